@@ -1,0 +1,1 @@
+"""The soft body: each module is one choice of ``body=``."""

@@ -1,0 +1,1 @@
+"""Where touches come from: each module is one choice of ``device=``."""

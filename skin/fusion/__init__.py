@@ -1,0 +1,1 @@
+"""How time is folded: each module is one choice of ``fusion=``."""

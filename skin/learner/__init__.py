@@ -1,0 +1,1 @@
+"""What learns from touches: each module is one choice of ``learner=``."""

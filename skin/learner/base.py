@@ -1,0 +1,44 @@
+"""What a learner is: it is fitted to touches and then gives each label's probability."""
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from skin.recording import Touches
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger
+
+    from skin.datamodule import TouchData
+
+__all__ = ["AbstractLearner"]
+
+
+class AbstractLearner(ABC):
+    """Learns the labels of touches, whether by gradient descent, by boosting or by rules.
+
+    Attributes:
+        parameters: number of trained parameters, known after ``fit`` or ``load``.
+        seconds_per_epoch: mean duration of one training epoch, s, known after ``fit``.
+    """
+
+    parameters: int
+    seconds_per_epoch: float
+
+    @abstractmethod
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Learn from the training split of ``data``, choosing by its validation split only."""
+
+    @abstractmethod
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of any layout that the learner can take."""
+
+    @abstractmethod
+    def save(self, folder: Path) -> Path:
+        """Write what was learned to a file in ``folder`` and return its path."""
+
+    @abstractmethod
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Take what ``save`` wrote; ``data`` gives the shapes as in ``fit``."""

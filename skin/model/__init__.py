@@ -1,0 +1,1 @@
+"""Encoders of frames: each module is one choice of ``model=``."""

@@ -1,0 +1,1 @@
+"""How readings are shown to a network: each module is one choice of ``representation=``."""

@@ -1,0 +1,37 @@
+"""What a representation is: a batched map from readings to what a network takes."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Literal, NamedTuple
+
+from torch import Tensor, nn
+
+__all__ = ["AbstractRepresentation", "Frames"]
+
+
+class Frames(NamedTuple):
+    """Touches as a network takes them.
+
+    Attributes:
+        x: images (B, T, C, H, W), graphs (B, T, S, F), plain readings (B, T, F).
+        adjacency: (S, S) or (B, T, S, S), dense, normalised; None where there is no graph.
+    """
+
+    x: Tensor
+    adjacency: Tensor | None
+
+
+class AbstractRepresentation(nn.Module, ABC):
+    """Maps readings (B, T, S) in N with their validity to :class:`Frames`.
+
+    Built for one layout: ``cls(positions, size, **options)`` with positions (S, 3), m, and the sheet's size (x, y), m.
+    Readings are divided by ``scale``, N; invalid ones become 0.
+
+    Attributes:
+        kind: what a model must take: images, graphs or plain readings.
+    """
+
+    kind: ClassVar[Literal["image", "graph", "readings"]]
+
+    @abstractmethod
+    def forward(self, readings: Tensor, valid: Tensor) -> Frames:
+        """Return the frames of readings (B, T, S), N, and valid (B, T, S), bool."""

@@ -1,0 +1,1 @@
+"""From surface pressure to true sensor readings: each module is one choice of ``simulator=``."""

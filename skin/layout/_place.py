@@ -1,0 +1,61 @@
+"""Check that sensors can be where a layout puts them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.base import Sensors
+
+__all__ = ["place"]
+
+# Two sensors closer than this in the plane are at one place, m.
+_APART = 1e-6
+
+
+def place(
+    body: Sheet, x: np.ndarray, y: np.ndarray, depth: np.ndarray | None, footprint: Sequence[float]
+) -> Sensors:
+    """Return sensors at x, y and depth, each (S,), m; without depth they lie at ``body.sensor_depth``.
+
+    Raises:
+        InputError: a footprint that is not two positive lengths, a sensor outside the sheet or deeper than it, or
+            two sensors at one place in the plane, whatever their depths: images and graphs show sensors in the plane.
+    """
+    lengths = [float(extent) for extent in footprint]
+    if len(lengths) != 2 or not all(math.isfinite(extent) and extent > 0 for extent in lengths):
+        raise InputError(
+            f"layout.footprint must be two positive lengths (x, y) in m, got {list(footprint)}: "
+            "as in layout.footprint=[0.01,0.01]"
+        )
+    positions = np.column_stack([x, y, np.full_like(x, body.sensor_depth) if depth is None else depth])
+    _inside(body, positions)
+    _apart(positions)
+    return Sensors(positions, (lengths[0], lengths[1]))
+
+
+def _inside(body: Sheet, positions: np.ndarray) -> None:
+    extent = np.array([*body.size, body.thickness])
+    outside = ((positions < 0) | (positions > extent + 1e-9)).any(axis=1)
+    if outside.any():
+        number = int(outside.argmax())
+        x, y, depth = positions[number]
+        raise InputError(
+            f"{outside.sum()} of {len(positions)} sensors lie outside the sheet; the first is sensor {number + 1} at "
+            f"x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a sheet of {extent[0]:g} x {extent[1]:g} m, "
+            f"{extent[2]:g} m thick: positions are in metres from the upper left corner; "
+            "mend the layout or give body.size=[x,y]"
+        )
+
+
+def _apart(positions: np.ndarray) -> None:
+    distance = np.linalg.norm(positions[:, None, :2] - positions[None, :, :2], axis=-1)
+    first, second = np.nonzero(np.triu(distance < _APART, k=1))
+    if len(first):
+        x, y, _ = positions[first[0]]
+        raise InputError(
+            f"sensors {first[0] + 1} and {second[0] + 1} are at one place, x = {x:g} m, y = {y:g} m: "
+            "move one or take it out of the layout"
+        )

@@ -1,0 +1,34 @@
+"""Sensors on a regular grid."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skin.body.sheet import Sheet
+from skin.layout._grid import grid
+from skin.layout._place import place
+from skin.layout.base import AbstractLayout, Sensors
+
+__all__ = ["Grid"]
+
+
+class Grid(AbstractLayout):
+    """Sensors in the middle of equal tiles of the sheet.
+
+    Args:
+        rows: number of rows (along y).
+        columns: number of columns (along x).
+        footprint: extent (x, y) over which a sensor feels, m.
+
+    Raises:
+        InputError: no row or column.
+    """
+
+    def __init__(self, rows: int = 5, columns: int = 5, footprint: Sequence[float] = (0.01, 0.01)) -> None:
+        self.centres = grid(rows, columns)
+        self.footprint = footprint
+
+    def sensors(self, body: Sheet) -> Sensors:
+        """Return the sensors row by row, from the upper left rightwards and down."""
+        x, y = (self.centres * np.array(body.size)).T
+        return place(body, x, y, None, self.footprint)

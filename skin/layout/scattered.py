@@ -1,0 +1,52 @@
+"""Sensors scattered at random around a grid."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout._grid import grid
+from skin.layout._place import place
+from skin.layout.base import AbstractLayout, Sensors
+
+__all__ = ["Scattered"]
+
+
+class Scattered(AbstractLayout):
+    """A grid of sensors, each moved at random: what a skin made by hand looks like.
+
+    Args:
+        rows: number of rows (along y).
+        columns: number of columns (along x).
+        jitter: how far a sensor may move along x and y, as a share of the pitch, 0 to 0.5.
+        seed: what the moves are drawn from.
+        footprint: extent (x, y) over which a sensor feels, m.
+
+    Raises:
+        InputError: no row or column, or a jitter at which two sensors could meet.
+    """
+
+    def __init__(
+        self,
+        rows: int = 5,
+        columns: int = 5,
+        jitter: float = 0.25,
+        seed: int = 0,
+        footprint: Sequence[float] = (0.01, 0.01),
+    ) -> None:
+        if not 0 <= jitter < 0.5:
+            raise InputError(
+                f"layout.jitter must be at least 0 and below 0.5 of the pitch, got {jitter}: as in layout.jitter=0.25"
+            )
+        self.centres = grid(rows, columns)
+        self.pitch = np.array([1 / columns, 1 / rows])
+        self.jitter = jitter
+        self.seed = seed
+        self.footprint = footprint
+
+    def sensors(self, body: Sheet) -> Sensors:
+        """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""
+        moves = np.random.default_rng(self.seed).uniform(-self.jitter, self.jitter, self.centres.shape)
+        x, y = np.round((self.centres + moves * self.pitch) * body.size, 6).T
+        return place(body, x, y, None, self.footprint)

@@ -1,0 +1,111 @@
+"""Silicones in SI units, each number with its source."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from skin.errors import InputError
+
+__all__ = ["MATERIALS", "Material"]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A linear elastic material.
+
+    Attributes:
+        name: what it is called; it has no meaning to the mechanics.
+        young: Young's modulus E, Pa.
+        poisson: Poisson's ratio nu. The plate-and-beam model takes -1 < nu < 1, within which its shear modulus
+            E / 2(1 + nu) and its plate stiffness E / (1 - nu^2) are positive. An isotropic solid needs nu < 0.5.
+
+    Raises:
+        InputError: a modulus that is not a positive number, or a Poisson's ratio outside (-1, 1).
+    """
+
+    name: str
+    young: float
+    poisson: float
+
+    def __post_init__(self) -> None:
+        for key, unit in (("young", " in Pa"), ("poisson", "")):
+            value = getattr(self, key)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise InputError(f"material {self.name}: {key} must be a number{unit}, got {value!r}")
+        if self.young <= 0:
+            raise InputError(
+                f"material {self.name}: young must be above 0 Pa, got {self.young:g}; EcoFlex 00-30 has 170e3"
+            )
+        if not -1 < self.poisson < 1:
+            raise InputError(
+                f"material {self.name}: Poisson's ratio must lie between -1 and 1 (a plate's stiffness is "
+                f"E / (1 - nu^2)), got {self.poisson:g}; silicones have about 0.49"
+            )
+
+    @property
+    def shear(self) -> float:
+        """Shear modulus E / 2(1 + nu), Pa (report, equation 5)."""
+        return self.young / (2 * (1 + self.poisson))
+
+    @classmethod
+    def of(cls, given: "str | Mapping[str, Any] | Material") -> "Material":
+        """Return the material that a configuration means.
+
+        Args:
+            given: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa) and ``poisson``.
+                What is left out comes from the known material of that name.
+
+        Raises:
+            InputError: the name is unknown and a constant is missing, or a key is mistyped.
+        """
+        if isinstance(given, Material):
+            return given
+        constants = {"name": given} if isinstance(given, str) else given
+        if not isinstance(constants, Mapping) or "name" not in constants:
+            raise InputError(f"a material is a name or {{name, young, poisson}}, got {given!r}; {_known()}")
+        if unknown := set(constants) - {"name", "young", "poisson"}:
+            raise InputError(
+                f"material {constants['name']}: unknown key {', '.join(sorted(map(str, unknown)))}; "
+                "a material has name, young (Pa) and poisson"
+            )
+        name = str(constants["name"])
+        known = _BY_KEY.get(_key(name))
+        young, poisson = (
+            constants.get(key) if constants.get(key) is not None else getattr(known, key, None)
+            for key in ("young", "poisson")
+        )
+        if young is None or poisson is None:
+            raise InputError(_missing(name, young, poisson))
+        return cls(known.name if known else name, young, poisson)
+
+
+MATERIALS = (
+    # Report, table 2: E = 0.02466 ksi after Fouillet et al. [19], nu after An [20]. The maker's modulus at 100 %
+    # strain is 69 kPa.
+    Material("EcoFlex 00-30", young=170.0e3, poisson=0.499),
+    # Report, table 2: E = 0.08122 ksi after Fouillet et al. [19], nu from the report's own experiment. No isotropic
+    # solid has nu = 0.54; the plate-and-beam model uses it only in E / (1 - nu^2) and E / 2(1 + nu). The maker's
+    # modulus at 100 % strain is 152 kPa.
+    Material("Dragon Skin 10 Medium", young=560.0e3, poisson=0.54),
+)
+
+
+def _key(name: str) -> str:
+    """Reduce a name to what identifies it, so that ``ecoflex_00_30`` means EcoFlex 00-30."""
+    return "".join(character for character in name.lower() if character.isalnum())
+
+
+_BY_KEY = {_key(material.name): material for material in MATERIALS}
+
+
+def _known() -> str:
+    return "known materials: " + ", ".join(material.name for material in MATERIALS)
+
+
+def _missing(name: str, young: float | None, poisson: float | None) -> str:
+    need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
+    mend = f"give {need}, as in {{name: {name}, young: 100e3, poisson: 0.49}}"
+    if _key(name) == "ecoflexgel":
+        return f"EcoFlex Gel has no constants of its own: the report's measurement was unreliable; {mend}"
+    return f"unknown material {name}: {_known()}; or {mend}"

@@ -1,0 +1,159 @@
+"""What the labels of a touch mean, and the ground truth of them: the pressure movie."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from skin.errors import InputError
+
+__all__ = ["TOUCH", "Measures", "Task", "Thresholds", "measure", "movie_labels"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a device's labels mean; head width, loss, metrics and table columns follow from it.
+
+    Attributes:
+        names: one name per label, in the order of the label tensor's last axis.
+        kind: ``binary`` (each label holds or not by itself), ``exclusive`` (exactly one holds) or
+            ``direction``.
+    """
+
+    names: tuple[str, ...]
+    kind: Literal["binary", "exclusive", "direction"] = "binary"
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+TOUCH = Task(("big", "dynamic", "press", "dangerous"))
+"""The four binary labels of the report, section 2.1.1."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Where the report draws its lines (section 2.1.1).
+
+    Attributes:
+        area: a touch is big if it covers more than this share of the sheet.
+        frames: a touch is a press if it lasts more than this many consecutive frames.
+        pressure: a touch is dangerous if some sensor's surface pressure exceeds this in some frame, Pa
+            (cuff algometry, Jespersen et al.).
+        contact: cells above this share of the gesture's peak cell are in contact.
+        travel: a touch is dynamic if its centre of pressure moves further than this from where it began, m.
+    """
+
+    area: float = 0.30
+    frames: int = 3
+    pressure: float = 90.5e3
+    contact: float = 0.02
+    travel: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("area", "contact"):
+            share = getattr(self, name)
+            if not 0 < share < 1:
+                raise InputError(
+                    f"thresholds.{name} is a share between 0 and 1, got {share}: "
+                    f"use touch.thresholds.{name}={getattr(Thresholds, name)}"
+                )
+
+
+class Measures(NamedTuple):
+    """What a movie says about each of its gestures; every tensor is (B,).
+
+    Attributes:
+        area: largest share of the sheet in contact in one frame.
+        travel: furthest distance of the centre of pressure from its first place, m.
+        frames: longest run of consecutive frames in contact.
+        pressure: largest surface pressure over a sensor's footprint, Pa.
+    """
+
+    area: Tensor
+    travel: Tensor
+    frames: Tensor
+    pressure: Tensor
+
+    def labels(self, thresholds: Thresholds) -> Tensor:
+        """Return the labels (B, 4), 0 or 1, float32, in the order of ``TOUCH``."""
+        big = self.area > thresholds.area
+        dynamic = self.travel > thresholds.travel
+        press = self.frames > thresholds.frames
+        dangerous = self.pressure > thresholds.pressure
+        return torch.stack([big, dynamic, press, dangerous], dim=1).float()
+
+
+def measure(
+    frames: Tensor,
+    index: Tensor,
+    scale: Tensor,
+    footprints: Tensor,
+    cell: tuple[float, float],
+    contact: float = Thresholds.contact,
+) -> Measures:
+    """Measure gestures given as distinct frames, so that no frame is looked at twice.
+
+    Args:
+        frames: (U, H, W), Pa; a frame belongs to one gesture.
+        index: (B, T), which frame is shown.
+        scale: (B, T), by what it is multiplied, 0 where nothing touches.
+        footprints: (S, H * W), area weights of each sensor that sum to 1.
+        cell: extent (x, y) of a cell, m.
+        contact: share of the gesture's peak cell above which a cell is in contact.
+    """
+    count, height, width = frames.shape
+    flat = frames.flatten(1)
+    highest = flat.amax(1)
+    peak = (highest[index] * scale).amax(1)
+    touched = highest[index] * scale > contact * peak[:, None]
+
+    # One product reads the frames once for the sensors' pressures, the total and both first moments.
+    y, x = torch.meshgrid(
+        (torch.arange(height) + 0.5) * cell[1], (torch.arange(width) + 0.5) * cell[0], indexing="ij"
+    )
+    moments = torch.stack([torch.ones_like(x), x, y]).flatten(1).to(frames)
+    means = flat @ torch.cat([footprints.to(frames), moments]).T
+    centre = means[:, -2:] / means[:, -3:-2].clamp(min=1e-30)
+    pressure = (means[:, :-3].amax(1)[index] * scale).amax(1)
+
+    # The lowest pressure that counts as contact, where a frame is shown at its strongest.
+    level = torch.full((count,), torch.inf).to(frames)
+    lowest = contact * peak[:, None] / scale
+    level.scatter_reduce_(0, index.flatten(), lowest.flatten(), "amin")
+    area = (flat > level[:, None]).sum(1)[index].where(touched, 0).amax(1) / (height * width)
+
+    first = touched.int().argmax(1)
+    places = centre[index]
+    distance = torch.linalg.vector_norm(places - places[torch.arange(len(places)), first][:, None], dim=-1)
+    travel = distance.where(touched, 0).amax(1)
+    return Measures(area, travel, _longest_run(touched), pressure)
+
+
+def _longest_run(touched: Tensor) -> Tensor:
+    """Return the length of the longest run of true values along the last axis of (B, T)."""
+    run = longest = torch.zeros(len(touched), dtype=torch.long, device=touched.device)
+    for column in touched.long().unbind(1):
+        run = (run + 1) * column
+        longest = torch.maximum(longest, run)
+    return longest
+
+
+def movie_labels(
+    pressure: Tensor, footprints: Tensor, cell: tuple[float, float], thresholds: Thresholds | None = None
+) -> Tensor:
+    """Return the labels (B, 4) that a dense pressure movie gives.
+
+    Args:
+        pressure: (B, T, H, W), Pa.
+        footprints: (S, H * W), area weights of each sensor that sum to 1.
+        cell: extent (x, y) of a cell, m.
+        thresholds: where the lines are; the report's if None.
+    """
+    thresholds = thresholds or Thresholds()
+    batch, time = pressure.shape[:2]
+    index = torch.arange(batch * time, device=pressure.device).view(batch, time)
+    scale = torch.ones(batch, time).to(pressure)
+    measures = measure(pressure.flatten(0, 1), index, scale, footprints, cell, thresholds.contact)
+    return measures.labels(thresholds)

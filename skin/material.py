@@ -17,8 +17,8 @@ class Material:
     Attributes:
         name: what it is called; it has no meaning to the mechanics.
         young: Young's modulus E, Pa.
-        poisson: Poisson's ratio nu. The plate-and-beam model takes -1 < nu < 1, within which its shear modulus
-            E / 2(1 + nu) and its plate stiffness E / (1 - nu^2) are positive. An isotropic solid needs nu < 0.5.
+        poisson: Poisson's ratio nu. The plate-and-beam model takes -1 < nu < 1, where its shear modulus
+            E / 2(1 + nu) and its plate stiffness E / (1 - nu^2) are positive. A solid needs nu < 0.5.
 
     Raises:
         InputError: a modulus that is not a positive number, or a Poisson's ratio outside (-1, 1).
@@ -53,8 +53,8 @@ class Material:
         """Return the material that a configuration means.
 
         Args:
-            given: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa) and ``poisson``.
-                What is left out comes from the known material of that name.
+            given: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa) and
+                ``poisson``; what is left out comes from the known material of that name.
 
         Raises:
             InputError: the name is unknown and a constant is missing, or a key is mistyped.
@@ -71,22 +71,23 @@ class Material:
             )
         name = str(constants["name"])
         known = _BY_KEY.get(_key(name))
-        young, poisson = (
-            constants.get(key) if constants.get(key) is not None else getattr(known, key, None)
-            for key in ("young", "poisson")
-        )
+        young: Any = constants.get("young")
+        poisson: Any = constants.get("poisson")
+        if known is not None:
+            young = known.young if young is None else young
+            poisson = known.poisson if poisson is None else poisson
         if young is None or poisson is None:
             raise InputError(_missing(name, young, poisson))
         return cls(known.name if known else name, young, poisson)
 
 
 MATERIALS = (
-    # Report, table 2: E = 0.02466 ksi after Fouillet et al. [19], nu after An [20]. The maker's modulus at 100 %
-    # strain is 69 kPa.
+    # Report, table 2: E = 0.02466 ksi after Fouillet et al. [19], nu after An [20]. The maker's modulus at
+    # 100 % strain is 69 kPa.
     Material("EcoFlex 00-30", young=170.0e3, poisson=0.499),
-    # Report, table 2: E = 0.08122 ksi after Fouillet et al. [19], nu from the report's own experiment. No isotropic
-    # solid has nu = 0.54; the plate-and-beam model uses it only in E / (1 - nu^2) and E / 2(1 + nu). The maker's
-    # modulus at 100 % strain is 152 kPa.
+    # Report, table 2: E = 0.08122 ksi after Fouillet et al. [19], nu from the report's own experiment. No
+    # isotropic solid has nu = 0.54; the plate-and-beam model uses it only in E / (1 - nu^2) and E / 2(1 +
+    # nu). The maker's modulus at 100 % strain is 152 kPa.
     Material("Dragon Skin 10 Medium", young=560.0e3, poisson=0.54),
 )
 
@@ -103,7 +104,7 @@ def _known() -> str:
     return "known materials: " + ", ".join(material.name for material in MATERIALS)
 
 
-def _missing(name: str, young: float | None, poisson: float | None) -> str:
+def _missing(name: str, young: Any, poisson: Any) -> str:
     need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
     mend = f"give {need}, as in {{name: {name}, young: 100e3, poisson: 0.49}}"
     if _key(name) == "ecoflexgel":

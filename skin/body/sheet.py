@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Layer", "Sheet", "overlaps"]
 
-# The least that any simulator holds per cell: 25 sensors' weights in float64 and one gesture of 30 float32 frames.
+# What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
 _BYTES_PER_CELL = 25 * 8 + 30 * 4
 
 
@@ -42,9 +42,10 @@ class Sheet:
 
     Attributes:
         size: extent (x, y), m.
-        cells: number of cells (along x, along y). A pressure on the sheet is (..., H, W) = (..., cells[1], cells[0]).
-        layers: from the table up. A configuration gives each as ``{material, thickness}``, with the material as in
-            :meth:`skin.material.Material.of` and the thickness in m.
+        cells: number of cells (along x, along y); a pressure on the sheet is (..., H, W) with H = cells[1]
+            and W = cells[0].
+        layers: from the table up. A configuration gives each as ``{material, thickness}``, with the material
+            as in :meth:`skin.material.Material.of` and the thickness in m.
 
     Raises:
         InputError: a size or thickness that is not positive, fewer than two cells along a side, no layer, an
@@ -82,7 +83,7 @@ class Sheet:
 
     @cached_property
     def interfaces(self) -> tuple[float, ...]:
-        """Depth below the surface of each layer's upper face, m, from the table up: the last is the surface, 0.
+        """Depth below the surface of each layer's upper face, m, from the table up; the last is 0.
 
         The table itself is no interface: nothing moves there.
         """
@@ -91,7 +92,7 @@ class Sheet:
 
     @property
     def sensor_depth(self) -> float:
-        """Where sensors lie if nothing else is said, m: under the top layer; on the surface of a single layer."""
+        """Where sensors lie by default, m: under the top layer; on the surface of a single layer."""
         return self.interfaces[-2] if len(self.layers) > 1 else 0.0
 
     def footprint_areas(self, sensors: "Sensors") -> np.ndarray:
@@ -112,8 +113,8 @@ class Sheet:
     def footprints(self, sensors: "Sensors") -> np.ndarray:
         """Return weights (S, H*W) that sum to 1 per sensor.
 
-        ``footprints(sensors) @ pressure.reshape(H * W)`` is the mean pressure over each sensor's footprint, Pa:
-        cells that it covers in part weigh by area.
+        ``footprints(sensors) @ pressure.reshape(H * W)`` is the mean pressure over each sensor's footprint,
+        Pa; cells that it covers in part weigh by area.
         """
         areas = self.footprint_areas(sensors)
         return areas / areas.sum(axis=1, keepdims=True)
@@ -172,7 +173,7 @@ def _layer(number: int, given: Any) -> Layer:
         given = {"material": given.material, "thickness": given.thickness}
     if not isinstance(given, Mapping) or set(given) != {"material", "thickness"}:
         raise InputError(
-            f"layer {number} from the table must be {{material, thickness}} with the thickness in m, got {given}"
+            f"layer {number} from the table must be {{material, thickness}}, thickness in m, got {given}"
         )
     if not _positive(given["thickness"]):
         raise InputError(

@@ -21,8 +21,8 @@ def place(
     """Return sensors at x, y and depth, each (S,), m; without depth they lie at ``body.sensor_depth``.
 
     Raises:
-        InputError: a footprint that is not two positive lengths, a sensor outside the sheet or deeper than it, or
-            two sensors at one place in the plane, whatever their depths: images and graphs show sensors in the plane.
+        InputError: a footprint that is not two positive lengths, a sensor outside the sheet or deeper than
+            it, or two sensors at one place in the plane, whatever their depths: images and graphs are flat.
     """
     lengths = [float(extent) for extent in footprint]
     if len(lengths) != 2 or not all(math.isfinite(extent) and extent > 0 for extent in lengths):
@@ -43,10 +43,10 @@ def _inside(body: Sheet, positions: np.ndarray) -> None:
         number = int(outside.argmax())
         x, y, depth = positions[number]
         raise InputError(
-            f"{outside.sum()} of {len(positions)} sensors lie outside the sheet; the first is sensor {number + 1} at "
-            f"x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a sheet of {extent[0]:g} x {extent[1]:g} m, "
-            f"{extent[2]:g} m thick: positions are in metres from the upper left corner; "
-            "mend the layout or give body.size=[x,y]"
+            f"{outside.sum()} of {len(positions)} sensors lie outside the sheet; the first is "
+            f"sensor {number + 1} at x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a sheet of "
+            f"{extent[0]:g} x {extent[1]:g} m, {extent[2]:g} m thick: positions are in metres from the "
+            "upper left corner; mend the layout or give body.size=[x,y]"
         )
 
 

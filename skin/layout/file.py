@@ -21,14 +21,15 @@ _NEED = "a layout has the columns x_m, y_m and optionally depth_m, in metres fro
 class File(AbstractLayout):
     """Sensors of a CSV file with the columns ``x_m``, ``y_m`` and optionally ``depth_m``, all m.
 
-    The order of the rows is the order of the readings: that of the hardware's channels. Other columns are ignored.
+    The order of the rows is the order of the readings: that of the hardware's channels. Other columns are
+    ignored.
 
     Args:
         path: the file; a relative path is looked for in the working directory, then in the repository.
         footprint: extent (x, y) over which a sensor feels, m.
 
     Raises:
-        InputError: no such file, nothing in it, a column missing, or a cell that is no number (with its line).
+        InputError: no such file, nothing in it, a column missing, or a cell that is no number, with its line.
     """
 
     def __init__(self, path: str, footprint: Sequence[float] = (0.01, 0.01)) -> None:
@@ -62,7 +63,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             if missing := {"x_m", "y_m"} - set(names):
                 found = ", ".join(names) or "nothing"
                 raise InputError(f"{path}: no column {' and '.join(sorted(missing))}, found {found}; {_NEED}")
-            columns = [name for name in ("x_m", "y_m", "depth_m") if name in names]
+            columns = [name for name in names if name in ("x_m", "y_m", "depth_m")]
             rows = list(_rows(path, reader, columns))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"cannot read the layout {path}: {error}; {_NEED}") from error

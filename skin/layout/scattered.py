@@ -37,7 +37,8 @@ class Scattered(AbstractLayout):
     ) -> None:
         if not 0 <= jitter < 0.5:
             raise InputError(
-                f"layout.jitter must be at least 0 and below 0.5 of the pitch, got {jitter}: as in layout.jitter=0.25"
+                f"layout.jitter must be at least 0 and below 0.5 of the pitch, got {jitter}: "
+                "as in layout.jitter=0.25"
             )
         self.centres = grid(rows, columns)
         self.pitch = np.array([1 / columns, 1 / rows])

@@ -13,8 +13,8 @@ class Response(NamedTuple):
 
     Attributes:
         readings: (..., S), N.
-        displacement: (..., S, 2), m: D_s at each sensor's depth and D_t at the surface above it, positive into
-            the skin; or None where the simulator knows no displacement.
+        displacement: (..., S, 2), m: D_s at each sensor's depth and D_t at the surface above it, positive
+            into the skin; or None where the simulator knows no displacement.
     """
 
     readings: Tensor

@@ -1,0 +1,169 @@
+"""What a sheet's sensors see of a pressure on it, as matrices: solved once, then kept on disk.
+
+The sheet is linear, so every functional s of its motion is a fixed row over the cells: s' K^-1 P p = (K^-1
+s)' P p. One factorisation and one solve per functional replace one solve per frame.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+import warnings
+import zipfile
+import zlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+from scipy.sparse.linalg import splu
+
+from skin.body._memory import require_memory
+from skin.layout.base import Sensors
+from skin.simulator._assembly import Structure
+
+__all__ = ["Operator", "build", "cache_folder", "cached"]
+
+# Raise it when the meaning of a stored file changes.
+_FORMAT = 1
+_HERE = Path(__file__).parent
+# Mechanics that changed must not be answered from a file that the old mechanics wrote.
+_SOURCES = [
+    _HERE.parent / "body" / "sheet.py",
+    *(_HERE / name for name in ("_assembly.py", "_beam.py", "_operator.py", "_plate.py")),
+]
+
+
+@dataclass(frozen=True)
+class Operator:
+    """Rows over the cells (S, H*W), float64, to be multiplied by a pressure (H*W,) in Pa.
+
+    Attributes:
+        sensor: D_s, how far the sensor moves into the skin, m/Pa.
+        surface: D_t, how far the surface above it does, m/Pa.
+        applied: F_in, the force on the footprint at the surface, N/Pa.
+        carried: the force that the layer below the sensor carries under the footprint, N/Pa.
+    """
+
+    sensor: np.ndarray
+    surface: np.ndarray
+    applied: np.ndarray
+    carried: np.ndarray
+
+
+def build(structure: Structure, sensors: Sensors) -> Operator:
+    """Assemble, factorise and solve for every functional of every sensor.
+
+    Raises:
+        InputError: a sensor lies at no interface, or the mesh is finer than memory allows.
+    """
+    body = structure.body
+    levels = structure.levels(sensors)
+    require_memory(
+        _bytes(structure, len(sensors)),
+        f"the stiffness of body.cells=[{body.cells[0]},{body.cells[1]}] with {len(body.layers)} layers",
+        "give fewer cells, such as body.cells=[32,32]",
+    )
+    top = np.full_like(levels, len(body.layers) - 1)
+    functionals = [
+        structure.deflection(sensors, levels),
+        structure.deflection(sensors, top),
+        structure.carried(sensors, levels),
+    ]
+    # K is symmetric and positive definite: no pivoting, and an ordering for symmetric matrices.
+    factors = splu(
+        structure.stiffness(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    load = structure.load()
+    deflection, surface, carried = (
+        np.ascontiguousarray((load.T @ factors.solve(rows.T.toarray())).T) for rows in functionals
+    )
+    return Operator(deflection, surface, body.footprint_areas(sensors), carried)
+
+
+def cached(structure: Structure, sensors: Sensors, folder: Path) -> Operator:
+    """Return the operator from its file in ``folder``, or build it and write the file.
+
+    A file that is damaged, foreign or of another shape is rebuilt; a folder that cannot be written to costs
+    a warning.
+    """
+    key = _key(structure, sensors)
+    path = folder / f"operator-{key}.npz"
+    shape = (len(sensors), structure.body.cells[0] * structure.body.cells[1])
+    stored = _load(path, key, shape)
+    if stored is not None:
+        return stored
+    operator = build(structure, sensors)
+    try:
+        _save(path, key, operator)
+    except OSError as error:
+        warnings.warn(f"the operator cannot be kept in {folder}: {error}", RuntimeWarning, stacklevel=2)
+    return operator
+
+
+def cache_folder(given: str | Path | None) -> Path:
+    """Return where operators are kept: as given, else by the variable SKIN_CACHE, else the user's cache."""
+    return Path(given or os.environ.get("SKIN_CACHE") or platformdirs.user_cache_dir("skin")).expanduser()
+
+
+def _key(structure: Structure, sensors: Sensors) -> str:
+    """Hash everything that the operator depends on."""
+    body = structure.body
+    content = {
+        "format": _FORMAT,
+        "sources": [hashlib.sha256(source.read_bytes()).hexdigest() for source in _SOURCES],
+        "size": body.size,
+        "cells": body.cells,
+        "layers": [(layer.material.young, layer.material.poisson, layer.thickness) for layer in body.layers],
+        "constraint": structure.constraint,
+        "positions": sensors.positions.tolist(),
+        "footprint": sensors.footprint,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _load(path: Path, key: str, shape: tuple[int, int]) -> Operator | None:
+    """Return the operator in a file, or None if there is no file or anything about it is wrong."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["key"]) != key:
+                return None
+            rows = {field.name: file[field.name] for field in fields(Operator)}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return None
+    sound = all(
+        row.shape == shape and row.dtype == np.float64 and np.isfinite(row).all() for row in rows.values()
+    )
+    return Operator(**rows) if sound else None
+
+
+def _save(path: Path, key: str, operator: Operator) -> None:
+    """Write the file whole or not at all: others may read or write it at the same time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, key=np.array(key), **vars(operator))
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _bytes(structure: Structure, sensors: int) -> float:
+    """Estimate the memory that ``build`` takes, bytes.
+
+    The factors' filling was measured on sheets of 16 to 128 cells a side and 6 to 15 unknowns per place: L
+    has about (7.5 log2(side) - 17) entries per unknown and unknown of the place.
+    """
+    each = len(structure.free)
+    layers, rows, columns = structure.grid
+    places = float(rows * columns)
+    per_place = each * layers
+    filling = max(7.5 * np.log2(places**0.5) - 17, 7.0)
+    factors = 24 * places * per_place**2 * filling
+    elements = 48 * places * layers * ((4 * each) ** 2 + (2 * each) ** 2)
+    return factors + elements + 16 * 3 * sensors * (places * per_place + places)

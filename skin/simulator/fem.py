@@ -1,0 +1,81 @@
+"""The report's finite-element skin: plates and beams (report, 2.1.2), as one linear operator."""
+
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.base import Sensors
+from skin.simulator._assembly import Constraint, Structure
+from skin.simulator._frames import flatten
+from skin.simulator._operator import Operator, cache_folder, cached
+from skin.simulator.base import AbstractSimulator, Response
+
+__all__ = ["PlatesAndBeams", "Reading"]
+
+Reading = Literal["equation10", "interface"]
+
+
+class PlatesAndBeams(AbstractSimulator):
+    """Layers of Kirchhoff plates on upright Euler-Bernoulli beams, glued to a table.
+
+    Each layer is a set of beams, one per node with the part of the sheet nearest to it as section, and the
+    plates on their heads. Linear: no contact, no large strain.
+
+    Args:
+        body: the sheet.
+        sensors: where the sensors are; each lies at an interface between layers, or on the surface.
+        reading: ``equation10`` is the report's: the force on the footprint at the surface times D_s / D_t,
+            the share of the surface's motion that reaches the sensor. It is zero beside the contact.
+            ``interface`` is the force that the layer below carries under the footprint: linear, and
+            neighbours feel a touch.
+        constraint: ``vertical`` is the report's: nodes move vertically and tilt. ``free`` lets them move
+            along the sheet too.
+        cache: folder of operators kept from earlier runs; None means the variable SKIN_CACHE, else the
+            user's cache.
+
+    Raises:
+        InputError: an unknown reading or constraint, a sensor at no interface, or a mesh finer than memory
+            allows.
+
+    Attributes:
+        operator: the rows D_s, D_t, F_in and the carried force in float64, as computed. The buffers that
+            ``forward`` multiplies by are float32 copies of them.
+    """
+
+    transfer: Tensor
+
+    def __init__(
+        self,
+        body: Sheet,
+        sensors: Sensors,
+        reading: Reading = "equation10",
+        constraint: Constraint = "vertical",
+        cache: str | Path | None = None,
+    ) -> None:
+        super().__init__()
+        if reading not in get_args(Reading):
+            raise InputError(f"simulator.reading must be {' or '.join(get_args(Reading))}, got {reading}")
+        self.reading = reading
+        self.shape = body.shape
+        self.operator: Operator = cached(Structure(body, constraint), sensors, cache_folder(cache))
+        force = self.operator.applied if reading == "equation10" else self.operator.carried
+        rows = np.concatenate([self.operator.sensor, self.operator.surface, force])
+        self.register_buffer("transfer", torch.from_numpy(rows.T.copy()).float())
+
+    def forward(self, pressure: Tensor) -> Response:
+        """Return the response to pressure (..., H, W), Pa, with D_s and D_t as its displacement."""
+        cells = flatten(pressure, self.shape, self.transfer.dtype)
+        sensor, surface, force = (cells @ self.transfer).chunk(3, dim=-1)
+        displacement = torch.stack([sensor, surface], dim=-1)
+        if self.reading == "interface":
+            return Response(force, displacement)
+        # Where nothing moves the share is 0; dividing by 1 there keeps the gradient finite too. Subnormal
+        # motion counts as none: its quotient could overflow.
+        moves = surface.abs() > torch.finfo(surface.dtype).tiny
+        share = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
+        return Response(share * force, displacement)

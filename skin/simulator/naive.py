@@ -1,0 +1,43 @@
+"""The naive skin: each sensor reads the pressure above it (report, 2.1.1)."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skin.body.sheet import Sheet
+from skin.layout.base import Sensors
+from skin.simulator._frames import flatten
+from skin.simulator.base import AbstractSimulator, Response
+
+__all__ = ["Naive"]
+
+
+class Naive(AbstractSimulator):
+    """Reads the pressure of the cell that holds the sensor, times the area of its footprint: no mechanics.
+
+    Choose it to see what mechanics is worth, or for a skin too thin to spread a touch.
+
+    Args:
+        body: the sheet; only its cells matter.
+        sensors: where the sensors are; a footprint that passes the sheet's edge is cut there.
+    """
+
+    cell: Tensor
+    area: Tensor
+
+    def __init__(self, body: Sheet, sensors: Sensors) -> None:
+        super().__init__()
+        # A sensor on the far edge belongs to the last cell.
+        column, row = (
+            np.minimum(sensors.positions[:, axis] / body.cell[axis], body.cells[axis] - 1).astype(np.int64)
+            for axis in (0, 1)
+        )
+        self.shape = body.shape
+        self.register_buffer("cell", torch.from_numpy(row * body.cells[0] + column))
+        area = body.footprint_areas(sensors).sum(axis=1)
+        self.register_buffer("area", torch.from_numpy(area).float())
+
+    def forward(self, pressure: Tensor) -> Response:
+        """Return the response to pressure (..., H, W), Pa; it knows no displacement."""
+        cells = flatten(pressure, self.shape, self.area.dtype)
+        return Response(cells[..., self.cell] * self.area, None)

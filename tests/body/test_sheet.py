@@ -1,0 +1,96 @@
+"""The sheet: its geometry, the area under a footprint, and what is refused."""
+
+import numpy as np
+import pytest
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.base import Sensors
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+
+
+def sheet(**changes) -> Sheet:
+    return Sheet(**{"size": [0.16, 0.08], "cells": [8, 6], "layers": LAYERS, **changes})
+
+
+def test_interfaces_run_from_the_table_up():
+    body = sheet(layers=[*LAYERS, {"material": "EcoFlex 00-30", "thickness": 0.002}])
+    assert body.interfaces == pytest.approx((0.007, 0.002, 0.0))
+    assert body.sensor_depth == 0.002
+    assert body.thickness == pytest.approx(0.017)
+
+
+def test_sensors_of_a_single_layer_lie_on_its_surface():
+    assert sheet(layers=LAYERS[1:]).sensor_depth == 0
+
+
+def test_rows_run_along_y():
+    body = sheet()
+    assert body.shape == (6, 8)
+    assert body.cell == pytest.approx((0.02, 0.08 / 6))
+
+
+def test_equal_sheets_are_equal_however_they_were_given():
+    assert sheet() == sheet(size=(0.16, 0.08), cells=(8, 6), layers=sheet().layers)
+    assert hash(sheet()) == hash(sheet())
+
+
+def test_footprint_weighs_partly_covered_cells_by_area():
+    """A footprint three quarters in one column and one quarter in the next."""
+    body = sheet(size=[0.04, 0.04], cells=[4, 4])
+    sensors = Sensors(np.array([[0.0175, 0.015, 0.005]]), (0.01, 0.01))
+    weights = body.footprints(sensors).reshape(body.shape)
+    expected = np.zeros((4, 4))
+    expected[1, 1], expected[1, 2] = 0.75, 0.25
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+
+
+def test_footprint_is_cut_at_the_edge():
+    body = sheet(size=[0.04, 0.04], cells=[4, 4])
+    sensors = Sensors(np.array([[0.0, 0.04, 0.005]]), (0.02, 0.02))
+    areas = body.footprint_areas(sensors).reshape(body.shape)
+    assert areas.sum() == pytest.approx(1e-4)
+    assert areas[3, 0] == pytest.approx(1e-4)
+    assert body.footprints(sensors).sum() == pytest.approx(1)
+
+
+def test_footprint_mean_is_the_integral_of_a_fine_raster():
+    """Independent answer: sample the footprint on a raster much finer than the cells."""
+    body = sheet(cells=[7, 5])
+    rng = np.random.default_rng(0)
+    pressure = rng.uniform(size=body.shape)
+    positions = np.column_stack([rng.uniform(0.02, 0.14, 6), rng.uniform(0.02, 0.06, 6), np.zeros(6)])
+    means = body.footprints(Sensors(positions, (0.03, 0.02))) @ pressure.ravel()
+    steps = (np.arange(400) + 0.5) / 400 - 0.5
+    for mean, (x, y, _) in zip(means, positions, strict=True):
+        columns = ((x + 0.03 * steps) / body.cell[0]).astype(int)
+        rows = ((y + 0.02 * steps) / body.cell[1]).astype(int)
+        assert mean == pytest.approx(pressure[np.ix_(rows, columns)].mean(), abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"size": [0.16, 0]}, "body.size must be two positive lengths"),
+        ({"size": [0.16]}, "body.size must be two positive lengths"),
+        ({"size": [float("nan"), 0.1]}, "body.size must be two positive lengths"),
+        ({"cells": [1, 8]}, "body.cells must be two whole numbers"),
+        ({"cells": [8.5, 8]}, "body.cells must be two whole numbers"),
+        ({"layers": []}, "at least one layer"),
+        ({"layers": [{"material": "EcoFlex 00-30"}]}, "layer 1 from the table must be {material, thickness}"),
+        ({"layers": [LAYERS[0], {"material": "EcoFlex 00-30", "thickness": -1}]}, "layer 2.*positive length"),
+        ({"layers": [{"material": "rubber", "thickness": 0.01}]}, "unknown material rubber"),
+    ],
+)
+def test_what_is_no_sheet_is_refused_by_name(changes, says):
+    with pytest.raises(InputError, match=says):
+        sheet(**changes)
+
+
+def test_a_mesh_too_fine_for_memory_is_refused_with_an_estimate():
+    with pytest.raises(InputError, match=r"body.cells=\[1000000,1000000\] needs about .* GB.*32,32"):
+        sheet(cells=[1_000_000, 1_000_000])

@@ -1,0 +1,74 @@
+"""Layout files: what a person may write, and what is refused by name."""
+
+import numpy as np
+import pytest
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.file import File
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+
+
+@pytest.fixture
+def sensors(tmp_path):
+    """Write a layout file and read its sensors."""
+
+    def read(text: str | bytes):
+        path = tmp_path / "layout.csv"
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return File(str(path)).sensors(BODY)
+
+    return read
+
+
+def test_order_depth_and_other_columns(sensors):
+    """The rows keep their order; columns may come in any, with spaces, a byte order mark, blank lines."""
+    read = sensors("\ufeffname, depth_m, y_m, x_m\nb, 0, 0.02, 0.15\n\na, 0.005, 0.01, 0.03\n")
+    np.testing.assert_allclose(read.positions, [[0.15, 0.02, 0], [0.03, 0.01, 0.005]])
+
+
+def test_depth_defaults_to_the_interface_under_the_top_layer(sensors):
+    assert sensors("x_m,y_m\n0.1,0.1\n").positions[0, 2] == 0.005
+
+
+def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
+    here = tmp_path / "data" / "layouts"
+    here.mkdir(parents=True)
+    (here / "jittered_5x5.csv").write_text("x_m,y_m\n0.1,0.1\n")
+    assert len(File("data/layouts/jittered_5x5.csv").sensors(BODY)) == 25
+    monkeypatch.chdir(tmp_path)
+    assert len(File("data/layouts/jittered_5x5.csv").sensors(BODY)) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no column x_m and y_m, found nothing"),
+        ("x_m,y_m\n", "no sensor below the header"),
+        ("x,y_m\n0.1,0.1\n", "no column x_m, found x, y_m"),
+        ("x_m,y_m\n0.1,0.1\n0.1,abc\n", "line 3: y_m must be a number in m, got 'abc'"),
+        ("x_m,y_m\n0.1,nan\n", "line 2: y_m must be a number in m, got 'nan'"),
+        ("x_m,y_m\n0.1,inf\n", "line 2: y_m must be a number"),
+        ("x_m,y_m\n0.1\n", "line 2: y_m must be a number in m, got None"),
+        ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
+        ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
+        ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the sheet.*depth = 0.02 m"),
+        ("x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n", "sensors 1 and 3 are at one place, x = 0.1 m, y = 0.1 m"),
+        ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one place"),
+        (b"x_m,y_m\n\xff\xfe,0.1\n", "cannot read the layout"),
+    ],
+)
+def test_what_is_no_layout_is_refused_by_name(sensors, text, says):
+    with pytest.raises(InputError, match=says):
+        sensors(text)
+
+
+@pytest.mark.parametrize("path", ["nowhere.csv", "/", "data/layouts"])
+def test_a_missing_file_is_refused_with_where_it_was_looked_for(path):
+    with pytest.raises(InputError, match=r"no layout file .*: looked for .*layout.path=FILE.csv"):
+        File(path)

@@ -1,0 +1,56 @@
+"""Materials: the report's numbers, and what is refused."""
+
+import pytest
+
+from skin.errors import InputError
+from skin.material import MATERIALS, Material
+
+KSI = 6.894757e6
+
+
+@pytest.mark.parametrize(
+    ("name", "young", "poisson", "shear"),
+    [("EcoFlex 00-30", 0.02466, 0.499, 0.008224), ("Dragon Skin 10 Medium", 0.08122, 0.54, 0.02637)],
+)
+def test_constants_are_the_reports(name, young, poisson, shear):
+    material = Material.of(name)
+    assert material.young == pytest.approx(young * KSI, rel=2e-4)
+    assert material.poisson == poisson
+    assert material.shear == pytest.approx(shear * KSI, rel=5e-4)
+
+
+@pytest.mark.parametrize("name", ["ecoflex_00_30", "EcoFlex 00-30", "ECOFLEX0030"])
+def test_a_name_is_read_as_people_write_it(name):
+    assert Material.of(name) == MATERIALS[0]
+
+
+def test_one_constant_of_a_known_material_can_change():
+    material = Material.of({"name": "EcoFlex 00-30", "young": 69e3})
+    assert (material.young, material.poisson) == (69e3, 0.499)
+
+
+def test_any_material_can_be_given_by_its_constants():
+    assert Material.of({"name": "foam", "young": 1e4, "poisson": -0.2}) == Material("foam", 1e4, -0.2)
+    gel = Material.of({"name": "EcoFlex Gel", "young": 2e4, "poisson": 0.49})
+    assert gel.young == 2e4
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ("rubber", "unknown material rubber: known materials: EcoFlex 00-30, Dragon Skin 10 Medium"),
+        ("EcoFlex Gel", r"EcoFlex Gel has no constants of its own.*young \(Pa\) and poisson"),
+        ({"name": "EcoFlex Gel", "young": 1e4}, "give poisson"),
+        ({"name": "foam", "yuong": 1e4}, "unknown key yuong"),
+        ({"young": 1e4, "poisson": 0.3}, "a material is a name or"),
+        (17, "a material is a name or"),
+        ({"name": "foam", "young": 0, "poisson": 0.3}, "young must be above 0 Pa, got 0"),
+        ({"name": "foam", "young": "soft", "poisson": 0.3}, "young must be a number in Pa, got 'soft'"),
+        ({"name": "foam", "young": float("nan"), "poisson": 0.3}, "young must be a number in Pa, got nan"),
+        ({"name": "foam", "young": 1e4, "poisson": 1.0}, "between -1 and 1.*got 1"),
+        ({"name": "foam", "young": 1e4, "poisson": -1}, "between -1 and 1.*got -1"),
+    ],
+)
+def test_what_is_no_material_is_refused_by_name(given, says):
+    with pytest.raises(InputError, match=says):
+        Material.of(given)

@@ -1,0 +1,146 @@
+"""The report's figures 4, 7, 8, 10 and 11 from our own data, each written whole."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from torch import Tensor
+
+__all__ = ["confusions", "force_and_reading", "images", "misclassified", "save", "traces"]
+
+# Okabe and Ito's palette: told apart by colour-blind readers too.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG under a temporary name and rename it, so that a reader never sees half of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".part.png")
+    figure.savefig(unfinished, dpi=120)
+    return unfinished.replace(path)
+
+
+def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float, float]) -> Figure:
+    """Draw one frame of readings in several representations side by side (report, figure 4).
+
+    Args:
+        pictures: name -> (H, W).
+        points: (S, 2), m, where the sensors are; drawn on every picture but ``fourier``, which has no places.
+        size: extent (x, y) of the sheet, m.
+    """
+    figure = Figure(figsize=(2.4 * len(pictures), 2.8), layout="constrained")
+    axes = figure.subplots(1, len(pictures), squeeze=False)[0]
+    for axis, (name, picture) in zip(axes, pictures.items(), strict=True):
+        extent = (0, size[0] * 1e3, size[1] * 1e3, 0)
+        if name == "fourier":
+            axis.imshow(picture, cmap="magma")
+        else:
+            axis.imshow(picture, cmap="magma", extent=extent, interpolation="nearest")
+            axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, ".", color="#56B4E9", markersize=2)
+        axis.set_title(name)
+        axis.set_xticks([])
+        axis.set_yticks([])
+    return figure
+
+
+def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Figure:
+    """Draw 2 x 2 confusion matrices side by side, as shares of each true class (report, figure 8).
+
+    Args:
+        matrices: row -> (2, 2) counts, true class down, predicted class across.
+        names: of class 0 and class 1.
+    """
+    columns = min(4, len(matrices))
+    lines = -(-len(matrices) // columns)
+    figure = Figure(figsize=(2.6 * columns, 2.7 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axis in axes[len(matrices) :]:
+        axis.set_visible(False)
+    for axis, (title, counts) in zip(axes, matrices.items(), strict=False):
+        shares = counts / counts.sum(axis=1, keepdims=True).clip(min=1)
+        axis.imshow(shares, cmap="Blues", vmin=0, vmax=1)
+        for (true, said), count in np.ndenumerate(counts):
+            ink = "white" if shares[true, said] > 0.5 else "black"
+            axis.text(
+                said, true, f"{shares[true, said]:.1%}\n{count:.0f}", ha="center", va="center", color=ink
+            )
+        axis.set_xticks([0, 1], names)
+        axis.set_yticks([0, 1], names, rotation=90, va="center")
+        axis.set_xlabel("predicted")
+        axis.set_ylabel("true")
+        axis.set_title(title)
+    return figure
+
+
+def misclassified(
+    speeds: np.ndarray, wrong: Mapping[str, np.ndarray], label: str, bins: Sequence[float]
+) -> Figure:
+    """Draw the share of gestures whose label is wrong against the speed of the slide (report, figure 7).
+
+    Args:
+        speeds: (B,), m per frame; 0 for a static touch.
+        wrong: row -> (B,), bool.
+        label: which label.
+        bins: edges in m per frame; static touches stand at 0 on their own.
+    """
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axis = figure.subplots()
+    edges = np.asarray(bins)
+    middles = np.concatenate([[0.0], (edges[1:] + edges[:-1]) / 2])
+    # Static touches go to group 0, a slide in bin k to group k.
+    group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, edges), 1, len(edges) - 1))
+    for (row, errors), colour in zip(wrong.items(), _COLOURS * 2, strict=False):
+        counts = np.bincount(group, minlength=len(middles))
+        shares = np.bincount(group, weights=errors, minlength=len(middles)) / np.maximum(counts, 1)
+        spread = np.sqrt(shares * (1 - shares) / np.maximum(counts, 1))
+        axis.errorbar(
+            middles * 1e3, shares, spread, marker="o", markersize=4, capsize=2, color=colour, label=row
+        )
+    axis.set_xlabel("speed, mm per frame (0: static)")
+    axis.set_ylabel(f"share with “{label}” wrong")
+    axis.set_ylim(bottom=0)
+    axis.legend(fontsize=8)
+    return figure
+
+
+def traces(readings: Mapping[str, Tensor], rate: float) -> Figure:
+    """Draw the most active sensor over time, one panel per simulator (report, figure 10).
+
+    Args:
+        readings: simulator -> (T, S), N, of the same gesture.
+        rate: Hz.
+    """
+    figure = Figure(figsize=(4.2 * len(readings), 3), layout="constrained")
+    axes = figure.subplots(1, len(readings), squeeze=False)[0]
+    for axis, (name, values) in zip(axes, readings.items(), strict=True):
+        sensor = int(values.amax(0).argmax())
+        axis.plot(np.arange(len(values)) / rate, values[:, sensor], color=_COLOURS[0], marker=".")
+        axis.set_title(f"{name}, sensor {sensor}")
+        axis.set_xlabel("time, s")
+        axis.set_ylabel("reading, N")
+    return figure
+
+
+def force_and_reading(force: Tensor, readings: Tensor, rate: float) -> Figure:
+    """Draw total applied force and the most active sensor's reading over time (report, figure 11).
+
+    Args:
+        force: (G, T), N, of a few gestures.
+        readings: (G, T, S), N.
+        rate: Hz.
+    """
+    count = len(force)
+    figure = Figure(figsize=(3.6 * count, 3), layout="constrained")
+    for axis, applied, values in zip(
+        figure.subplots(1, count, squeeze=False)[0], force, readings, strict=True
+    ):
+        time = np.arange(len(applied)) / rate
+        sensor = int(values.amax(0).argmax())
+        axis.plot(time, applied, color=_COLOURS[0])
+        axis.set_ylabel("applied force, N", color=_COLOURS[0])
+        axis.set_xlabel("time, s")
+        twin = axis.twinx()
+        twin.plot(time, values[:, sensor], color=_COLOURS[4])
+        twin.set_ylabel(f"sensor {sensor}, N", color=_COLOURS[4])
+    return figure

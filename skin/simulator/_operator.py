@@ -9,8 +9,6 @@ import json
 import os
 import tempfile
 import warnings
-import zipfile
-import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -132,7 +130,7 @@ def _load(path: Path, key: str, shape: tuple[int, int]) -> Operator | None:
             if str(file["key"]) != key:
                 return None
             rows = {field.name: file[field.name] for field in fields(Operator)}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except Exception:  # Whatever a broken archive raises, the answer is the same: build it anew.
         return None
     sound = all(
         row.shape == shape and row.dtype == np.float64 and np.isfinite(row).all() for row in rows.values()

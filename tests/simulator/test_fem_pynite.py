@@ -1,0 +1,110 @@
+"""PyNite, a finite-element program of others, as the referee of the plates and beams."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse.linalg import spsolve
+
+from skin.body.sheet import Sheet
+from skin.layout.base import Sensors
+from skin.simulator import _pynite
+from skin.simulator._assembly import Structure
+from skin.simulator.fem import PlatesAndBeams
+
+DRAGON = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
+ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}
+FOAM = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thickness": 0.003}
+BODIES = {
+    "3x3, one layer": Sheet([0.03, 0.03], [3, 3], [ECOFLEX]),
+    "6x5, flat cells, two layers": Sheet([0.05, 0.09], [6, 5], [DRAGON, ECOFLEX]),
+    "3x6, wide cells, two layers": Sheet([0.16, 0.07], [3, 6], [DRAGON, ECOFLEX]),
+    "5x4, three layers": Sheet([0.06, 0.05], [5, 4], [DRAGON, ECOFLEX, FOAM]),
+    "4x4, stiff on soft": Sheet([0.04, 0.04], [4, 4], [FOAM, DRAGON]),
+}
+LOADS = ("one cell off the centre", "random")
+
+
+def load(body: Sheet, kind: str) -> np.ndarray:
+    """Return a pressure (H, W), Pa, that is no mirror image of itself."""
+    pressure = np.zeros(body.shape)
+    if kind == "random":
+        return np.random.default_rng(0).uniform(0, 1e5, body.shape)
+    pressure[0, body.cells[0] - 2] = 8e4
+    return pressure
+
+
+def solved(structure: Structure, pressure: np.ndarray):
+    model = _pynite.model(structure, pressure)
+    _pynite.solve(model)
+    return model, _pynite.displacements(model, structure)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        (name, constraint, kind) for name in BODIES for constraint in ("vertical", "free") for kind in LOADS
+    ],
+    ids=" ".join,
+)
+def case(request):
+    name, constraint, kind = request.param
+    structure = Structure(BODIES[name], constraint)
+    pressure = load(structure.body, kind)
+    return structure, pressure, *solved(structure, pressure)
+
+
+def test_pynite_agrees_on_every_displacement_of_every_node(case):
+    structure, pressure, _, expected = case
+    motion = spsolve(structure.stiffness(), structure.load() @ pressure.ravel())
+    ours = motion.reshape(*structure.grid, -1)
+    for place, dof in enumerate(structure.free):
+        largest = np.abs(expected[..., dof]).max()
+        assert largest > 0
+        np.testing.assert_allclose(ours[..., place], expected[..., dof], rtol=0, atol=1e-6 * largest)
+
+
+def test_pynite_agrees_with_the_cached_operator_on_sensors_at_every_interface(case, tmp_path):
+    """D_s and D_t out of the file that the simulator works from, at places between nodes."""
+    structure, pressure, _, expected = case
+    body = structure.body
+    rng = np.random.default_rng(1)
+    count = 7
+    where = rng.uniform(0.05, 0.95, (count, 2)) * body.size
+    positions = np.column_stack([where, np.resize(body.interfaces, count)])
+    sensors = Sensors(positions, (0.01, 0.01))
+    PlatesAndBeams(body, sensors, constraint=structure.constraint, cache=tmp_path)
+    skin = PlatesAndBeams(body, sensors, constraint=structure.constraint, cache=tmp_path)
+    lines = [np.linspace(0, body.size[axis], body.cells[axis] + 1) for axis in (1, 0)]
+    into = [RegularGridInterpolator(lines, -expected[level, ..., 2]) for level in range(len(body.layers))]
+    at_sensor = [
+        into[index % len(body.layers)](position[[1, 0]])[0] for index, position in enumerate(positions)
+    ]
+    at_surface = into[-1](positions[:, [1, 0]])
+    largest = np.abs(at_surface).max()
+    for rows, answer in ((skin.operator.sensor, at_sensor), (skin.operator.surface, at_surface)):
+        np.testing.assert_allclose(rows @ pressure.ravel(), answer, rtol=0, atol=1e-6 * largest)
+    given = skin(torch.from_numpy(pressure)).displacement.numpy()
+    np.testing.assert_allclose(given, np.stack([at_sensor, at_surface], axis=-1), atol=1e-5 * largest)
+
+
+def test_pynite_reactions_on_the_table_carry_the_load(case):
+    """Held nodes above the table take nothing vertically: what is pressed on comes out below."""
+    structure, pressure, model, _ = case
+    table = sum(node.RxnFZ["Combo 1"] for name, node in model.nodes.items() if name.startswith("0,"))
+    force = pressure.sum() * np.prod(structure.body.cell)
+    assert table == pytest.approx(force, rel=1e-6)
+
+
+def test_pynite_agrees_on_the_force_that_the_layer_below_carries(tmp_path):
+    """A footprint around one node on its own section feels the axial force of that node's beam."""
+    structure = Structure(BODIES["5x4, three layers"])
+    body = structure.body
+    pressure = load(body, "random")
+    model, _ = solved(structure, pressure)
+    for level in range(3):
+        depth = body.interfaces[level]
+        sensors = Sensors(np.array([[2 * body.cell[0], 3 * body.cell[1], depth]]), body.cell)
+        skin = PlatesAndBeams(body, sensors, reading="interface", cache=tmp_path)
+        beam = model.members[f"{level + 1},3,2"]
+        assert skin.operator.carried @ pressure.ravel() == pytest.approx(beam.axial(0, "Combo 1"), rel=1e-6)

@@ -10,6 +10,8 @@ from skin.errors import InputError
 
 __all__ = ["TOUCH", "Measures", "Task", "Thresholds", "measure", "movie_labels"]
 
+_PART = 256
+
 
 @dataclass(frozen=True)
 class Task:
@@ -122,7 +124,10 @@ def measure(
     level = torch.full((count,), torch.inf).to(frames)
     lowest = contact * peak[:, None] / scale
     level.scatter_reduce_(0, index.flatten(), lowest.flatten(), "amin")
-    area = (flat > level[:, None]).sum(1)[index].where(touched, 0).amax(1) / (height * width)
+    # In parts that stay in the cache: the comparison of all cells at once would be as large as the movie.
+    parts = zip(flat.split(_PART), level[:, None].split(_PART), strict=True)
+    cells = torch.cat([(part > limit).sum(1) for part, limit in parts])
+    area = cells[index].where(touched, 0).amax(1) / (height * width)
 
     first = touched.int().argmax(1)
     places = centre[index]

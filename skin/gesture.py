@@ -1,0 +1,202 @@
+"""What a gesture is drawn from: its settings, and the draws of its body (shape, time) and of its path."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.labels import Thresholds
+from skin.shapes import Shapes
+
+__all__ = ["Draws", "GestureSettings", "draw_gestures", "draw_paths", "fold"]
+
+Draws = dict[str, np.ndarray]
+"""Named parameters of gestures, one entry each along the first axis."""
+
+_TRIES = 2000
+
+
+@dataclass(frozen=True)
+class GestureSettings:
+    """The difficulty of the task; ``conf/touch.yaml`` holds the same defaults and says each unit.
+
+    Ranges are (least, most), drawn evenly, both ends included.
+
+    Raises:
+        InputError: a range that is empty, out of order, or on the wrong side of its threshold.
+    """
+
+    window: int = 30
+    shapes: tuple[str, ...] = ("disc", "blurred_disc", "square", "bar", "fist", "hand", "fingertip")
+    small_area: tuple[float, float] = (0.01, 0.30)
+    big_area: tuple[float, float] = (0.30, 0.70)
+    tap: tuple[int, int] = (1, 3)
+    press: tuple[int, int] = (4, 20)
+    safe_peak: tuple[float, float] = (10e3, 90.5e3)
+    dangerous_peak: tuple[float, float] = (90.5e3, 180e3)
+    speed: tuple[float, float] = (0.003, 0.020)
+    path: float = 0.010
+    spare: float = 0.010
+    ramp: int = 3
+    redraws: int = 30
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    @classmethod
+    def of(cls, given: "Mapping[str, Any] | GestureSettings | None") -> "GestureSettings":
+        """Return the settings that a configuration means; what it leaves out keeps its default."""
+        if isinstance(given, GestureSettings):
+            return given
+        values = dict(given or {})
+        limits = values.pop("thresholds", {})
+        if isinstance(limits, Thresholds):
+            limits = vars(limits)
+        for keys, known, prefix in ((values, cls, "touch"), (limits, Thresholds, "touch.thresholds")):
+            names = [entry.name for entry in fields(known)]
+            if unknown := sorted(set(keys) - set(names)):
+                raise InputError(f"{prefix} has no {', '.join(unknown)}: it takes {', '.join(names)}")
+        values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        return cls(**values, thresholds=Thresholds(**limits))
+
+    def __post_init__(self) -> None:
+        lines = self.thresholds
+        if not self.shapes or isinstance(self.shapes, str):
+            raise InputError(
+                f"touch.shapes must list at least one shape, got {self.shapes!r}: as in [disc,hand]"
+            )
+        # (name, lowest allowed, highest allowed): a range beyond its threshold would be redrawn for ever.
+        for name, low, high in (
+            ("small_area", 0, lines.area),
+            ("big_area", lines.area, 1),
+            ("tap", 1, min(lines.frames, self.window)),
+            ("press", lines.frames + 1, self.window),
+            ("safe_peak", 0, lines.pressure),
+            ("dangerous_peak", lines.pressure, np.inf),
+            ("speed", 0, np.inf),
+        ):
+            self._check(name, low, high)
+        for name, low in (("path", 0), ("spare", 0), ("ramp", 2), ("redraws", 1)):
+            if getattr(self, name) < low:
+                raise InputError(f"touch.{name} must be at least {low}, got {getattr(self, name)}")
+        if self.tap[1] < 2:
+            raise InputError(
+                f"a touch slides over at least 2 frames, got touch.tap={list(self.tap)}: use [1,3]"
+            )
+        if self.path > self.speed[1]:
+            raise InputError(
+                f"touch.path={self.path} m is longer than the fastest touch moves in a frame "
+                f"({self.speed[1]} m): a tap of 2 frames could not slide so far; raise touch.speed"
+            )
+
+    def _check(self, name: str, low: float, high: float) -> None:
+        given = getattr(self, name)
+        if len(given) != 2 or not all(np.isfinite(given)) or given[0] > given[1] or given[1] <= 0:
+            raise InputError(f"touch.{name} must be a range [least, most] above 0, got {list(given)}")
+        if given[0] < low or given[1] > high or (name == "safe_peak" and given[0] == 0):
+            raise InputError(
+                f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: touch.thresholds and "
+                "touch.window decide; a pressure of 0 is no touch"
+            )
+
+
+def draw_gestures(
+    labels: np.ndarray,
+    settings: GestureSettings,
+    shapes: Shapes,
+    padded: bool,
+    generator: np.random.Generator,
+) -> Draws:
+    """Draw what the path does not change: shape, angle, area, duration, onset.
+
+    Shape, angle and area are redrawn, for static and dynamic alike, until the outline leaves ``spare`` along
+    both axes of the sheet: then every shape has room to slide, and only the path tells sliding from standing.
+
+    Args:
+        labels: (B, 4), bool, the wanted combinations.
+        settings: the difficulty.
+        shapes: what presses, on which sheet.
+        padded: the touch begins at a random frame of the window, not at its first.
+        generator: where randomness comes from; it draws for all gestures in every round.
+
+    Returns:
+        shape, angle (rad), scale (m), low and high (B, 2) (m), duration, onset (frames).
+    """
+    big, dynamic, press = labels[:, 0], labels[:, 1], labels[:, 2]
+    least, most = np.where(big[:, None], settings.big_area, settings.small_area).T
+    names = ("shape", "angle", "scale", "low", "high")
+    drawn: Draws = {}
+    todo = np.arange(len(labels))
+    for _ in range(_TRIES):
+        chance = generator.random((len(labels), 3))[todo]
+        shape = (chance[:, 0] * len(shapes.names)).astype(int)
+        angle = 2 * np.pi * chance[:, 1]
+        scale = shapes.scale(shape, least[todo] + (most - least)[todo] * chance[:, 2])
+        low, high = shapes.extent(shape, angle, scale)
+        for name, value in zip(names, (shape, angle, scale, low, high), strict=True):
+            drawn.setdefault(name, value.copy())[todo] = value
+        todo = todo[(high - low + settings.spare > shapes.body.size).any(axis=1)]
+        if not len(todo):
+            break
+    else:
+        raise _no_room(big[todo[0]], settings, shapes.body)
+
+    least, most = np.where(press[:, None], settings.press, settings.tap).T
+    least = np.where(dynamic, np.maximum(least, 2), least)
+    chance = generator.random((len(labels), 2))
+    duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
+    free = settings.window - duration if padded else np.zeros_like(duration)
+    return drawn | {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
+
+
+def _no_room(big: bool, settings: GestureSettings, body: Sheet) -> InputError:
+    kind = "big" if big else "small"
+    area = settings.big_area if big else settings.small_area
+    return InputError(
+        f"none of touch.shapes={list(settings.shapes)} covers {area[0]:g} to {area[1]:g} of a sheet of "
+        f"{body.size[0]:g} x {body.size[1]:g} m and leaves touch.spare={settings.spare:g} m along x and y: "
+        f"add a compact shape such as disc, or lower touch.{kind}_area or touch.spare"
+    )
+
+
+def draw_paths(
+    labels: np.ndarray,
+    gestures: Draws,
+    settings: GestureSettings,
+    size: tuple[float, float],
+    chance: np.ndarray,
+) -> Draws:
+    """Draw where gestures begin, where they go, how fast, and how hard they press.
+
+    A sliding touch moves along a straight line at constant speed, reflected at the limits of its room, so
+    that neither its duration nor its speed depends on its size.
+
+    Args:
+        labels: (B, 4), bool, the wanted combinations.
+        gestures: what :func:`draw_gestures` gave, (B, ...).
+        settings: the difficulty.
+        size: extent (x, y) of the sheet, m.
+        chance: (B, 5), 0 to 1.
+
+    Returns:
+        start (B, 2) within the room (m), room (B, 2) (m), direction (rad), speed (m per frame), peak (Pa).
+    """
+    dynamic, dangerous = labels[:, 1], labels[:, 3]
+    room = size - (gestures["high"] - gestures["low"])
+    slowest = np.maximum(settings.speed[0], settings.path / np.maximum(gestures["duration"] - 1, 1))
+    speed = slowest + (settings.speed[1] - slowest) * chance[:, 3]
+    least, most = np.where(dangerous[:, None], settings.dangerous_peak, settings.safe_peak).T
+    return {
+        "start": chance[:, :2] * room,
+        "room": room,
+        "direction": np.where(dynamic, 2 * np.pi * chance[:, 2], 0.0),
+        "speed": np.where(dynamic, speed, 0.0),
+        "peak": least + (most - least) * chance[:, 4],
+    }
+
+
+def fold(place: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """Return places reflected at 0 and ``room``, as a ball between two walls (a triangle wave)."""
+    round_trip = np.mod(place, 2 * room)
+    return np.minimum(round_trip, 2 * room - round_trip)

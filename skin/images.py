@@ -1,0 +1,102 @@
+"""Grey-scale images of what touches the skin: found by name, checked, and made ready for sampling."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
+
+from skin.errors import InputError
+
+__all__ = ["check", "load", "pyramid"]
+
+_ROOT = Path(__file__).parents[1]
+_FOLDER = _ROOT / "data" / "shapes"
+
+
+def load(name: str) -> np.ndarray:
+    """Return a shape's image (h, w), float64, 0 to 1.
+
+    Args:
+        name: the stem of a file in ``data/shapes``, or the path of any picture; a relative path is looked
+            for in the working directory, then in the repository.
+
+    Raises:
+        InputError: no such picture, unreadable, empty, black, or not finite.
+    """
+    path = _find(name)
+    try:
+        with Image.open(path) as file:
+            image: Image.Image = file
+            # Transparent means no force; deep and floating-point pictures keep their own range.
+            if "A" in image.getbands() or "transparency" in image.info:
+                cover = image.convert("RGBA")
+                image = Image.alpha_composite(Image.new("RGBA", cover.size, "black"), cover).convert("L")
+            elif image.mode not in ("F", "I") and not image.mode.startswith("I;16"):
+                image = image.convert("L")
+            pixels = np.asarray(image, dtype=float)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"cannot read the shape {name} ({path}): {error}; touch.shapes takes grey-scale pictures, "
+            "such as a PNG, white = full pressure"
+        ) from error
+    return check(pixels, name)
+
+
+def _find(name: str) -> Path:
+    path = Path(name).expanduser()
+    candidates = [path, _ROOT / path] if path.suffix else [_FOLDER / f"{name}.png", path]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate.resolve()
+    known = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.png")))
+    raise InputError(
+        f"no shape {name}: touch.shapes takes {known}, or the path of a picture, as in "
+        "touch.shapes=[disc,my.png]"
+    )
+
+
+def check(pixels: np.ndarray, name: str) -> np.ndarray:
+    """Return pixels (h, w) scaled so that the brightest is 1.
+
+    Raises:
+        InputError: no pixels, a pixel that is no number or below 0, or nothing but black.
+    """
+    if pixels.ndim != 2 or not pixels.size:
+        raise InputError(f"the shape {name} must be a grey-scale picture (h, w), got {pixels.shape} pixels")
+    if not np.isfinite(pixels).all():
+        raise InputError(f"the shape {name} has pixels that are NaN or infinite: give it finite grey values")
+    if pixels.min() < 0:
+        raise InputError(
+            f"the shape {name} has pixels below 0: pressure cannot pull; give it values from 0 up"
+        )
+    if pixels.max() == 0:
+        raise InputError(
+            f"the shape {name} is black all over, so it presses with no force: white = full pressure"
+        )
+    return pixels / pixels.max()
+
+
+def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
+    """Return the images at halving resolutions, each centred in a square of ``pixels``, a power of two.
+
+    An image with more pixels is averaged over areas down to the square; one with fewer keeps its own. A rim
+    of one black pixel stays around it, so that it ends where it ends.
+
+    Returns:
+        levels (N, 1, p, p), float32, p = pixels, pixels / 2, ... 1.
+    """
+    base = torch.zeros(len(images), 1, pixels, pixels, dtype=torch.float64)
+    for square, image in zip(base[:, 0], images, strict=True):
+        shrink = min(1.0, (pixels - 2) / max(image.shape))
+        height, width = (max(1, round(side * shrink)) for side in image.shape)
+        small = adaptive_avg_pool2d(torch.from_numpy(image)[None], (height, width))[0]
+        top, left = (pixels - height) // 2, (pixels - width) // 2
+        square[top : top + height, left : left + width] = small / small.max()
+    levels = [base]
+    while levels[-1].shape[-1] > 1:
+        levels.append(avg_pool2d(levels[-1], 2))
+    return [level.float() for level in levels]

@@ -1,0 +1,155 @@
+"""Shapes pressed on a sheet: their outline, their contact area, and their frames on the sheet's cells."""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from skin.body.sheet import Sheet
+from skin.images import load, pyramid
+
+__all__ = ["Shapes"]
+
+# Frames rendered at once: their sampling grid (32 KiB a frame on 32 x 32 cells) then stays in the cache.
+_CELLS_AT_ONCE = 128 * 1024
+_CALIBRATION_SIZES, _CALIBRATION_POSES = 24, 6
+
+
+class Shapes:
+    """Grey-scale images that can be pressed on a sheet at any place, angle and size.
+
+    A shape's *scale* is the length, m, of half its texture's side; its place is that of its texture's centre.
+
+    Args:
+        names: stems in ``data/shapes`` or paths of pictures.
+        body: the sheet.
+        contact: share of a gesture's peak cell above which a cell is in contact.
+
+    Attributes:
+        names: one per shape.
+        hulls: (N, K, 2), corners of each shape's convex outline (pixels above ``contact``), in scales.
+
+    Raises:
+        InputError: no shape, or a picture that cannot be used (:func:`skin.images.load`).
+    """
+
+    def __init__(self, names: Sequence[str], body: Sheet, contact: float = 0.02) -> None:
+        self.names = tuple(names)
+        self.body = body
+        self.contact = contact
+        # Cells are sampled at 2 x 2 points, a spacing apart.
+        self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
+        finest = max(64, max(body.size) / self.spacing)
+        self.levels = pyramid([load(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
+        self.hulls = _hulls(self.levels[0][:, 0].numpy(), contact)
+
+    def extent(
+        self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far the outline reaches from its place: lowest and highest (x, y), each (B, 2), m."""
+        cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        x, y = self.hulls[shape, :, 0], self.hulls[shape, :, 1]
+        corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) * scale[:, None, None]
+        return corners.min(axis=1), corners.max(axis=1)
+
+    def scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
+        """Return the scale (B,), m, at which shapes cover a share of the sheet, on average over places."""
+        scales, roots = self._calibration
+        result = np.empty(len(shape))
+        for number in np.unique(shape):
+            mine = shape == number
+            result[mine] = np.interp(np.sqrt(area[mine]), roots[number], scales[number])
+        return result
+
+    @cached_property
+    def _calibration(self) -> tuple[np.ndarray, np.ndarray]:
+        """Scales and the square roots of the area shares found there, each (N, sizes).
+
+        Cells at the rim count as whole although the shape covers them in part, so what a shape of a given
+        size covers depends on the mesh: it is measured once. The root is nearly linear in the scale.
+        """
+        poses = np.random.default_rng(0).random((_CALIBRATION_POSES, 3))
+        width = np.ptp(self.hulls, axis=1).min(axis=1)
+        largest = 1.5 * max(self.body.size) / width
+        scales = largest[:, None] * np.geomspace(1 / 128, 1, _CALIBRATION_SIZES)
+        angle = np.tile(2 * np.pi * poses[:, 0], _CALIBRATION_SIZES)
+        places = np.array(self.body.size) / 2 + (poses[:, 1:] - 0.5) * self.body.cell
+        places = np.tile(places, (_CALIBRATION_SIZES, 1))
+        roots = []
+        for number, sizes in enumerate(scales):
+            size = np.repeat(sizes, _CALIBRATION_POSES)
+            frames = self.render(np.full(len(size), number), angle, size, places).flatten(1)
+            share = (frames > self.contact * frames.amax(1, keepdim=True)).double().mean(1)
+            means = share.view(_CALIBRATION_SIZES, _CALIBRATION_POSES).mean(1).numpy()
+            roots.append(np.sqrt(np.maximum.accumulate(means)))
+        return scales, np.stack(roots)
+
+    def render(self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, place: np.ndarray) -> Tensor:
+        """Return frames (F, H, W), float32, each of sum 1 (report, equation 1).
+
+        Every cell is the mean of 2 x 2 bilinear samples of the texture whose pixels are about as far apart as
+        the samples, so that coarse cells see the average of the image and not single pixels of it. Sorted by
+        scale, frames are rendered in few runs.
+
+        Args:
+            shape: (F,), which shape.
+            angle: (F,), by which it is turned, from x towards y, rad.
+            scale: (F,), m.
+            place: (F, 2), m.
+        """
+        # A shape smaller than the samples' spacing would fall between them.
+        scale = np.maximum(scale, max(self.body.cell) / 4)
+        texel = 2 * scale / self.levels[0].shape[-1]
+        level = np.clip(np.floor(np.log2(self.spacing / texel)), 0, len(self.levels) - 1).astype(int)
+        turn = np.exp(-1j * angle) / scale
+        shift = turn * (place[:, 0] + 1j * place[:, 1])
+        frames = torch.empty(len(shape), *self.body.shape)
+        step = max(1, _CELLS_AT_ONCE // int(np.prod(self.body.shape)))
+        runs = np.split(np.arange(len(level)), np.flatnonzero(np.diff(level)) + 1)
+        for run in runs:
+            for start in range(0, len(run), step):
+                part = slice(run[start], run[min(start + step, len(run)) - 1] + 1)
+                texture = self.levels[level[run[0]]][torch.from_numpy(shape[part])]
+                frames[part] = self._sample(texture, turn[part], shift[part])
+        return frames
+
+    @cached_property
+    def _points(self) -> tuple[Tensor, Tensor]:
+        """Sample points along x (2 W,) and, times i, along y (2 H, 1), m.
+
+        The first halves of all cells, then the second ones, so that a mean over cells reads whole rows.
+        """
+        x, y = (
+            torch.cat([torch.arange(count) + 0.25, torch.arange(count) + 0.75]).double() * size
+            for count, size in zip(self.body.cells, self.body.cell, strict=True)
+        )
+        return x, 1j * y[:, None]
+
+    def _sample(self, texture: Tensor, turn: np.ndarray, shift: np.ndarray) -> Tensor:
+        """Return frames (f, H, W) of textures (f, 1, p, p) seen at ``turn * point - shift``, in scales."""
+        x, y = self._points
+        turns, shifts = (torch.from_numpy(values)[:, None, None] for values in (turn, shift))
+        # A turn of the plane is a product of complex numbers; its two real halves are what grid_sample takes.
+        across, down = (turns * x - shifts).to(torch.complex64), (turns * y).to(torch.complex64)
+        grid = torch.view_as_real(across + down)
+        samples = grid_sample(texture, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        upper, lower = samples[:, 0].chunk(2, dim=1)
+        left, right = (upper + lower).chunk(2, dim=2)
+        cells = left + right
+        return cells.div_(cells.sum((1, 2), keepdim=True))
+
+
+def _hulls(images: np.ndarray, contact: float) -> np.ndarray:
+    """Return the corners (N, K, 2) of the convex outlines of images (N, p, p), in scales."""
+    pixels = images.shape[-1]
+    hulls = []
+    for image in images:
+        rows, columns = np.nonzero(image > contact)
+        corners = np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
+        hulls.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
+    most = max(map(len, hulls))
+    return np.stack([np.pad(hull, ((0, most - len(hull)), (0, 0)), mode="edge") for hull in hulls])

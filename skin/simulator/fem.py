@@ -26,8 +26,8 @@ class PlatesAndBeams(AbstractSimulator):
     Each layer is a set of beams, one per node with the part of the sheet nearest to it as section, and the
     plates on their heads. Linear: no contact, no large strain.
 
-    Refinement is slow. Under a Gaussian touch of 15 mm standard deviation the default 32 x 32 cells give a D_s
-    16 %, a D_t 11 % and a share D_s / D_t 5 % smaller than 128 x 128 cells do; 64 x 64 come within 5 %. Under
+    Refinement is slow. Under a Gaussian touch of 15 mm standard deviation the default 32 x 32 cells give a
+    D_s 16 %, a D_t 11 % and a share D_s / D_t 5 % smaller than 128 x 128 cells do; 64 x 64 come within 5 %. Under
     uniform pressure the surface's edges deviate from its middle by -11 to +3 % (128 x 128: -1.4 to +0.3 %).
 
     Args:

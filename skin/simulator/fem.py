@@ -27,8 +27,9 @@ class PlatesAndBeams(AbstractSimulator):
     plates on their heads. Linear: no contact, no large strain.
 
     Refinement is slow. Under a Gaussian touch of 15 mm standard deviation the default 32 x 32 cells give a
-    D_s 16 %, a D_t 11 % and a share D_s / D_t 5 % smaller than 128 x 128 cells do; 64 x 64 come within 5 %. Under
-    uniform pressure the surface's edges deviate from its middle by -11 to +3 % (128 x 128: -1.4 to +0.3 %).
+    D_s 16 %, a D_t 11 % and a share D_s / D_t 5 % smaller than 128 x 128 cells do; 64 x 64 come within 5 %.
+    Under uniform pressure the surface's edges deviate from its middle by -11 to +3 % (128 x 128: -1.4 to
+    +0.3 %).
 
     Args:
         body: the sheet.

@@ -1,0 +1,42 @@
+# `make` alone lists the targets. Everything runs in .venv, built once from pinned constraints.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+BUDGET ?= full
+SEEDS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install test check bench ui reproduce-table clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel]"
+	touch $@
+
+install: $(READY)  ## build .venv; the other targets call it
+
+test: $(READY)  ## the test suite
+	$(BIN)/python -m pytest
+
+check: $(READY)  ## lint, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(READY)  ## speed and memory, into results/bench.json
+	$(BIN)/python experiments/bench.py
+
+ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
+	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
+		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
+
+reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke, SEEDS=3)
+	$(BIN)/python experiments/reproduce_table.py budget=$(BUDGET) seeds=$(SEEDS)
+
+clean:  ## remove what the targets made, but keep results and runs
+	rm -rf $(VENV) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

@@ -1,7 +1,6 @@
 """An upright Euler-Bernoulli beam of rectangular section.
 
-Its ends are the lower and the upper node, each with the six degrees of freedom (u, v, w, rx, ry, rz), w
-upwards.
+Its ends are the lower and the upper node, each with the degrees of freedom (u, v, w, rx, ry, rz), w upwards.
 """
 
 import numpy as np
@@ -48,8 +47,7 @@ def _unit(mode: str, length: float) -> np.ndarray:
         ends = [first, first + 6]
         matrix[np.ix_(ends, ends)] = np.array([[1, -1], [-1, 1]]) / length
         return matrix
-    # Bending couples a deflection and a rotation at each end; about y a positive rotation is a negative
-    # slope.
+    # Bending couples a deflection and a rotation at each end; about y a rotation is a negative slope.
     ends, sign = ([1, 5, 7, 11], 1) if mode == "about_z" else ([2, 4, 8, 10], -1)
     arm = sign * length
     matrix[np.ix_(ends, ends)] = (

@@ -11,8 +11,7 @@ from skin.material import Material
 __all__ = ["pressure_load", "stiffness"]
 
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
-# Powers (of x, of y) of the twelve terms of the deflection (Melosh 1963; Zienkiewicz and Taylor, section
-# 4.3).
+# Powers (of x, of y) of the twelve terms of the deflection (Melosh 1963).
 _POWERS = np.array(
     [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3), (3, 1), (1, 3)]
 )

@@ -33,7 +33,7 @@ class AbstractLearner(ABC):
 
     @abstractmethod
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L), for touches of any layout that the learner can take."""
+        """Return the probability of each label, (B, L), for touches of any layout that can be taken."""
 
     @abstractmethod
     def save(self, folder: Path) -> Path:

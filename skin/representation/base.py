@@ -23,8 +23,8 @@ class Frames(NamedTuple):
 class AbstractRepresentation(nn.Module, ABC):
     """Maps readings (B, T, S) in N with their validity to :class:`Frames`.
 
-    Built for one layout: ``cls(positions, size, **options)`` with positions (S, 3), m, and the sheet's size (x, y), m.
-    Readings are divided by ``scale``, N; invalid ones become 0.
+    Built for one layout: ``cls(positions, size, **options)`` with positions (S, 3), m, and the sheet's size
+    (x, y), m. Readings are divided by ``scale``, N; invalid ones become 0.
 
     Attributes:
         kind: what a model must take: images, graphs or plain readings.

@@ -1,0 +1,103 @@
+"""The one training step of every network."""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from skin.errors import InputError
+from skin.fusion.base import AbstractFusion
+from skin.labels import Task
+from skin.model._activation import activation as activation_of
+from skin.representation.base import Frames
+
+__all__ = ["Batch", "MakeOptimizer", "TouchClassifier", "probabilities"]
+
+Batch = tuple[Frames, Tensor]
+MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
+
+
+def probabilities(logits: Tensor, task: Task) -> Tensor:
+    """Return the probability of each label, (B, L), from logits (B, L)."""
+    return logits.softmax(dim=-1) if task.kind == "exclusive" else logits.sigmoid()
+
+
+class TouchClassifier(pl.LightningModule):
+    """Dense layers on the embedding of a window, and how they learn.
+
+    Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
+    per epoch.
+
+    Args:
+        fusion: makes the embedding (B, E) of frames.
+        task: what the labels mean: its length is the number of logits, its kind decides the loss.
+        hidden: widths of the dense layers before the last one.
+        activation: relu, elu or silu, after each of them.
+        optimizer: short of the parameters.
+
+    Raises:
+        InputError: the task is of a kind that has no loss here.
+    """
+
+    def __init__(
+        self,
+        fusion: AbstractFusion,
+        task: Task,
+        hidden: Sequence[int],
+        activation: str,
+        optimizer: MakeOptimizer,
+    ) -> None:
+        super().__init__()
+        if task.kind not in ("binary", "exclusive"):
+            raise InputError(f"networks learn binary and exclusive labels, got a task of kind {task.kind}")
+        widths = [fusion.width, *hidden]
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            layers += [nn.Linear(before, after), activation_of(activation)]
+        self.fusion = fusion
+        self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
+        self.task = task
+        self._make_optimizer = optimizer
+
+    def forward(self, frames: Frames) -> Tensor:
+        """Return the logits (B, L) of frames."""
+        return self.head(self.fusion(frames))
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1."""
+        if self.task.kind == "exclusive":
+            return F.cross_entropy(logits, labels)
+        return F.binary_cross_entropy_with_logits(logits, labels)
+
+    def _step(self, batch: Batch, stage: str) -> Tensor:
+        frames, labels = batch
+        logits = self(frames)
+        loss = self.loss(logits, labels)
+        values = {f"{stage}_loss": loss.detach()} | {
+            f"{stage}_{name}": value for name, value in self._accuracy(logits.detach(), labels).items()
+        }
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(labels))
+        return loss
+
+    def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
+        if self.task.kind == "exclusive":
+            return {"accuracy": (logits.argmax(dim=-1) == labels.argmax(dim=-1)).float().mean()}
+        right = ((logits > 0) == (labels > 0.5)).float().mean(dim=0)
+        each = {f"accuracy_{name}": right[i] for i, name in enumerate(self.task.names)}
+        return {"accuracy": right.mean(), **each}
+
+    def training_step(self, batch: Batch, index: int) -> Tensor:
+        """Return the loss of one batch."""
+        return self._step(batch, "train")
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        """Log the loss and accuracy of one batch."""
+        self._step(batch, "val")
+
+    def configure_optimizers(self) -> Any:
+        """Return the optimizer over all parameters."""
+        return self._make_optimizer(self.parameters())

@@ -1,0 +1,126 @@
+"""Touches as batches of frames."""
+
+from collections.abc import Callable, Iterator
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+
+from skin.classifier import Batch
+from skin.device.base import AbstractDevice
+from skin.errors import InputError
+from skin.labels import Task
+from skin.recording import Touches
+from skin.representation.base import AbstractRepresentation
+
+__all__ = ["MakeRepresentation", "TouchData"]
+
+MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
+
+
+class TouchData(pl.LightningDataModule):
+    """Cuts a device's touches into batches and shows them as a representation does.
+
+    Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
+    one. A device that draws fresh gestures is asked again every epoch.
+
+    Args:
+        device: source of touches.
+        representation: short of positions (S, 3), m, and size (x, y), m.
+        batch_size: gestures per batch.
+        seed: of the order of gestures; epoch e uses (seed, e).
+
+    Attributes:
+        device: as given.
+        task: what the labels mean.
+        window: number of frames per touch.
+    """
+
+    def __init__(
+        self, device: AbstractDevice, representation: MakeRepresentation, batch_size: int = 64, seed: int = 0
+    ) -> None:
+        super().__init__()
+        if batch_size < 1:
+            raise InputError(f"a batch needs at least one gesture, got {batch_size}: set data.batch_size=64")
+        self.device, self.batch_size, self.seed = device, batch_size, seed
+        self._make = representation
+        self._known: tuple[Tensor, AbstractRepresentation] | None = None
+        self._drawn: dict[str, Touches] = {}
+
+    @property
+    def task(self) -> Task:
+        """What the labels mean."""
+        return self.device.task
+
+    @property
+    def window(self) -> int:
+        """Number of frames per touch."""
+        return self.touches("train").readings.shape[1]
+
+    def touches(self, split: str, epoch: int = 0) -> Touches:
+        """Return the touches of a split; those of epoch 0 are kept."""
+        if epoch == 0 or not getattr(self.device, "fresh", False):
+            if split not in self._drawn:
+                self._drawn[split] = self.device.touches(split)  # type: ignore[arg-type]
+            return self._drawn[split]
+        return self.device.touches(split, epoch)  # type: ignore[arg-type]
+
+    def representation_for(self, positions: Tensor) -> AbstractRepresentation:
+        """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
+
+        Raises:
+            InputError: positions that change with time, (B, T, S, 3).
+        """
+        if positions.ndim != 2:
+            raise InputError(
+                "representations are built for sensors that stay in place, got positions per frame: "
+                "give one position (x, y, z) per sensor"
+            )
+        if self._known is None or not torch.equal(self._known[0], positions):
+            self._known = (positions, self._make(positions, self.device.size).requires_grad_(False))
+        return self._known[1]
+
+    def frames(self, touches: Touches) -> Batch:
+        """Return the frames of touches and their labels (B, L), on the touches' device."""
+        if touches.labels is None:
+            raise InputError("touches without labels cannot be learnt from: record them with labels")
+        representation = self.representation_for(touches.positions.cpu()).to(touches.readings.device)
+        return representation(touches.readings, touches.valid), touches.labels
+
+    def train_dataloader(self) -> "_Batches":
+        """Return the batches of the training split, in another order each epoch."""
+        return _Batches(self, "train")
+
+    def val_dataloader(self) -> "_Batches":
+        """Return the batches of the validation split."""
+        return _Batches(self, "validation")
+
+    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
+        """Return the frames and labels of a batch that has arrived where the network is."""
+        return self.frames(batch)
+
+
+class _Batches:
+    """The batches of one split; no torch DataLoader, which would touch every sample by itself."""
+
+    def __init__(self, data: TouchData, split: str) -> None:
+        self.data, self.split = data, split
+
+    def __len__(self) -> int:
+        return -(-len(self.data.touches(self.split)) // self.data.batch_size)
+
+    def __iter__(self) -> Iterator[Touches]:
+        data = self.data
+        if self.split != "train":
+            yield from map(data.touches(self.split).__getitem__, self._slices())
+            return
+        epoch = data.trainer.current_epoch if data.trainer else 0
+        touches = data.touches(self.split, epoch)
+        # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
+        generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
+        for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
+            yield touches[index]
+
+    def _slices(self) -> Iterator[slice]:
+        size = self.data.batch_size
+        return (slice(start, start + size) for start in range(0, len(self.data.touches(self.split)), size))

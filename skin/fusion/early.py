@@ -1,0 +1,46 @@
+"""Time as channels."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.fusion.base import AbstractFusion, MakeModel
+from skin.model.base import Kind
+from skin.representation.base import Frames
+
+__all__ = ["Early"]
+
+
+class Early(AbstractFusion):
+    """Stacks the frames as channels of one image or as features of one graph (report, 3.2.2 and 3.2.3).
+
+    Fast, since the model runs once per window; but every frame has weights of its own, so the length of the
+    window is fixed and a touch that comes later looks like another touch.
+
+    Args:
+        model: short of its shapes.
+        kind: what the representation yields.
+        shape: of one frame: (C, H, W), (S, F) or (F,).
+        window: number of frames.
+    """
+
+    def __init__(self, model: MakeModel, kind: Kind, shape: Sequence[int], window: int) -> None:
+        super().__init__()
+        stacked = (shape[0], window * shape[1]) if kind == "graph" else (window * shape[0], *shape[1:])
+        self.kind, self.window = kind, window
+        self.model = model(kind, stacked)
+        self.width = self.model.width
+
+    def forward(self, frames: Frames) -> Tensor:
+        """Return the embeddings (B, E) of windows of the length that was built for."""
+        x, adjacency = frames
+        if x.shape[1] != self.window:
+            raise InputError(
+                f"fusion=early is made for windows of {self.window} frames, got {x.shape[1]}: "
+                "train with fusion=late, which takes any length"
+            )
+        if adjacency is not None and adjacency.ndim > 2:
+            raise InputError("fusion=early needs one graph for all frames: use fusion=late")
+        stacked = x.transpose(1, 2).flatten(2) if self.kind == "graph" else x.flatten(1, 2)
+        return self.model(stacked, adjacency)

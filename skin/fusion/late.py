@@ -1,0 +1,55 @@
+"""Every frame by itself, then a head over time."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.fusion._heads import HEADS
+from skin.fusion.base import AbstractFusion, MakeModel
+from skin.model.base import Kind
+from skin.representation.base import Frames
+
+__all__ = ["Late"]
+
+
+class Late(AbstractFusion):
+    """Encodes every frame with the same weights and folds the embeddings (report, sections 3.2.4 and 3.2.5).
+
+    Takes windows of any length. The model runs once per frame, so it costs what the window is long.
+
+    Args:
+        model: short of its shapes.
+        kind: what the representation yields.
+        shape: of one frame: (C, H, W), (S, F) or (F,).
+        window: number of frames; any other length is taken too.
+        head: over time: mean, max, conv, lstm, gru or attention+gru.
+        hidden: width of the head, where it has weights.
+
+    Raises:
+        InputError: an unknown head.
+    """
+
+    def __init__(
+        self,
+        model: MakeModel,
+        kind: Kind,
+        shape: Sequence[int],
+        window: int,
+        head: str = "gru",
+        hidden: int = 64,
+    ) -> None:
+        super().__init__()
+        if head not in HEADS:
+            raise InputError(f"unknown head {head!r}: set fusion.head to one of {', '.join(HEADS)}")
+        self.model = model(kind, shape)
+        self.head = HEADS[head](self.model.width, hidden)
+        self.width = int(self.head.width)  # type: ignore[arg-type]
+
+    def forward(self, frames: Frames) -> Tensor:
+        """Return the embeddings (B, E) of windows of any length."""
+        x, adjacency = frames
+        if adjacency is not None and adjacency.ndim > 2:
+            adjacency = adjacency.flatten(0, 1)
+        embeddings = self.model(x.flatten(0, 1), adjacency)
+        return self.head(embeddings.unflatten(0, x.shape[:2]))

@@ -1,0 +1,123 @@
+"""Learning by gradient descent."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from skin.fusion.base import AbstractFusion
+from skin.learner.base import AbstractLearner
+from skin.recording import Touches
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger
+
+    from skin.classifier import MakeOptimizer, TouchClassifier
+    from skin.datamodule import TouchData
+
+__all__ = ["Network"]
+
+CHUNK = 256  # touches at a time when predicting: bounds memory to about 1 GB for the largest row
+
+
+class Network(AbstractLearner):
+    """Trains ``fusion(model)`` on frames and keeps the weights of the best validation loss.
+
+    Args:
+        model: short of kind and shape.
+        fusion: short of model, kind, shape and window.
+        optimizer: short of the parameters.
+        trainer: settings of pytorch_lightning.Trainer: max_epochs, accelerator, ...
+        hidden: widths of the dense layers between embedding and labels.
+        activation: relu, elu or silu, after each of them.
+        seed: of weights, dropout and nothing else; the caller's random state is left as it was.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        fusion: Callable[..., AbstractFusion],
+        optimizer: "MakeOptimizer",
+        trainer: dict[str, Any],
+        hidden: Sequence[int] = (32,),
+        activation: str = "relu",
+        seed: int = 0,
+    ) -> None:
+        self._fusion = partial(fusion, model)
+        self._optimizer, self._trainer = optimizer, dict(trainer)
+        self._hidden, self._activation, self._seed = hidden, activation, seed
+        self._data: TouchData | None = None
+        self._classifier: TouchClassifier | None = None
+
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Train on the training split; validation chooses the epoch.
+
+        Raises:
+            InputError: the choices do not fit each other or the data.
+        """
+        from pytorch_lightning import Trainer
+        from pytorch_lightning.callbacks import ModelCheckpoint
+
+        from skin.learner._clock import Clock
+
+        clock = Clock()
+        with torch.random.fork_rng(), TemporaryDirectory() as folder:
+            torch.manual_seed(self._seed)
+            classifier = self._build(data)
+            best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
+            settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
+            trainer = Trainer(
+                **settings,
+                logger=logger or False,
+                callbacks=[best, clock],
+                enable_model_summary=False,
+                default_root_dir=folder,
+            )
+            trainer.fit(classifier, datamodule=data)
+            weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
+            classifier.load_state_dict(weights["state_dict"])
+        self.seconds_per_epoch = sum(clock.seconds) / len(clock.seconds)
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of any layout that the model takes."""
+        from skin.classifier import probabilities
+
+        if self._classifier is None or self._data is None:
+            raise RuntimeError("fit or load the learner first")
+        classifier = self._classifier.eval()
+        representation = self._data.representation_for(touches.positions.cpu()).to(classifier.device)
+        parts = []
+        with torch.inference_mode():
+            for start in range(0, len(touches), CHUNK):
+                part = touches[start : start + CHUNK].to(classifier.device)
+                logits = classifier(representation(part.readings, part.valid))
+                parts.append(probabilities(logits, classifier.task).cpu())
+        return torch.cat(parts)
+
+    def save(self, folder: Path) -> Path:
+        """Write the weights to ``weights.pt`` in ``folder`` and return its path."""
+        if self._classifier is None:
+            raise RuntimeError("fit or load the learner first")
+        path = Path(folder) / "weights.pt"
+        torch.save(self._classifier.state_dict(), path)
+        return path
+
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Take the weights that ``save`` wrote; ``data`` gives the shapes as in ``fit``."""
+        self._build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
+
+    def _build(self, data: "TouchData") -> "TouchClassifier":
+        """Make the network for the frames that ``data`` gives."""
+        from skin.classifier import TouchClassifier
+
+        frames, _ = data.frames(data.touches("train")[:1])
+        kind = data.representation_for(data.touches("train").positions).kind
+        fusion = self._fusion(kind, tuple(frames.x.shape[2:]), frames.x.shape[1])
+        classifier = TouchClassifier(fusion, data.task, self._hidden, self._activation, self._optimizer)
+        self._data, self._classifier = data, classifier
+        self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
+        return classifier

@@ -1,0 +1,41 @@
+"""A plain multi-layer perceptron on the readings."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import ClassVar
+
+from torch import Tensor, nn
+
+from skin.model._activation import activation as activation_of
+from skin.model.base import AbstractModel, Kind
+
+__all__ = ["Mlp"]
+
+
+class Mlp(AbstractModel):
+    """Dense layers on the vector of readings: sensors keep their identity, so it serves one layout only.
+
+    Args:
+        kind: must be ``readings``.
+        shape: (F,).
+        widths: of the layers; the last one is the embedding. Empty: the readings themselves are the
+            embedding, which leaves all work to the recurrent layer of ``fusion=late``.
+        activation: relu, elu or silu, after every layer.
+    """
+
+    takes: ClassVar[Kind] = "readings"
+
+    def __init__(
+        self, kind: Kind, shape: Sequence[int], widths: Sequence[int] = (64, 64), activation: str = "relu"
+    ) -> None:
+        super().__init__(kind)
+        sizes = [*shape, *widths]
+        pairs = pairwise(sizes)
+        self.layers = nn.Sequential(
+            *(layer for pair in pairs for layer in (nn.Linear(*pair), activation_of(activation)))
+        )
+        self.width = sizes[-1]
+
+    def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
+        """Return the embeddings (N, E) of readings (N, F)."""
+        return self.layers(x)

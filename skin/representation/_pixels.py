@@ -1,0 +1,34 @@
+"""The pixel grid that covers the sheet, shared by the image representations."""
+
+import numpy as np
+
+from skin.errors import InputError
+
+__all__ = ["centres", "check_pixels", "pixel_of"]
+
+
+def check_pixels(pixels: int) -> int:
+    """Return the edge length of a square image in pixels, at least 8.
+
+    Raises:
+        InputError: it is smaller, or no whole number.
+    """
+    if not isinstance(pixels, int) or pixels < 8:
+        raise InputError(
+            f"an image must be at least 8 pixels wide, got {pixels!r}: set e.g. representation.pixels=64"
+        )
+    return pixels
+
+
+def pixel_of(positions: np.ndarray, size: tuple[float, float], pixels: int) -> np.ndarray:
+    """Return the flat index (S,) of the pixel in which each position (S, 3), m, falls; rows run along y."""
+    scaled = np.floor(positions[:, :2] / np.asarray(size) * pixels).astype(int)
+    column, row = np.clip(scaled, 0, pixels - 1).T
+    return row * pixels + column
+
+
+def centres(size: tuple[float, float], pixels: int) -> np.ndarray:
+    """Return the centres (pixels * pixels, 2) of all pixels as x, y in m, row by row."""
+    middle = (np.arange(pixels) + 0.5) / pixels
+    y, x = np.meshgrid(middle * size[1], middle * size[0], indexing="ij")
+    return np.stack([x.ravel(), y.ravel()], axis=1)

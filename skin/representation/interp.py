@@ -1,0 +1,91 @@
+"""An image interpolated between the sensors."""
+
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from scipy.interpolate import CloughTocher2DInterpolator, LinearNDInterpolator, NearestNDInterpolator
+from scipy.spatial import QhullError
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.representation._channels import channels
+from skin.representation._pixels import centres, check_pixels
+from skin.representation.base import AbstractRepresentation, Frames
+
+__all__ = ["Interpolation", "weights"]
+
+Method = Literal["nearest", "linear", "cubic"]
+
+
+def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarray:
+    """Return the matrix (P, S) that interpolates values at ``points`` (S, 2) to ``targets`` (P, 2).
+
+    Every method is linear in the values, so the images of the S unit readings are its columns: nearest;
+    linear on the Delaunay triangles; cubic after Clough and Tocher. Outside the convex hull the nearest value
+    holds.
+
+    Raises:
+        InputError: an unknown method, or points of which no triangle can be made.
+    """
+    unit = np.eye(len(points))
+    matrix = NearestNDInterpolator(points, unit)(targets)
+    if method == "nearest":
+        return matrix
+    try:
+        if method == "linear":
+            inner = LinearNDInterpolator(points, unit)(targets)
+        elif method == "cubic":
+            # the gradients come from an iteration: only a converged one is linear in the values
+            inner = CloughTocher2DInterpolator(points, unit, tol=1e-12, maxiter=5000)(targets)
+        else:
+            raise InputError(
+                f"unknown interpolation {method!r}: set representation.method=nearest, linear or cubic"
+            )
+    except QhullError:
+        raise InputError(
+            f"representation.method={method} needs at least three sensors that are not in one line, "
+            f"got {len(points)}: set representation.method=nearest"
+        ) from None
+    return np.where(np.isnan(inner), matrix, inner)
+
+
+class Interpolation(AbstractRepresentation):
+    """Fills the image between the sensors (report, section 2.2 and figure 4).
+
+    One precomputed matrix of (pixels * pixels, S), applied to whole batches. It guesses values where nothing
+    was measured: pleasant to look at; whether it helps a network is a question for the table.
+
+    Args:
+        positions: (S, 3), m.
+        size: extent (x, y) of the sheet, m; the square image covers all of it.
+        method: nearest, linear or cubic; see :func:`weights`.
+        pixels: edge length of the image.
+        scale: N; readings are divided by it.
+        mask: append the interpolated validity as a channel.
+
+    Raises:
+        InputError: an unknown method, too few sensors for it, or ``pixels`` below 8.
+    """
+
+    kind: ClassVar[Literal["image", "graph", "readings"]] = "image"
+    matrix: Tensor
+
+    def __init__(
+        self,
+        positions: Tensor,
+        size: tuple[float, float],
+        method: Method = "linear",
+        pixels: int = 64,
+        scale: float = 10.0,
+        mask: bool = False,
+    ) -> None:
+        super().__init__()
+        self.pixels, self.scale, self.mask = check_pixels(pixels), scale, mask
+        matrix = weights(positions[:, :2].cpu().numpy(), centres(size, pixels), method)
+        self.register_buffer("matrix", torch.from_numpy(matrix).to(torch.float32))
+
+    def forward(self, readings: Tensor, valid: Tensor) -> Frames:
+        """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
+        values = channels(readings, valid, self.scale, self.mask).mT @ self.matrix.mT
+        return Frames(values.unflatten(-1, (self.pixels, self.pixels)), None)

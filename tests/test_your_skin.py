@@ -2,11 +2,14 @@
 
 import os
 import re
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "your-skin.md").read_text()
@@ -16,14 +19,12 @@ COMMANDS = re.findall(r"^```bash\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A home with the page's files, and a stand-in for the checkout that runs write into."""
+    """A home with the page's files, and a stand-in for the checkout where runs leave their output."""
     home = tmp_path_factory.mktemp("home")
     for name, text in FILES.items():
         path = home / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    (home / "bin").mkdir()
-    (home / "bin" / "python").symlink_to(sys.executable)
     (home / "checkout").mkdir()
     (home / "checkout" / "experiments").symlink_to(ROOT / "experiments")
     return home
@@ -52,4 +53,35 @@ def run(command: str, home: Path) -> str:
 
 def test_the_page_has_the_files_and_commands_of_the_walk():
     assert sorted(FILES) == ["my-skin/body/mine.yaml", "my-skin/sensors.csv"]
-    assert len(COMMANDS) == 3
+    assert ["--cfg job" in command for command in COMMANDS] == [True, False, True]
+
+
+def test_the_configuration_that_the_page_prints_is_the_users(home):
+    shown = OmegaConf.create(run(COMMANDS[0], home))
+    body = instantiate(shown.body)
+    assert (body.size, body.cells, len(body.layers)) == ((0.15, 0.10), (30, 20), 3)
+    assert [layer.material.young for layer in body.layers] == [560e3, 40e3, 69e3]
+    assert shown.layout._target_ == "skin.layout.file.File"
+    assert shown.layout.path == "~/my-skin/sensors.csv"
+    assert shown.layout.footprint == [0.008, 0.008]
+
+
+def test_the_overrides_of_the_page_describe_the_same_sheet(home):
+    shown = OmegaConf.create(run(COMMANDS[2], home))
+    body = instantiate(shown.body)
+    sensors = instantiate(shown.layout).sensors(body)
+    assert (body.size, body.thickness) == ((0.15, 0.10), pytest.approx(0.016))
+    assert body.layers[1].material.young == 69e3
+    assert len(sensors) == 8
+
+
+@pytest.mark.slow
+def test_the_training_of_the_page_runs(home):
+    run(
+        f"{COMMANDS[1].strip()} tracking.uri=sqlite:///{home}/mlflow.db tracking.artifacts={home}/artifacts",
+        home,
+    )
+    with sqlite3.connect(home / "mlflow.db") as database:
+        states = database.execute("select status from runs").fetchall()
+    database.close()
+    assert states == [("FINISHED",)]

@@ -1,11 +1,15 @@
 """Touches, the type that every device yields, and Recording, its stored form."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["Touches"]
+from skin.labels import Task
+
+__all__ = ["Recording", "Touches", "join"]
 
 
 @dataclass(frozen=True)
@@ -39,9 +43,11 @@ class Touches:
             raise ValueError(f"valid must be bool, got {self.valid.dtype}")
         batch, time, sensors = self.readings.shape
         if tuple(self.positions.shape) not in {(sensors, 3), (batch, time, sensors, 3)}:
-            raise ValueError(f"positions must be (S, 3) or (B, T, S, 3) with S = {sensors}, got {tuple(self.positions.shape)}")
+            raise ValueError(
+                f"positions must be (S, 3) or (B, T, S, 3), S = {sensors}, got {tuple(self.positions.shape)}"
+            )
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
-            raise ValueError(f"labels must be (B, L) with B = {batch}, got {tuple(self.labels.shape)}")
+            raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
     def __len__(self) -> int:
         return len(self.readings)
@@ -58,5 +64,86 @@ class Touches:
 
     def to(self, device: torch.device | str) -> "Touches":
         """Return these touches with every tensor on ``device``."""
-        moved = (getattr(self, field.name) for field in fields(self))
-        return Touches(*(value.to(device) if isinstance(value, Tensor) else value for value in moved))
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        moved: dict[str, Any] = {
+            name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
+        }
+        return replace(self, **moved)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Touches with all that is known about them, as :mod:`skin.storage` keeps them in a file.
+
+    Attributes:
+        touches: B touches of T frames; their positions are common to all, (S, 3).
+        task: what the labels mean.
+        size: extent (x, y) of the sheet, m.
+        footprint: extent (x, y) over which a sensor feels, m.
+        force: applied force, (B, T), N; None where nobody knows it.
+        displacement: (B, T, S, 2), m: D_s and D_t (``skin.simulator.base.Response``); or None.
+        parameters: (B,) each, float32: what else is known of each gesture.
+        metadata: anything that JSON can hold: seeds, versions, hashes, a summary.
+
+    Raises:
+        ValueError: shapes disagree.
+    """
+
+    touches: Touches
+    task: Task
+    size: tuple[float, float]
+    footprint: tuple[float, float]
+    force: Tensor | None = None
+    displacement: Tensor | None = None
+    parameters: dict[str, Tensor] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.touches.readings.shape)
+        if self.touches.positions.ndim != 2:
+            raise ValueError("a recording has one layout: positions must be (S, 3)")
+        if self.force is not None and tuple(self.force.shape) != shape[:2]:
+            raise ValueError(f"force must be (B, T) = {shape[:2]}, got {tuple(self.force.shape)}")
+        if self.displacement is not None and tuple(self.displacement.shape) != (*shape, 2):
+            raise ValueError(f"displacement must be (B, T, S, 2), got {tuple(self.displacement.shape)}")
+        for name, values in self.parameters.items():
+            if tuple(values.shape) != shape[:1]:
+                raise ValueError(f"parameter {name} must be (B,) = {shape[:1]}, got {tuple(values.shape)}")
+        if self.touches.labels is not None and self.touches.labels.shape[1] != len(self.task):
+            raise ValueError(f"labels must be (B, {len(self.task)}), got {tuple(self.touches.labels.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.touches)
+
+    def __getitem__(self, index: Tensor | slice) -> "Recording":
+        """Return the recording of the touches that ``index`` selects."""
+        return replace(
+            self,
+            touches=self.touches[index],
+            force=None if self.force is None else self.force[index],
+            displacement=None if self.displacement is None else self.displacement[index],
+            parameters={name: values[index] for name, values in self.parameters.items()},
+        )
+
+
+def join(parts: Sequence[Recording]) -> Recording:
+    """Return one recording of all touches of ``parts``, which agree on the rest; the first one's metadata."""
+    first = parts[0]
+
+    def together(tensors: Iterable[Tensor | None]) -> Tensor | None:
+        known = [tensor for tensor in tensors if tensor is not None]
+        return torch.cat(known) if known else None
+
+    touches = replace(
+        first.touches,
+        readings=torch.cat([part.touches.readings for part in parts]),
+        valid=torch.cat([part.touches.valid for part in parts]),
+        labels=together(part.touches.labels for part in parts),
+    )
+    return replace(
+        first,
+        touches=touches,
+        force=together(part.force for part in parts),
+        displacement=together(part.displacement for part in parts),
+        parameters={name: torch.cat([part.parameters[name] for part in parts]) for name in first.parameters},
+    )

@@ -52,14 +52,17 @@ class Movie:
         """Return the dense movie, (B, T, H, W), Pa."""
         return self.frames[self.index] * self.scale[..., None, None]
 
-    def respond(self, simulator: AbstractSimulator) -> Response:
-        """Return a simulator's readings (B, T, S), N, and displacement (B, T, S, 2), m, or None."""
+    def respond(self, simulator: AbstractSimulator, displacement: bool = True) -> Response:
+        """Return a simulator's readings (B, T, S), N, and displacement (B, T, S, 2), m.
+
+        The displacement is None if the simulator knows none, or if it is not asked for.
+        """
         home = next(simulator.buffers(), self.frames).device
-        readings, displacement = simulator(self.frames.to(home))
+        readings, moves = simulator(self.frames.to(home))
         index, scale = self.index.to(home), self.scale.to(home)
-        if displacement is not None:
-            displacement = displacement[index] * scale[..., None, None]
-        return Response(readings[index] * scale[..., None], displacement)
+        if not displacement or moves is None:
+            return Response(readings[index] * scale[..., None], None)
+        return Response(readings[index] * scale[..., None], moves[index] * scale[..., None, None])
 
 
 def balanced(count: int, generator: np.random.Generator) -> np.ndarray:

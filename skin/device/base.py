@@ -26,7 +26,7 @@ class AbstractDevice(ABC):
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split.
 
-        ``train``, ``validation`` and ``holdout`` share the training budget 80/10/10 by gesture; ``test`` comes from
-        gestures that no training can draw, where the device has such. ``epoch`` matters to devices that draw fresh
-        gestures.
+        ``train``, ``validation`` and ``holdout`` share the training budget 80/10/10 by gesture; ``test``
+        comes from gestures that no training can draw, where the device has such. ``epoch`` matters to devices
+        that draw fresh gestures.
         """

@@ -1,0 +1,87 @@
+"""Touches from a file."""
+
+import numpy as np
+import torch
+
+from skin.body.sheet import Sheet
+from skin.device.base import AbstractDevice, Split
+from skin.errors import InputError
+from skin.layout.base import AbstractLayout
+from skin.recording import Recording, Touches
+from skin.storage import read
+from skin.streams import Stream, generator
+
+__all__ = ["Recorded"]
+
+_SAME_PLACE = 1e-6  # m: the file's positions are float32
+
+
+class Recorded(AbstractDevice):
+    """Yields the touches of a recording, split 80/10/10 by gesture; ``test`` is ``holdout``, the last part.
+
+    Args:
+        path: ``x.parquet`` or ``x.csv``.
+        body: the sheet, to be compared with the file's.
+        layout: where the sensors are, to be compared with the file's.
+        split_seed: what the split is drawn from.
+
+    Attributes:
+        sensors: as ``layout`` gives them.
+        rate: frames per second, Hz.
+        window: frames per touch.
+
+    Raises:
+        InputError: no file given, unreadable, too few touches, or another sheet or other sensors than the
+            configuration's.
+    """
+
+    def __init__(
+        self, body: Sheet, layout: AbstractLayout, path: str | None = None, split_seed: int = 0
+    ) -> None:
+        if path is None:
+            raise InputError("device=recording needs a file: add device.path=x.parquet")
+        self._recording = read(path)
+        if len(self._recording) < 10:
+            raise InputError(f"{path} has {len(self._recording)} touches: 80/10/10 needs at least 10")
+        self.path, self.split_seed = path, split_seed
+        self.sensors = layout.sensors(body)
+        self._compare(body)
+        self.task, self.size = self._recording.task, body.size
+        touches = self._recording.touches
+        self.rate, self.window = touches.rate, touches.readings.shape[1]
+
+    def _compare(self, body: Sheet) -> None:
+        stored, size = self._recording.touches.positions, self._recording.size
+        if not np.allclose(size, body.size):
+            raise InputError(
+                f"{self.path} was recorded on a sheet of {size[0]:g} x {size[1]:g} m, the body is "
+                f"{body.size[0]:g} x {body.size[1]:g} m: add body.size=[{size[0]:g},{size[1]:g}]"
+            )
+        if len(stored) != len(self.sensors):
+            raise InputError(
+                f"{self.path} has {len(stored)} sensors, the layout has {len(self.sensors)}: give the layout "
+                "it was recorded with, as in layout=file layout.path=FILE.csv"
+            )
+        apart = np.abs(stored.numpy() - self.sensors.positions).max(axis=1)
+        if apart.max() > _SAME_PLACE:
+            number = int(apart.argmax())
+            raise InputError(
+                f"{self.path} has sensor {number} at {stored[number].tolist()} m, the layout at "
+                f"{self.sensors.positions[number].tolist()} m: give the layout it was recorded with, as in "
+                "layout=file layout.path=FILE.csv"
+            )
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
+        """Return the touches of a split; a file has no fresh ones."""
+        return self.recording(split, epoch).touches
+
+    def recording(self, split: Split | None = None, epoch: int = 0) -> Recording:
+        """Return all that the file holds of a split; None takes the whole file."""
+        if split is None:
+            return self._recording
+        count = len(self._recording)
+        training = round(0.8 * count)
+        middle = training + (count - training) // 2
+        bounds = {"train": (0, training), "validation": (training, middle)}
+        order = generator(Stream.SPLIT, self.split_seed).permutation(count)
+        return self._recording[torch.from_numpy(order[slice(*bounds.get(split, (middle, None)))])]

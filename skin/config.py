@@ -1,0 +1,213 @@
+"""The configuration: its schema, its fingerprint, and the door that every command comes through.
+
+Only Hydra is imported here: ``--help`` and a mistyped key must not pay for torch.
+"""
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from skin import __version__
+from skin.errors import InputError
+
+__all__ = ["CONF", "ROOT", "Config", "checked", "command", "fingerprint", "plain"]
+
+ROOT = Path(__file__).parents[1]
+CONF = ROOT / "conf"
+
+# They steer a run and change none of its results.
+_STEERING = ("tracking",)
+
+
+@dataclass
+class Data:
+    """How many gestures a training draws (``conf/data``)."""
+
+    name: str
+    gestures: int
+    padded: bool
+    fresh: bool
+    batch_size: int
+
+
+@dataclass
+class Evaluation:
+    """On what a trained learner is tried (``conf/train.yaml``)."""
+
+    devices: int
+    layouts: int
+    gestures: int
+    false_alarm_rate: float
+
+
+@dataclass
+class Tracking:
+    """Where runs are logged, and whether finished ones are skipped (``conf/train.yaml``)."""
+
+    uri: str | None
+    artifacts: str | None
+    experiment: str
+    resume: bool
+    threads: int | None
+
+
+@dataclass
+class Config:
+    """What may stand at the top of a configuration; groups without a type here belong to their class."""
+
+    row: str
+    seed: int
+    epochs: dict[str, int]
+    touch: dict[str, Any]
+    body: dict[str, Any]
+    layout: dict[str, Any]
+    simulator: dict[str, Any]
+    device: dict[str, Any]
+    representation: dict[str, Any]
+    model: dict[str, Any]
+    fusion: dict[str, Any]
+    learner: dict[str, Any]
+    data: Data
+    optimizer: dict[str, Any]
+    trainer: dict[str, Any]
+    evaluation: Evaluation
+    tracking: Tracking
+    # What a command other than training adds.
+    run: str | None = None
+    n: int | None = None
+    out: str | None = field(default=None)
+
+
+def checked(config: DictConfig) -> DictConfig:
+    """Return a configuration that fits the schema, read-only.
+
+    Raises:
+        InputError: a key or a value does not fit.
+    """
+    try:
+        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+    except OmegaConfBaseException as error:
+        raise InputError(_sentence(error)) from error
+    OmegaConf.set_readonly(whole, True)
+    return whole
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Return a configuration with every interpolation resolved, as plain containers.
+
+    Raises:
+        InputError: an interpolation leads nowhere.
+    """
+    try:
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise InputError(_sentence(error)) from error
+
+
+def fingerprint(config: DictConfig) -> str:
+    """Return a hash of everything that a run's result depends on, but for the code: configuration, files, version."""
+    content = {key: value for key, value in plain(config).items() if key not in _STEERING}
+    files = {value: _digest(value) for value in _strings(content) if _file(value)}
+    text = json.dumps([content, files, __version__], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+    """Make a command of a function that takes a checked configuration.
+
+    Bad input ends it with one sentence and exit code 2. In a multirun the job fails and the others run on.
+
+    Args:
+        name: the primary configuration, a file in ``conf/``.
+    """
+
+    def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        started = []
+
+        @wraps(task)
+        def job(config: DictConfig) -> Any:
+            started.append(True)
+            try:
+                return task(checked(config))
+            except (HydraException, OmegaConfBaseException, InputError, TypeError) as error:
+                refusal = _refusal(error)
+                if refusal is None or HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise refusal or error from error
+                print(refusal, file=sys.stderr)
+                sys.exit(2)
+
+        composed = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(job)
+
+        def main() -> None:
+            try:
+                composed()
+            except SystemExit as stop:
+                # Hydra ends with 1 where the configuration could not be composed.
+                if stop.code == 1 and not started:
+                    sys.exit(2)
+                raise
+
+        return main
+
+    return decorate
+
+
+def _refusal(error: Exception) -> InputError | None:
+    """Return the sentence for a person, or None where the error is ours and deserves its traceback."""
+    if isinstance(error, InputError):
+        return error
+    cause = error.__cause__ if isinstance(error, InstantiationException) else None
+    if isinstance(cause, InputError):
+        return cause
+    reason = cause or error
+    if isinstance(reason, TypeError) and "argument" not in str(reason):
+        return None
+    if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
+        return None
+    return InputError(_sentence(reason))
+
+
+def _sentence(error: BaseException) -> str:
+    """Return what an error says, on one line; OmegaConf adds lines about its own objects."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    kept = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
+    return "; ".join(kept)
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for entry in value.values():
+            yield from _strings(entry)
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _strings(entry)
+
+
+def _file(name: str) -> Path | None:
+    """Return the file that a setting names, as the package finds it, if there is one."""
+    if "/" not in name and "." not in name:
+        return None
+    path = Path(name).expanduser()
+    try:
+        return next((found for found in (path, ROOT / path) if found.is_file()), None)
+    except OSError:
+        return None
+
+
+def _digest(name: str) -> str:
+    path = _file(name)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path else ""

@@ -1,0 +1,18 @@
+"""Silence for messages that a user of the command line cannot act on."""
+
+import logging
+import warnings
+
+__all__ = ["quiet"]
+
+
+def quiet() -> None:
+    """Quieten Lightning's remarks on hardware and on logging, and torch's notice of a change in its own insides."""
+    for name in ("pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.setLevel(logging.ERROR)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    logging.getLogger("mlflow").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=".*treespec.*", category=FutureWarning)
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")

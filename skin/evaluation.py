@@ -1,0 +1,114 @@
+"""On what a trained learner is tried: its own device, unseen devices, unseen layouts."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor
+
+from skin.config import Evaluation
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.labels import Task
+from skin.layout.scattered import Scattered
+from skin.learner.base import AbstractLearner
+from skin.metrics import confusion, metrics
+from skin.recording import Touches
+
+__all__ = ["Report", "evaluate"]
+
+# Neither the default device (0) nor any layout of data/layouts is among them.
+_FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an evaluation found.
+
+    Attributes:
+        metrics: ``<column>/<label>/<metric>``, with the columns ``same`` (test gestures felt by the device of the training),
+            ``holdout`` (the training budget's last tenth), ``device_shift`` and ``unseen_layout`` (means over unseen
+            devices and layouts).
+        cannot: column -> why the learner has no figures in it.
+        confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
+        predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.
+    """
+
+    metrics: dict[str, float]
+    cannot: dict[str, str]
+    confusion: Tensor | None
+    predictions: pa.Table
+
+
+def evaluate(learner: AbstractLearner, device: AbstractDevice, settings: Evaluation) -> Report:
+    """Try a trained learner on a device and, where it is simulated, on others like it."""
+    task, found, cannot = device.task, {}, {}
+    same, drawn = _test(device)
+    chances = learner.probabilities(same)
+    found |= _named("same", metrics(chances, _labels(same), task, settings.false_alarm_rate))
+    columns = {"holdout": iter([device.touches("holdout")])}
+    if isinstance(device, Simulated):
+        columns |= {"device_shift": _devices(device, settings), "unseen_layout": _layouts(device, settings)}
+    for column, sets in columns.items():
+        try:
+            each = [
+                metrics(learner.probabilities(touches), _labels(touches), task, settings.false_alarm_rate)
+                for touches in sets
+            ]
+        except InputError as reason:
+            cannot[column] = str(reason)
+            continue
+        if each:
+            found |= _named(column, {name: fmean(values[name] for values in each) for name in each[0]})
+    table = confusion(chances, _labels(same)) if task.kind == "binary" else None
+    return Report(found, cannot, table, _predictions(chances, same, task, drawn))
+
+
+def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
+    """Return the test touches and, where they were simulated, how each was drawn."""
+    if isinstance(device, Simulated):
+        recording = device.recording("test")
+        return recording.touches, recording.parameters
+    return device.touches("test"), {}
+
+
+def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
+    """Yield test touches as other devices of the same kind feel them."""
+    for number in range(settings.devices):
+        other = device.replace(seed=_FIRST_DEVICE + number, test_gestures=settings.gestures)
+        yield other.touches("test")
+
+
+def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
+    """Yield test touches as as many sensors at other places feel them."""
+    count = len(device.sensors)
+    rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
+    if count // rows > 3 * rows:
+        raise InputError(f"{count} sensors make no grid that could be scattered anew")
+    for number in range(settings.layouts):
+        layout = Scattered(
+            rows, count // rows, seed=_FIRST_LAYOUT + number, footprint=device.sensors.footprint
+        )
+        yield device.replace(layout=layout, test_gestures=settings.gestures).touches("test")
+
+
+def _labels(touches: Touches) -> Tensor:
+    if touches.labels is None:
+        raise InputError("touches without labels cannot be scored: record them with labels")
+    return touches.labels
+
+
+def _named(column: str, values: dict[str, float]) -> dict[str, float]:
+    return {f"{column}/{name}": value for name, value in values.items()}
+
+
+def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
+    columns: dict[str, np.ndarray] = {}
+    for name, label, chance in zip(task.names, _labels(touches).T, chances.T, strict=True):
+        columns |= {name: label.to(torch.int8).numpy(), f"p_{name}": chance.numpy()}
+    columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
+    return pa.table(columns)

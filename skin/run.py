@@ -1,0 +1,85 @@
+"""One run: build, learn, evaluate, log."""
+
+import hashlib
+import io
+import os
+import tempfile
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import torch
+from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.loggers import MLFlowLogger
+
+from skin.build import build_data, build_device, build_learner
+from skin.config import fingerprint, plain
+from skin.evaluation import Report, evaluate
+from skin.figures import confusions, save
+from skin.labels import Task
+from skin.recording import Touches
+from skin.tracking import Store
+from skin.console import quiet
+
+__all__ = ["PARENT", "train"]
+
+PARENT = "SKIN_PARENT_RUN"
+"""Environment variable by which a sweep tells its jobs the id of their parent run."""
+
+
+def train(config: DictConfig) -> bool:
+    """Train and evaluate as a configuration says; return False if a finished run holds the results already.
+
+    A run that finished with the same fingerprint is not repeated, unless ``tracking.resume=false``.
+    """
+    quiet()
+    if config.tracking.threads:
+        torch.set_num_threads(config.tracking.threads)
+    store, identity = Store.open(config.tracking), fingerprint(config)
+    finished = store.find("FINISHED", fingerprint=identity) if config.tracking.resume else []
+    if finished:
+        return False
+    device = build_device(config)
+    data, learner = build_data(config, device), build_learner(config)
+    tags = {"fingerprint": identity, "row": config.row, "simulator": config.data.name, "seed": str(config.seed)}
+    name = f"{config.row} {config.data.name} {config.seed}"
+    with store.run(name, tags, os.environ.get(PARENT)) as run:
+        logger = MLFlowLogger(tracking_uri=store.uri, run_id=run.info.run_id)
+        _describe(store, run.info.run_id, config, data.touches("train"))
+        learner.fit(data, logger)
+        report = evaluate(learner, device, config.evaluation)
+        values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
+        store.log_metrics(run, report.metrics | values)
+        with tempfile.TemporaryDirectory() as folder:
+            learner.save(Path(folder))
+            _write(report, device.task, Path(folder))
+            store.client.log_artifacts(run.info.run_id, folder)
+    return True
+
+
+def _describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
+    """Log what the run is made from, before it starts."""
+    store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(plain(config))), "config.yaml")
+    store.client.set_tag(run, "data_hash", _hash(touches))
+    groups = ("simulator", "device", "representation", "model", "fusion", "learner")
+    choices = {group: config[group]["_target_"].split(".")[-2] for group in groups}
+    scalars = {"seed": config.seed, "row": config.row, "gestures": config.data.gestures}
+    for name, value in (choices | scalars | {"fresh": config.data.fresh}).items():
+        store.client.log_param(run, name, value)
+
+
+def _hash(touches: Touches) -> str:
+    """Return a hash of readings and labels."""
+    buffer = io.BytesIO(touches.readings.contiguous().numpy().tobytes())
+    if touches.labels is not None:
+        buffer.write(touches.labels.contiguous().numpy().tobytes())
+    return hashlib.sha256(buffer.getvalue()).hexdigest()[:16]
+
+
+def _write(report: Report, task: Task, folder: Path) -> None:
+    """Write what a person will open: predictions, and confusion matrices as a picture."""
+    pq.write_table(report.predictions, folder / "predictions.parquet")
+    if report.confusion is not None:
+        named = dict(zip(task.names, report.confusion.numpy(), strict=True))
+        save(confusions(named, ("no", "yes")), folder / "confusion.png")
+    for column, reason in report.cannot.items():
+        (folder / f"cannot_{column}.txt").write_text(reason + "\n")

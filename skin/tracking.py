@@ -1,0 +1,141 @@
+"""Runs in MLflow: one SQLite file, one experiment, and a status that can be trusted."""
+
+import os
+
+# Before mlflow is imported: it reports home by default.
+os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+
+import fcntl
+import signal
+import sqlite3
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from mlflow import MlflowClient
+from mlflow.entities import Run, ViewType
+from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
+
+from skin.config import ROOT, Tracking
+
+__all__ = ["Store", "commit", "ends_on_signal"]
+
+
+@dataclass(frozen=True)
+class Store:
+    """An MLflow experiment in a database that exists.
+
+    Attributes:
+        client: speaks to the tracking store.
+        uri: of the tracking store.
+        experiment: id of the experiment.
+    """
+
+    client: MlflowClient
+    uri: str
+    experiment: str
+
+    @classmethod
+    def open(cls, settings: Tracking) -> "Store":
+        """Return the experiment, made with its database where they are missing."""
+        uri = settings.uri or f"sqlite:///{ROOT / 'mlflow.db'}"
+        artifacts = Path(settings.artifacts).expanduser() if settings.artifacts else ROOT / "mlartifacts"
+        with _alone(uri):
+            client = MlflowClient(tracking_uri=uri)
+            found = client.get_experiment_by_name(settings.experiment)
+            if found is None:
+                location = (artifacts / settings.experiment).resolve().as_uri()
+                identity = client.create_experiment(settings.experiment, artifact_location=location)
+            else:
+                identity = found.experiment_id
+        return cls(client, uri, identity)
+
+    def find(self, status: str | None = None, **tags: str) -> list[Run]:
+        """Return the runs that have the tags, newest first; ``status`` as MLflow calls it (``FINISHED``)."""
+        terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
+        terms += [f"attributes.status = '{status}'"] if status else []
+        return list(
+            self.client.search_runs(
+                [self.experiment],
+                " and ".join(terms),
+                ViewType.ACTIVE_ONLY,
+                max_results=5000,
+                order_by=["attributes.start_time DESC"],
+            )
+        )
+
+    @contextmanager
+    def run(self, name: str, tags: dict[str, str], parent: str | None = None) -> Iterator[Run]:
+        """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal."""
+        tags = tags | {"commit": commit()} | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
+        run = self.client.create_run(self.experiment, run_name=name, tags=tags)
+        status = "KILLED"
+        try:
+            with ends_on_signal():
+                yield run
+            status = "FINISHED"
+        except Exception as error:
+            status = "FAILED"
+            self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
+            raise
+        finally:
+            self.client.set_terminated(run.info.run_id, status)
+
+    def log_metrics(self, run: Run, values: dict[str, float]) -> None:
+        """Log final metrics."""
+        for name, value in values.items():
+            self.client.log_metric(run.info.run_id, name, value, synchronous=True)
+
+
+@contextmanager
+def ends_on_signal() -> Iterator[None]:
+    """Turn SIGTERM into SystemExit, so that what is open is closed; only the main thread can."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    try:
+        before = signal.signal(signal.SIGTERM, leave)
+    except ValueError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def commit() -> str:
+    """Return the git commit of the code, with ``+`` where files differ from it; ``unknown`` without git."""
+
+    def git(*arguments: str) -> str:
+        result = subprocess.run(
+            ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True
+        )
+        return result.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+@contextmanager
+def _alone(uri: str) -> Iterator[Any]:
+    """Keep other processes out while a SQLite database is made: two that make it at once both fail."""
+    if not uri.startswith("sqlite:///"):
+        yield
+        return
+    path = Path(uri.removeprefix("sqlite:///"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{path}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        connection = sqlite3.connect(path)
+        # Readers and writers at the same time; the mode stays with the file.
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.close()
+        yield

@@ -1,0 +1,172 @@
+"""What one would measure on a touch: numbers that do not depend on the number or order of sensors."""
+
+import torch
+from torch import Tensor
+
+from skin.recording import Touches
+
+__all__ = ["measurements"]
+
+LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle; the noise is about 0.05 N
+SHARES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)  # of the touch's own peak
+IDLE = 0.2  # a touch rests for at least a fifth of its window
+BEST = 10  # how many sorted values are kept
+
+
+def measurements(touches: Touches) -> dict[str, Tensor]:
+    """Return about 130 named measurements, (B,) each, of touches of any layout.
+
+    Every sensor's idle level (a low quantile over the window) is subtracted first, so that constant offsets
+    of a device do not matter; readings that are not valid count as idle.
+    """
+    raw = torch.where(touches.valid, touches.readings, torch.zeros(()))
+    x = (raw - torch.quantile(raw, IDLE, dim=1, keepdim=True)) * touches.valid
+    places = touches.positions[..., :2].to(x.dtype)
+    frame, peak = x.sum(dim=2), x.amax(dim=2)
+    return {
+        **_levels(x, peak, frame),
+        **_sorted(raw, x, peak, frame),
+        **_changes(x, peak, frame),
+        **_sharing(x, peak, frame),
+        **_path(x, peak, places),
+        **_spread(x, places),
+    }
+
+
+def _longest(active: Tensor) -> Tensor:
+    """Return the longest run of true values over time, (B,), of active (B, T)."""
+    run = torch.zeros(len(active), dtype=torch.int64)
+    longest = run
+    for now in active.unbind(dim=1):
+        run = (run + 1) * now
+        longest = torch.maximum(longest, run)
+    return longest.to(torch.float32)
+
+
+def _levels(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
+    """How long and on how many sensors a touch exceeds absolute and relative levels."""
+    result: dict[str, Tensor] = {}
+    highest = x.amax(dim=1)
+    top = peak.amax(dim=1, keepdim=True).clamp(min=1e-6)
+    at_peak = x[torch.arange(len(x)), frame.argmax(dim=1)]
+    for level in LEVELS:
+        result[f"frames above {level} N"] = (peak > level).sum(dim=1)
+        result[f"longest run above {level} N"] = _longest(peak > level)
+        result[f"sensors above {level} N"] = (highest > level).sum(dim=1)
+        result[f"most sensors above {level} N at once"] = (x > level).sum(dim=2).amax(dim=1)
+    for share in SHARES:
+        result[f"longest run above {share} of the peak"] = _longest(peak > share * top)
+        result[f"longest run of the sum above {share} of its peak"] = _longest(
+            frame > share * frame.amax(dim=1, keepdim=True)
+        )
+        result[f"sensors above {share} of the peak"] = (highest > share * top).sum(dim=1)
+        result[f"sensors above {share} of the peak at once"] = (at_peak > share * top).sum(dim=1)
+    return result
+
+
+def _sorted(raw: Tensor, x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
+    """Maxima and sums of sensors and frames, from the largest down."""
+    result: dict[str, Tensor] = {}
+    columns = {
+        "raw sensor maximum": raw.amax(dim=1),
+        "sensor maximum": x.amax(dim=1),
+        "sensor sum": x.sum(dim=1),
+        "frame maximum": peak,
+        "frame sum": frame,
+    }
+    for name, values in columns.items():
+        best = values.sort(dim=1, descending=True).values
+        best = torch.nn.functional.pad(best, (0, max(0, BEST - best.shape[1])))[:, :BEST]
+        result |= {f"{name} {rank + 1}": column for rank, column in enumerate(best.unbind(dim=1))}
+    return result
+
+
+def _changes(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
+    """How fast the touch rises and falls, and how often the strongest sensor changes."""
+    result: dict[str, Tensor] = {}
+    for name, values in {"sum": frame, "maximum": peak}.items():
+        step = values.diff(dim=1)
+        result |= {
+            f"fastest rise of the {name}": step.amax(dim=1),
+            f"fastest fall of the {name}": step.amin(dim=1),
+            f"deviation of the {name}": values.std(dim=1),
+        }
+    active = peak > 0.3 * peak.amax(dim=1, keepdim=True)
+    strongest = x.argmax(dim=2)
+    moved = (strongest.diff(dim=1) != 0) & active[:, 1:] & active[:, :-1]
+    ever = (torch.nn.functional.one_hot(strongest, x.shape[2]) * active[..., None]).amax(dim=1)
+    return result | {
+        "changes of the strongest sensor": moved.sum(dim=1),
+        "sensors that were strongest": ever.sum(dim=1),
+    }
+
+
+def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
+    """Whether all sensors follow one course over time, as they do under a touch that stands still."""
+    strength = torch.linalg.svdvals(x)
+    strength = torch.nn.functional.pad(strength, (0, 4))[:, :4]
+    ratio = strength / strength[:, :1].clamp(min=1e-6)
+    push = x.clamp(min=0)
+    time = torch.arange(x.shape[1], dtype=x.dtype)[None, :, None]
+    total = push.sum(dim=1).clamp(min=1e-6)
+    centre = (push * time).sum(dim=1) / total
+    weight = total * (x.amax(dim=1) > 0.3 * peak.amax(dim=1, keepdim=True))
+    weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
+    mean = (weight * centre).sum(dim=1, keepdim=True)
+    return {
+        "singular value 1": strength[:, 0],
+        **{
+            f"singular value {i + 1} of the first": strength[:, i] / strength[:, 0].clamp(min=1e-6)
+            for i in (1, 2, 3)
+        },
+        "spread of the sensors in time": (weight * (centre - mean).square()).sum(dim=1).sqrt(),
+        "share of the strongest sensor": peak.amax(dim=1) / frame.amax(dim=1).clamp(min=1e-6),
+    }
+
+
+def _path(x: Tensor, peak: Tensor, places: Tensor) -> dict[str, Tensor]:
+    """How the centre of the readings moves while the touch lasts, m."""
+    result: dict[str, Tensor] = {}
+    active = peak > 0.25 * peak.amax(dim=1, keepdim=True)
+    for power in (1, 2):
+        push = (x - 0.1).clamp(min=0) ** power
+        centre = push @ places / push.sum(dim=2, keepdim=True).clamp(min=1e-6)
+        outside = torch.where(active[..., None], centre, torch.nan)
+        step = centre.diff(dim=1).norm(dim=2) * (active[:, 1:] & active[:, :-1])
+        middle = outside.nanmean(dim=1, keepdim=True)
+        far = (outside - middle).norm(dim=2).nan_to_num(0).amax(dim=1)
+        high = outside.nan_to_num(-torch.inf).amax(dim=1)
+        low = outside.nan_to_num(torch.inf).amin(dim=1)
+        first = active.to(torch.int64).argmax(dim=1)
+        last = active.shape[1] - 1 - active.flip(1).to(torch.int64).argmax(dim=1)
+        rows = torch.arange(len(x))
+        ends = (centre[rows, last] - centre[rows, first]).norm(dim=1)
+        frames = active.sum(dim=1).clamp(min=1)
+        result |= {
+            f"path of the centre {power}": step.sum(dim=1),
+            f"mean step of the centre {power}": step.sum(dim=1) / frames,
+            f"longest step of the centre {power}": step.amax(dim=1),
+            f"reach of the centre {power}": far,
+            f"extent of the centre {power}": (high - low).norm(dim=1),
+            f"way of the centre {power}": ends,
+            f"speed of the centre {power}": ends / frames,
+        }
+    return result
+
+
+def _spread(x: Tensor, places: Tensor) -> dict[str, Tensor]:
+    """How wide the touch is at its strongest frame and over all, m."""
+    result: dict[str, Tensor] = {}
+    strongest = x[torch.arange(len(x)), x.sum(dim=2).argmax(dim=1)]
+    for name, values in {"strongest frame": strongest, "maxima": x.amax(dim=1)}.items():
+        weight = (values - 0.1).clamp(min=0)
+        weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
+        offset = places - (weight @ places)[:, None]
+        moments = torch.einsum("bs,bsi,bsj->bij", weight, offset, offset)
+        large, small = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1).unbind(dim=1)
+        result |= {
+            f"length of the {name}": large,
+            f"breadth of the {name}": small,
+            f"evenness of the {name}": weight.square().sum(dim=1).clamp(min=1e-6).reciprocal(),
+        }
+    return result

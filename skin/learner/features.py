@@ -1,0 +1,108 @@
+"""Learning by boosted trees on engineered measurements."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from sklearn.ensemble import HistGradientBoostingClassifier
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.labels import Task
+from skin.learner._measurements import measurements
+from skin.learner.base import AbstractLearner
+from skin.recording import Touches
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger
+
+    from skin.datamodule import TouchData
+
+__all__ = ["Features"]
+
+
+class Features(AbstractLearner):
+    """Measures about 130 numbers on a touch and boosts decision trees on them, one ensemble per label.
+
+    What a practitioner would try first; a network that does not beat it is not worth its cost. The
+    measurements know no sensor by number, so it takes any layout.
+
+    Args:
+        rounds: most trees per label; fewer if the validation loss stops falling.
+        learning_rate: share of each tree that is added.
+        patience: trees without a lower validation loss before stopping.
+        seed: of the trees' ties.
+    """
+
+    def __init__(
+        self, rounds: int = 500, learning_rate: float = 0.1, patience: int = 30, seed: int = 0
+    ) -> None:
+        self._settings = {
+            "max_iter": rounds,
+            "learning_rate": learning_rate,
+            "n_iter_no_change": patience,
+            "random_state": seed,
+            "early_stopping": True,
+        }
+        self._fitted: dict[str, np.ndarray] | None = None
+        self._models: list[HistGradientBoostingClassifier] = []
+        self._task: Task | None = None
+
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Grow the trees on the training split, as many as the validation split likes."""
+        table = {}
+        for split in ("train", "validation"):
+            touches = data.touches(split)
+            if touches.labels is None:
+                raise InputError("touches without labels cannot be learnt from: record them with labels")
+            table |= {split: _matrix(touches), f"{split}_labels": touches.labels.cpu().numpy()}
+        self._grow(table, data.task)
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of any layout."""
+        if self._task is None:
+            raise RuntimeError("fit or load the learner first")
+        matrix = _matrix(touches)
+        columns = [model.predict_proba(matrix)[:, 1] for model in self._models]
+        result = torch.from_numpy(np.stack(columns, axis=1)).to(torch.float32)
+        return result / result.sum(dim=1, keepdim=True) if self._task.kind == "exclusive" else result
+
+    def save(self, folder: Path) -> Path:
+        """Write the table that the trees grew from to ``features.npz`` in ``folder`` and return its path.
+
+        Trees have no format that is safe to load; grown again from the same table they are the same.
+        """
+        if self._fitted is None:
+            raise RuntimeError("fit or load the learner first")
+        path = Path(folder) / "features.npz"
+        np.savez_compressed(path, **self._fitted)  # type: ignore[arg-type]
+        return path
+
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Grow the trees again from what ``save`` wrote; takes some seconds."""
+        with np.load(path, allow_pickle=False) as table:
+            self._grow(dict(table), data.task)
+
+    def _grow(self, table: dict[str, np.ndarray], task: Task) -> None:
+        began = time.perf_counter()
+        self._models = []
+        for label, name in enumerate(task.names):
+            truth = table["train_labels"][:, label]
+            if len(np.unique(truth)) < 2:
+                raise InputError(f"all training touches have the same label {name}: give more touches")
+            model = HistGradientBoostingClassifier(**self._settings)
+            validation = {"X_val": table["validation"], "y_val": table["validation_labels"][:, label]}
+            self._models.append(model.fit(table["train"], truth, **validation))
+        self._fitted, self._task = table, task
+        self.seconds_per_epoch = time.perf_counter() - began
+        # one number per leaf; scikit-learn counts leaves nowhere in public
+        trees = [tree for model in self._models for trees in model._predictors for tree in trees]
+        self.parameters = sum(tree.get_n_leaf_nodes() for tree in trees)
+
+
+def _matrix(touches: Touches) -> np.ndarray:
+    """Return the measurements as (B, D), float32."""
+    columns = measurements(touches.to("cpu")).values()
+    return torch.stack([column.to(torch.float32) for column in columns], dim=1).numpy()

@@ -1,0 +1,143 @@
+"""Learning thresholds on what one would look at first."""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.labels import TOUCH
+from skin.learner._measurements import measurements
+from skin.learner.base import AbstractLearner
+from skin.recording import Touches
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger
+
+    from skin.datamodule import TouchData
+
+__all__ = ["Rule", "Rules"]
+
+LOOK_AT = {
+    "big": ("sensors above", "most sensors above"),
+    "dynamic": ("path of", "reach of", "extent of", "way of"),
+    "press": ("longest run",),
+    "dangerous": ("raw sensor maximum 1", "sensor maximum 1"),
+}
+"""How the names of the measurements begin that a rule for a label may use."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A label holds where a measurement exceeds a threshold.
+
+    Attributes:
+        measurement: its name.
+        threshold: in the unit of the measurement.
+        slope: of the log odds above the threshold, per unit; it makes a probability of a distance.
+    """
+
+    measurement: str
+    threshold: float
+    slope: float
+
+    def probability(self, values: dict[str, Tensor]) -> Tensor:
+        """Return the probability of the label, (B,)."""
+        return (self.slope * (values[self.measurement].double() - self.threshold)).sigmoid().float()
+
+
+class Rules(AbstractLearner):
+    """Tunes one threshold per label: peak force, duration of contact, travel of the centre, active sensors.
+
+    For every label the measurement and the threshold of the highest training accuracy are taken; the slope is
+    fitted to the validation split. Takes any layout.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._rules: dict[str, Rule] = {}
+
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Tune the thresholds.
+
+        Raises:
+            InputError: the labels are not the four of the report, or the touches have none.
+        """
+        if set(data.task.names) != set(TOUCH.names):
+            raise InputError(
+                f"learner=rules knows the labels {', '.join(TOUCH.names)}, got {', '.join(data.task.names)}: "
+                "use learner=features"
+            )
+        began = time.perf_counter()
+        train, validation = data.touches("train"), data.touches("validation")
+        if train.labels is None or validation.labels is None:
+            raise InputError("touches without labels cannot be learnt from: record them with labels")
+        known, other = measurements(train.to("cpu")), measurements(validation.to("cpu"))
+        self._set(
+            {
+                name: _tune(name, known, train.labels[:, i].numpy(), other, validation.labels[:, i].numpy())
+                for i, name in enumerate(data.task.names)
+            }
+        )
+        self.seconds_per_epoch = time.perf_counter() - began
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of any layout."""
+        if not self._rules:
+            raise RuntimeError("fit or load the learner first")
+        values = measurements(touches.to("cpu"))
+        return torch.stack([rule.probability(values) for rule in self._rules.values()], dim=1)
+
+    def save(self, folder: Path) -> Path:
+        """Write the rules to ``rules.json`` in ``folder`` and return its path."""
+        path = Path(folder) / "rules.json"
+        path.write_text(json.dumps({name: asdict(rule) for name, rule in self._rules.items()}, indent=2))
+        return path
+
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Take the rules that ``save`` wrote."""
+        stored = json.loads(Path(path).read_text())
+        self._set({name: Rule(**stored[name]) for name in data.task.names})
+
+    def _set(self, rules: dict[str, Rule]) -> None:
+        self._rules = rules
+        self.parameters = 2 * len(rules)
+
+
+def _tune(
+    label: str,
+    values: dict[str, Tensor],
+    truth: np.ndarray,
+    other: dict[str, Tensor],
+    other_truth: np.ndarray,
+) -> Rule:
+    """Return the best rule for one label: threshold from ``values``, slope from ``other``."""
+    allowed = [name for name in values if name.startswith(LOOK_AT[label])]
+    best = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
+    _, threshold, name = best
+    distance = other[name].double().numpy() - threshold
+    unit = np.std(distance) or 1.0
+
+    def loss(log_slope: float) -> float:
+        return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * other_truth)).mean())
+
+    log_slope = minimize_scalar(loss, bounds=(-3, 6), method="bounded").x
+    return Rule(name, threshold, float(np.exp(log_slope) / unit))
+
+
+def _threshold(scores: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Return the highest accuracy of ``scores > threshold`` and that threshold, between two scores."""
+    order = np.argsort(scores)
+    scores, truth = scores[order], truth[order]
+    # right when cutting after i: the zeros up to i and the ones beyond it
+    right = np.cumsum(1 - truth) + truth.sum() - np.cumsum(truth)
+    cut = np.diff(scores) > 0
+    if not cut.any():
+        return float(max(truth.mean(), 1 - truth.mean())), float(scores[0])
+    i = int(np.argmax(np.where(cut, right[:-1], -1)))
+    return float(right[i] / len(truth)), float((scores[i] + scores[i + 1]) / 2)

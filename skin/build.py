@@ -1,9 +1,9 @@
 """From a configuration to the objects it names, group by group."""
 
-import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from skin.config import plain
 from skin.datamodule import TouchData
 from skin.device.base import AbstractDevice
 from skin.learner.base import AbstractLearner
@@ -13,16 +13,17 @@ __all__ = ["build_data", "build_device", "build_learner"]
 
 def build_device(config: DictConfig) -> AbstractDevice:
     """Return the source of touches, with its body, layout and, where it has one, its simulator."""
-    body, layout = instantiate(config.body), instantiate(config.layout)
-    return instantiate(config.device, body=body, layout=layout)
+    groups = plain(config)
+    body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
+    # Not as arguments of instantiate: it would take the dataclass Sheet for a configuration.
+    return instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
 
 
 def build_data(config: DictConfig, device: AbstractDevice) -> TouchData:
     """Return the batches of a device's touches, shown as the representation does."""
-    return TouchData(device, instantiate(config.representation), config.data.batch_size, config.seed)
+    return TouchData(device, instantiate(plain(config)["representation"]), config.data.batch_size, config.seed)
 
 
 def build_learner(config: DictConfig) -> AbstractLearner:
     """Return what will learn, untrained."""
-    torch.set_float32_matmul_precision("highest")
-    return instantiate(config.learner, seed=config.seed)
+    return instantiate(plain(config)["learner"], seed=config.seed)

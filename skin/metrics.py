@@ -33,7 +33,7 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
         right = multiclass_accuracy(probabilities, labels.argmax(1), len(task), average="micro")
         return {"overall/accuracy": float(right)}
     values: dict[str, float] = {}
-    for name, chance, label in zip(task.names, probabilities.T, labels.long().T, strict=True):
+    for name, chance, label in zip(task.names, *_columns(probabilities, labels), strict=True):
         recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
         values[f"{name}/accuracy"] = float(((chance > 0.5) == (label > 0)).float().mean())
         values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
@@ -60,5 +60,10 @@ def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
 
 def confusion(probabilities: Tensor, labels: Tensor) -> Tensor:
     """Return counts (L, 2, 2) for probabilities and labels (B, L): true class down, predicted class across."""
-    pairs = zip(probabilities.T, labels.long().T, strict=True)
+    pairs = zip(*_columns(probabilities, labels), strict=True)
     return torch.stack([binary_confusion_matrix(chance, label) for chance, label in pairs])
+
+
+def _columns(probabilities: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both with one contiguous row per label."""
+    return probabilities.T.contiguous(), labels.long().T.contiguous()

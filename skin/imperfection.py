@@ -78,8 +78,12 @@ class Imperfection:
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
         idle = offset + self.noise / np.sqrt(_IDLE_FRAMES) * generator.standard_normal(shape)
         baseline = idle if self.tare else np.zeros(shape)
-        numbers = [torch.from_numpy(values).float() for values in (gain, offset, baseline)]
-        return Constants(*numbers, torch.from_numpy(rank < self.dead))
+        return Constants(
+            gain=torch.from_numpy(gain).float(),
+            offset=torch.from_numpy(offset).float(),
+            baseline=torch.from_numpy(baseline).float(),
+            dead=torch.from_numpy(rank < self.dead),
+        )
 
     def apply(
         self, readings: Tensor, constants: Constants, generator: np.random.Generator

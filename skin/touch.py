@@ -1,6 +1,6 @@
 """Sampled gestures and their pressure movies, each frame rendered once."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +15,22 @@ from skin.labels import TOUCH, measure
 from skin.shapes import Shapes
 from skin.simulator.base import AbstractSimulator, Response
 
-__all__ = ["Movie", "TouchSampler", "balanced"]
+__all__ = ["Movie", "TouchSampler", "balanced", "join"]
 
 _ATTEMPTS = 50
+_AHEAD = 64
+_PARAMETERS = (
+    "shape",
+    "angle",
+    "duration",
+    "onset",
+    "direction",
+    "speed",
+    "peak",
+    "force",
+    "area",
+    "draws",
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,19 @@ class Movie:
     def __len__(self) -> int:
         return len(self.index)
 
+    def __getitem__(self, rows: Tensor) -> "Movie":
+        """Return the movies of some gestures, with no frame that they do not show."""
+        index = self.index[rows]
+        shown = torch.zeros(len(self.frames), dtype=torch.bool)
+        shown[index.flatten()] = True
+        return Movie(
+            self.frames if shown.all() else self.frames[shown],
+            (shown.cumsum(0) - 1)[index],
+            self.scale[rows],
+            self.labels[rows],
+            {name: values[rows] for name, values in self.parameters.items()},
+        )
+
     @property
     def force(self) -> Tensor:
         """Applied force, (B, T), N."""
@@ -63,6 +89,18 @@ class Movie:
         if not displacement or moves is None:
             return Response(readings[index] * scale[..., None], None)
         return Response(readings[index] * scale[..., None], moves[index] * scale[..., None, None])
+
+
+def join(movies: Sequence[Movie]) -> Movie:
+    """Return one movie of all gestures of ``movies``, in order."""
+    starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
+    return Movie(
+        torch.cat([movie.frames for movie in movies]),
+        torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
+        torch.cat([movie.scale for movie in movies]),
+        torch.cat([movie.labels for movie in movies]),
+        {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
+    )
 
 
 def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
@@ -113,24 +151,51 @@ class TouchSampler:
             InputError: some combination of labels is never met on this sheet with these settings.
         """
         wanted = balanced(count, generator) if labels is None else labels
-        settings, reel = self.settings, _Reel(count, self.settings.window)
+        redraws = self.settings.redraws
         pending = np.arange(count)
-        for _ in range(_ATTEMPTS):
-            # Every round draws for the whole batch, so that one gesture's redraws never move another's.
-            gestures = draw_gestures(wanted, settings, self.shapes, self.padded, generator)
-            for _ in range(settings.redraws):
-                chance = generator.random((count, 5))
-                paths = draw_paths(wanted, gestures, settings, self.body.size, chance)
+        found: list[np.ndarray] = []
+        movies: list[Movie] = []
+        for attempt in range(_ATTEMPTS):
+            if not len(pending):
+                return join(movies)[torch.from_numpy(np.concatenate(found).argsort())]
+            gestures = draw_gestures(wanted, self.settings, self.shapes, self.padded, generator)
+            tried = 0
+            while tried < redraws and len(pending):
+                # The last few gestures try several paths at once: a round costs more than what it draws.
+                ahead = min(redraws - tried, max(1, _AHEAD // len(pending)))
+                # Drawn for the whole batch, so that one gesture's redraws never move another's.
+                chance = generator.random((ahead, count, 5))
                 # Sorted by scale, because frames of one texture level are rendered together.
                 pending = pending[np.argsort(gestures["scale"][pending], kind="stable")]
-                trial = {name: values[pending] for name, values in (gestures | paths).items()}
-                pending = pending[~reel.keep(pending, wanted[pending], *self._press(trial))]
-                if not len(pending):
-                    return reel.movie(torch.from_numpy(wanted).float())
-        raise _never(wanted[pending[0]], settings)
+                chosen, movie = self._round(pending, wanted, gestures, chance)
+                movie.parameters["draws"] += attempt * redraws + tried
+                movies.append(movie)
+                found.append(pending[chosen])
+                pending = pending[~chosen]
+                tried += ahead
+        raise _never(wanted[pending[0]], self.settings)
 
-    def _press(self, gestures: Draws) -> tuple[Tensor, Tensor, Tensor, Tensor, Draws]:
-        """Render gestures (B,): frames, index and scale as in :class:`Movie`, labels, parameters."""
+    def _round(
+        self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray
+    ) -> tuple[np.ndarray, Movie]:
+        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture.
+
+        Returns:
+            Which of the pending found a path with the wanted labels, bool, and the movie of those paths.
+        """
+        ahead = len(chance)
+        rows = np.repeat(pending, ahead)
+        turns = np.tile(np.arange(ahead), len(pending))
+        body = {name: values[rows] for name, values in gestures.items()}
+        path = draw_paths(wanted[rows], body, self.settings, self.body.size, chance[turns, rows])
+        movie = self._press(body | path | {"draws": turns + 1})
+        right = (movie.labels.numpy() == wanted[rows]).all(axis=1).reshape(-1, ahead)
+        chosen = right.any(axis=1)
+        first = np.arange(len(pending)) * ahead + right.argmax(axis=1)
+        return chosen, movie[torch.from_numpy(first[chosen])]
+
+    def _press(self, gestures: Draws) -> Movie:
+        """Return the movie of gestures (B,), with the labels that it gives."""
         body, settings = self.body, self.settings
         duration, onset, sliding = gestures["duration"], gestures["onset"], gestures["speed"] > 0
         time = np.arange(settings.window) - onset[:, None]
@@ -156,50 +221,9 @@ class TouchSampler:
         force = gestures["peak"] * cell / highest
         frames *= torch.from_numpy(force / cell).float()[torch.from_numpy(owner), None, None]
         measures = measure(frames, shown, shares, self.footprints, body.cell, settings.thresholds.contact)
-        labels = measures.labels(settings.thresholds)
         parameters = gestures | {"force": force, "area": measures.area.numpy()}
-        return frames, shown, shares, labels, parameters
-
-
-class _Reel:
-    """Collects accepted gestures of a batch, round after round, until their movie is complete."""
-
-    _NAMES = ("shape", "angle", "duration", "onset", "direction", "speed", "peak", "force", "area")
-
-    def __init__(self, count: int, window: int) -> None:
-        self.frames: list[Tensor] = []
-        self.length = 0
-        self.index = torch.zeros(count, window, dtype=torch.long)
-        self.scale = torch.zeros(count, window)
-        self.parameters = {name: torch.zeros(count) for name in (*self._NAMES, "draws")}
-
-    def keep(
-        self,
-        rows: np.ndarray,
-        wanted: np.ndarray,
-        frames: Tensor,
-        index: Tensor,
-        scale: Tensor,
-        labels: Tensor,
-        parameters: Draws,
-    ) -> np.ndarray:
-        """Keep the gestures that have the wanted labels; return which of ``rows`` they are, bool."""
-        found = (labels.numpy() == wanted).all(axis=1)
-        accepted, places = torch.from_numpy(found), torch.from_numpy(rows)
-        self.parameters["draws"][places] += 1
-        kept = torch.zeros(len(frames), dtype=torch.bool)
-        kept[index[accepted].flatten()] = True
-        self.index[places[accepted]] = (kept.cumsum(0) - 1 + self.length)[index[accepted]]
-        self.scale[places[accepted]] = scale[accepted]
-        for name in self._NAMES:
-            self.parameters[name][places[accepted]] = torch.from_numpy(parameters[name][found]).float()
-        self.frames.append(frames[kept])
-        self.length += len(self.frames[-1])
-        return found
-
-    def movie(self, labels: Tensor) -> Movie:
-        """Return what was collected."""
-        return Movie(torch.cat(self.frames), self.index, self.scale, labels, self.parameters)
+        known = {name: torch.from_numpy(parameters[name]).float() for name in _PARAMETERS}
+        return Movie(frames, shown, shares, measures.labels(settings.thresholds), known)
 
 
 def _never(labels: np.ndarray, settings: GestureSettings) -> InputError:

@@ -46,7 +46,7 @@ def _inside(body: Sheet, positions: np.ndarray) -> None:
             f"{outside.sum()} of {len(positions)} sensors lie outside the sheet; the first is "
             f"sensor {number + 1} at x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a sheet of "
             f"{extent[0]:g} x {extent[1]:g} m, {extent[2]:g} m thick: positions are in metres from the "
-            "upper left corner; mend the layout or give body.size=[x,y]"
+            "upper left corner; mend the layout, give body.size=[x,y] or take layout=grid"
         )
 
 

@@ -48,7 +48,7 @@ def _find(given: str) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    looked = " and ".join(str(candidate) for candidate in candidates)
+    looked = " and ".join(dict.fromkeys(map(str, candidates)))
     raise InputError(f"no layout file {given}: looked for {looked}; give layout.path=FILE.csv")
 
 

@@ -36,7 +36,7 @@ ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 
 reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke, SEEDS=3)
-	$(BIN)/python experiments/reproduce_table.py budget=$(BUDGET) seeds=$(SEEDS)
+	$(BIN)/python experiments/reproduce_table.py --budget $(BUDGET) --seeds $(SEEDS)
 
 clean:  ## remove what the targets made, but keep results and runs
 	rm -rf $(VENV) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

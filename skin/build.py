@@ -21,7 +21,9 @@ def build_device(config: DictConfig) -> AbstractDevice:
 
 def build_data(config: DictConfig, device: AbstractDevice) -> TouchData:
     """Return the batches of a device's touches, shown as the representation does."""
-    return TouchData(device, instantiate(plain(config)["representation"]), config.data.batch_size, config.seed)
+    return TouchData(
+        device, instantiate(plain(config)["representation"]), config.data.batch_size, config.seed
+    )
 
 
 def build_learner(config: DictConfig) -> AbstractLearner:

@@ -13,12 +13,12 @@ from pytorch_lightning.loggers import MLFlowLogger
 
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
+from skin.console import quiet
 from skin.evaluation import Report, evaluate
 from skin.figures import confusions, save
 from skin.labels import Task
 from skin.recording import Touches
 from skin.tracking import Store
-from skin.console import quiet
 
 __all__ = ["PARENT", "train"]
 
@@ -40,7 +40,12 @@ def train(config: DictConfig) -> bool:
         return False
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
-    tags = {"fingerprint": identity, "row": config.row, "simulator": config.data.name, "seed": str(config.seed)}
+    tags = {
+        "fingerprint": identity,
+        "row": config.row,
+        "simulator": config.data.name,
+        "seed": str(config.seed),
+    }
     name = f"{config.row} {config.data.name} {config.seed}"
     with store.run(name, tags, os.environ.get(PARENT)) as run:
         logger = MLFlowLogger(tracking_uri=store.uri, run_id=run.info.run_id)
@@ -50,7 +55,7 @@ def train(config: DictConfig) -> bool:
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
         store.log_metrics(run, report.metrics | values)
         with tempfile.TemporaryDirectory() as folder:
-            learner.save(Path(folder))
+            store.client.set_tag(run.info.run_id, "learned", learner.save(Path(folder)).name)
             _write(report, device.task, Path(folder))
             store.client.log_artifacts(run.info.run_id, folder)
     return True

@@ -4,6 +4,7 @@ import os
 
 # Before mlflow is imported: it reports home by default.
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 import fcntl
 import signal

@@ -1,0 +1,102 @@
+"""What the report's figures are drawn from: finished runs, and the simulated skin itself."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from skin import figures
+from skin.device.simulated import Simulated
+from skin.metrics import confusion
+from skin.representation.fourier import Fourier
+from skin.representation.image import Image
+from skin.representation.interp import Interpolation
+from skin.simulator.naive import Naive
+from skin.table import Cell
+from skin.tracking import Store
+
+__all__ = ["draw_runs", "draw_skin"]
+
+_SPEEDS = np.linspace(0.003, 0.020, 7)
+
+
+def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
+    """Draw figures 7 and 8 of each simulator from the test predictions of every row's first run."""
+    paths = []
+    for simulator in dict.fromkeys(cell.simulator for cell in cells):
+        tables = {
+            cell.row: _predictions(store, cell) for cell in cells if cell.simulator == simulator and cell.runs
+        }
+        if not tables:
+            continue
+        matrices, wrong = {}, {}
+        for row, table in tables.items():
+            matrices[row] = confusion(_column(table, "p_dangerous"), _column(table, "dangerous"))[0].numpy()
+            wrong[row] = ((_column(table, "p_big") > 0.5) != (_column(table, "big") > 0.5))[:, 0].numpy()
+        speeds = np.where(
+            *(np.asarray(next(iter(tables.values()))[name]) for name in ("dynamic", "speed")), 0
+        )
+        drawn = figures.confusions(matrices, ("safe", "dangerous"))
+        paths.append(figures.save(drawn, folder / f"figure08_confusion_{simulator}.png"))
+        drawn = figures.misclassified(speeds, wrong, "big", _SPEEDS)
+        paths.append(figures.save(drawn, folder / f"figure07_speed_{simulator}.png"))
+    return paths
+
+
+def draw_skin(device: Simulated, folder: Path) -> list[Path]:
+    """Draw figures 4, 10 and 11 from the gestures of a finite-element skin."""
+    recording = device.recording("test")
+    touches, drawn = recording.touches, recording.parameters
+    labels = dict(zip(device.task.names, touches.labels.T.bool(), strict=True))
+    sliding = int((labels["big"] & labels["dynamic"] & labels["press"] & labels["dangerous"]).nonzero()[0])
+    pictures = _pictures(touches[sliding : sliding + 1].readings, touches.positions, device.size)
+    image = figures.images(pictures, device.sensors.positions, device.size)
+
+    movie = device.sampler.sample(64, np.random.default_rng(0))
+    chosen = int((movie.labels[:, 1:].all(1) & (movie.labels[:, 0] == 0)).nonzero()[0])
+    simulators = {"naive": Naive(device.body, device.sensors), "fem": device.model}
+    readings = {name: movie.respond(model).readings[chosen] for name, model in simulators.items()}
+
+    blurred = drawn["shape"] == device.sampler.shapes.names.index("blurred_disc")
+    presses = (blurred & ~labels["dynamic"] & labels["press"]).nonzero()[:, 0]
+    presses = presses[drawn["force"][presses].argsort()]
+    four = presses[torch.linspace(0, len(presses) - 1, 4).round().long()]
+    return [
+        figures.save(image, folder / "figure04_interpolations.png"),
+        figures.save(figures.traces(readings, device.rate), folder / "figure10_naive_fem.png"),
+        figures.save(
+            figures.force_and_reading(recording.force[four], touches.readings[four], device.rate),
+            folder / "figure11_force_reading.png",
+        ),
+    ]
+
+
+def _pictures(readings: Tensor, positions: Tensor, size: tuple[float, float]) -> dict[str, Tensor]:
+    """Return the strongest frame of readings (1, T, S) in every image representation, (H, W) each."""
+    strongest = int(readings[0].sum(1).argmax())
+    frame = readings[:, strongest : strongest + 1]
+    makers = {
+        "image": Image(positions, size),
+        **{
+            method: Interpolation(positions, size, method=method) for method in ("nearest", "linear", "cubic")
+        },
+        "fourier": Fourier(positions, size),
+    }
+    valid = torch.ones_like(frame, dtype=torch.bool)
+    return {name: make(frame, valid).x[0, 0, 0] for name, make in makers.items()}
+
+
+def _predictions(store: Store, cell: Cell) -> pa.Table:
+    with TemporaryDirectory() as folder:
+        path = store.client.download_artifacts(cell.runs[0].info.run_id, "predictions.parquet", folder)
+        return pq.read_table(path, memory_map=False)
+
+
+def _column(table: pa.Table, name: str) -> Tensor:
+    """Return a column as (B, 1)."""
+    return torch.from_numpy(table[name].to_numpy().copy())[:, None]

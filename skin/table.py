@@ -1,0 +1,174 @@
+"""The results table: our numbers from MLflow beside the report's."""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+
+from mlflow.entities import Run
+from omegaconf import DictConfig
+
+from skin.config import fingerprint
+from skin.tracking import Store
+
+__all__ = [
+    "COLUMNS",
+    "LABELS",
+    "Cell",
+    "as_csv",
+    "collect",
+    "grid",
+    "markdown",
+    "report_values",
+    "rows",
+    "write",
+]
+
+LABELS = ("overall", "big", "dynamic", "press", "dangerous", "dangerous_recall")
+COLUMNS = (
+    "row",
+    "simulator",
+    "label",
+    "ours",
+    "ours_sd",
+    "report",
+    "device_shift",
+    "unseen_layout",
+    "seconds_per_epoch",
+    "parameters",
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The runs of one row on one simulator, one per seed.
+
+    Attributes:
+        row: name of the experiment.
+        simulator: on whose data.
+        runs: those that finished.
+        missing: how many did not: failed, killed, or never started.
+    """
+
+    row: str
+    simulator: str
+    runs: tuple[Run, ...]
+    missing: int
+
+    def values(self, metric: str) -> list[float]:
+        """Return a metric of every run that has it."""
+        found = (run.data.metrics.get(metric) for run in self.runs)
+        return [value for value in found if value is not None]
+
+
+def collect(store: Store, jobs: Iterable[tuple[str, str, DictConfig]]) -> list[Cell]:
+    """Return the cells of jobs (row, simulator, configuration), by the fingerprint of each."""
+    groups: dict[tuple[str, str], list[Run | None]] = {}
+    for row, simulator, config in jobs:
+        finished = store.find("FINISHED", fingerprint=fingerprint(config))
+        groups.setdefault((row, simulator), []).append(finished[0] if finished else None)
+    return [
+        Cell(*key, tuple(run for run in runs if run is not None), runs.count(None))
+        for key, runs in groups.items()
+    ]
+
+
+def report_values(path: Path) -> dict[tuple[str, str, str], float]:
+    """Return the report's numbers, (row, simulator, label) -> value, from ``data/report_table.csv``."""
+    with path.open(newline="") as file:
+        return {
+            (line["row"], line["simulator"], line["label"]): float(line["value"])
+            for line in csv.DictReader(file)
+        }
+
+
+def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> list[dict[str, str]]:
+    """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
+
+    ``ours`` is the mean over seeds of the accuracy on the 4000 test gestures, of ``dangerous_recall`` that recall;
+    ``failed`` where no run finished.
+    """
+    lines = []
+    for cell in cells:
+        for label in LABELS:
+            same = cell.values(_metric("same", label))
+            values = {
+                "ours": _number(same) if same else "failed",
+                "ours_sd": f"{stdev(same):.4f}" if len(same) > 1 else "",
+                "report": _reported(report.get((cell.row, cell.simulator, label))),
+                "device_shift": _number(cell.values(_metric("device_shift", label))),
+                "unseen_layout": _number(cell.values(_metric("unseen_layout", label))),
+                "seconds_per_epoch": _number(cell.values("seconds_per_epoch"), 2),
+                "parameters": _number(cell.values("parameters"), 0),
+            }
+            lines.append({"row": cell.row, "simulator": cell.simulator, "label": label, **values})
+    return lines
+
+
+def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
+    """Return the table for a person, its head first: one line per row and simulator, accuracies in per cent.
+
+    Where the report has a number, it stands behind ours.
+    """
+    head = ["row", "simulator", "overall", "big", "dynamic", "press", "dangerous", "recall"]
+    table = [[*head, "device shift", "unseen layout", "s/epoch", "parameters"]]
+    for start in range(0, len(lines), len(LABELS)):
+        group = {line["label"]: line for line in lines[start : start + len(LABELS)]}
+        whole = group["overall"]
+        table.append(
+            [whole["row"], whole["simulator"]]
+            + [_beside(group[label]) for label in LABELS]
+            + [_percent(whole["device_shift"]), _percent(whole["unseen_layout"])]
+            + [whole["seconds_per_epoch"], whole["parameters"]]
+        )
+    return table
+
+
+def markdown(table: Sequence[Sequence[str]], title: str) -> str:
+    """Return a table, its head first, as Markdown."""
+    lines = ["| " + " | ".join(line) + " |" for line in table]
+    return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
+
+
+def write(text: str, path: Path) -> None:
+    """Write a file under a temporary name and rename it, so that a reader never sees half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(path.name + ".part")
+    unfinished.write_text(text)
+    unfinished.replace(path)
+
+
+def as_csv(lines: Sequence[dict[str, str]]) -> str:
+    """Return the lines as CSV with a header."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return buffer.getvalue()
+
+
+def _metric(column: str, label: str) -> str:
+    return f"{column}/dangerous/recall" if label == "dangerous_recall" else f"{column}/{label}/accuracy"
+
+
+def _number(values: Sequence[float], digits: int = 4) -> str:
+    return f"{fmean(values):.{digits}f}" if values else ""
+
+
+def _reported(value: float | None) -> str:
+    return "" if value is None else f"{value:g}"
+
+
+def _beside(line: dict[str, str]) -> str:
+    """Return our number with its deviation and, in brackets, the report's."""
+    reported = _percent(line["report"])
+    return _percent(line["ours"], line["ours_sd"]) + (f" ({reported})" if reported else "")
+
+
+def _percent(value: str, deviation: str = "") -> str:
+    if not value or value == "failed":
+        return value
+    spread = f" ± {100 * float(deviation):.1f}" if deviation else ""
+    return f"{100 * float(value):.1f}{spread}"

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -100,6 +100,7 @@ def checked(config: DictConfig) -> DictConfig:
         whole = OmegaConf.merge(OmegaConf.structured(Config), config)
     except OmegaConfBaseException as error:
         raise InputError(_sentence(error)) from error
+    assert isinstance(whole, DictConfig)
     OmegaConf.set_readonly(whole, True)
     return whole
 
@@ -111,13 +112,13 @@ def plain(config: DictConfig) -> dict[str, Any]:
         InputError: an interpolation leads nowhere.
     """
     try:
-        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
         raise InputError(_sentence(error)) from error
 
 
 def fingerprint(config: DictConfig) -> str:
-    """Return a hash of everything that a run's result depends on, but for the code: configuration, files, version."""
+    """Return a hash of what a run's result depends on: configuration, the files it names, version."""
     content = {key: value for key, value in plain(config).items() if key not in _STEERING}
     files = {value: _digest(value) for value in _strings(content) if _file(value)}
     text = json.dumps([content, files, __version__], sort_keys=True)

@@ -30,9 +30,9 @@ class Report:
     """What an evaluation found.
 
     Attributes:
-        metrics: ``<column>/<label>/<metric>``, with the columns ``same`` (test gestures felt by the device of the training),
-            ``holdout`` (the training budget's last tenth), ``device_shift`` and ``unseen_layout`` (means over unseen
-            devices and layouts).
+        metrics: ``<column>/<label>/<metric>``, with the columns ``same`` (test gestures felt by the device of
+            the training), ``holdout`` (the training budget's last tenth), ``device_shift`` and
+            ``unseen_layout`` (means over unseen devices and layouts).
         cannot: column -> why the learner has no figures in it.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.
@@ -46,11 +46,11 @@ class Report:
 
 def evaluate(learner: AbstractLearner, device: AbstractDevice, settings: Evaluation) -> Report:
     """Try a trained learner on a device and, where it is simulated, on others like it."""
-    task, found, cannot = device.task, {}, {}
+    task, found, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
     found |= _named("same", metrics(chances, _labels(same), task, settings.false_alarm_rate))
-    columns = {"holdout": iter([device.touches("holdout")])}
+    columns: dict[str, Iterator[Touches]] = {"holdout": iter([device.touches("holdout")])}
     if isinstance(device, Simulated):
         columns |= {"device_shift": _devices(device, settings), "unseen_layout": _layouts(device, settings)}
     for column, sets in columns.items():

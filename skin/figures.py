@@ -1,6 +1,6 @@
 """The report's figures 4, 7, 8, 10 and 11 from our own data, each written whole."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +74,7 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
 
 
 def misclassified(
-    speeds: np.ndarray, wrong: Mapping[str, np.ndarray], label: str, bins: Sequence[float]
+    speeds: np.ndarray, wrong: Mapping[str, np.ndarray], label: str, bins: np.ndarray
 ) -> Figure:
     """Draw the share of gestures whose label is wrong against the speed of the slide (report, figure 7).
 
@@ -82,14 +82,13 @@ def misclassified(
         speeds: (B,), m per frame; 0 for a static touch.
         wrong: row -> (B,), bool.
         label: which label.
-        bins: edges in m per frame; static touches stand at 0 on their own.
+        bins: ascending edges, m per frame; static touches stand at 0 on their own.
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
-    edges = np.asarray(bins)
-    middles = np.concatenate([[0.0], (edges[1:] + edges[:-1]) / 2])
+    middles = np.concatenate([[0.0], (bins[1:] + bins[:-1]) / 2])
     # Static touches go to group 0, a slide in bin k to group k.
-    group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, edges), 1, len(edges) - 1))
+    group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, bins), 1, len(bins) - 1))
     for (row, errors), colour in zip(wrong.items(), _COLOURS * 2, strict=False):
         counts = np.bincount(group, minlength=len(middles))
         shares = np.bincount(group, weights=errors, minlength=len(middles)) / np.maximum(counts, 1)

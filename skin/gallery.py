@@ -38,9 +38,7 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
         for row, table in tables.items():
             matrices[row] = confusion(_column(table, "p_dangerous"), _column(table, "dangerous"))[0].numpy()
             wrong[row] = ((_column(table, "p_big") > 0.5) != (_column(table, "big") > 0.5))[:, 0].numpy()
-        speeds = np.where(
-            *(np.asarray(next(iter(tables.values()))[name]) for name in ("dynamic", "speed")), 0
-        )
+        speeds = _column(next(iter(tables.values())), "speed")[:, 0].numpy()
         drawn = figures.confusions(matrices, ("safe", "dangerous"))
         paths.append(figures.save(drawn, folder / f"figure08_confusion_{simulator}.png"))
         drawn = figures.misclassified(speeds, wrong, "big", _SPEEDS)
@@ -52,6 +50,7 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
     """Draw figures 4, 10 and 11 from the gestures of a finite-element skin."""
     recording = device.recording("test")
     touches, drawn = recording.touches, recording.parameters
+    assert touches.labels is not None and recording.force is not None
     labels = dict(zip(device.task.names, touches.labels.T.bool(), strict=True))
     sliding = int((labels["big"] & labels["dynamic"] & labels["press"] & labels["dangerous"]).nonzero()[0])
     pictures = _pictures(touches[sliding : sliding + 1].readings, touches.positions, device.size)

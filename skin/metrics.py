@@ -26,8 +26,9 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
         false_alarm_rate: share of false alarms at which the recall of ``dangerous`` is read.
 
     Returns:
-        ``<label>/accuracy``, ``/balanced_accuracy``, ``/ece`` for each label of a binary task, ``dangerous/recall``, and
-        ``overall/accuracy``: the mean of the labels' accuracies (report, 3.2); an exclusive task has only this.
+        ``<label>/accuracy``, ``/balanced_accuracy`` and ``/ece`` for each label of a binary task,
+        ``dangerous/recall``, and ``overall/accuracy``: the mean of the labels' accuracies (report, 3.2); an
+        exclusive task has only this.
     """
     if task.kind == "exclusive":
         right = multiclass_accuracy(probabilities, labels.argmax(1), len(task), average="micro")
@@ -59,7 +60,7 @@ def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
 
 
 def confusion(probabilities: Tensor, labels: Tensor) -> Tensor:
-    """Return counts (L, 2, 2) for probabilities and labels (B, L): true class down, predicted class across."""
+    """Return counts (L, 2, 2) of probabilities and labels (B, L): true class down, predicted across."""
     pairs = zip(*_columns(probabilities, labels), strict=True)
     return torch.stack([binary_confusion_matrix(chance, label) for chance, label in pairs])
 

@@ -60,7 +60,7 @@ class Progress:
         self._expected[number] = 0.0
 
     def left(self) -> float | None:
-        """Return the estimated rest, s, scaled by this machine's speed so far; None before anything is known."""
+        """Return the estimated rest, s, scaled by this machine's speed so far; None if nothing is known."""
         if not self._done:
             return sum(self._expected) if self._sure else None
         return sum(self._expected) * self._spent / self._done
@@ -69,8 +69,9 @@ class Progress:
 class Sweep(Callback):
     """Hydra's callback of every command: opens and closes the parent run, prints progress.
 
-    The parent exists before the first job, and with it database and experiment: jobs that start at once must not
-    race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is closed at exit.
+    The parent exists before the first job, and with it database and experiment: jobs that start at once must
+    not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
+    closed at exit.
     """
 
     def __init__(self) -> None:
@@ -140,9 +141,9 @@ class Sweep(Callback):
 
 
 def _tracking(config: DictConfig) -> Tracking:
-    """Return the settings that all jobs share: a multirun's own configuration is that of no job, but has them."""
-    whole = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-    return OmegaConf.to_object(checked(whole).tracking)
+    """Return the settings that all jobs share; a multirun's own configuration has them too."""
+    whole = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    return checked(whole).tracking
 
 
 def _seconds(store: "Store", job: dict[str, str]) -> float | None:

@@ -87,8 +87,8 @@ def report_values(path: Path) -> dict[tuple[str, str, str], float]:
 def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> list[dict[str, str]]:
     """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
 
-    ``ours`` is the mean over seeds of the accuracy on the 4000 test gestures, of ``dangerous_recall`` that recall;
-    ``failed`` where no run finished.
+    ``ours`` is the mean over seeds of the accuracy on the test gestures, or of that recall; ``failed`` where
+    no run finished.
     """
     lines = []
     for cell in cells:

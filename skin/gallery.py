@@ -50,7 +50,8 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
     """Draw figures 4, 10 and 11 from the gestures of a finite-element skin."""
     recording = device.recording("test")
     touches, drawn = recording.touches, recording.parameters
-    assert touches.labels is not None and recording.force is not None
+    assert touches.labels is not None
+    assert recording.force is not None
     labels = dict(zip(device.task.names, touches.labels.T.bool(), strict=True))
     sliding = int((labels["big"] & labels["dynamic"] & labels["press"] & labels["dangerous"]).nonzero()[0])
     pictures = _pictures(touches[sliding : sliding + 1].readings, touches.positions, device.size)

@@ -1,0 +1,125 @@
+"""A finished run, brought back: its configuration with changes, and what it learned."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from mlflow.artifacts import download_artifacts
+from mlflow.entities import Run
+from omegaconf import DictConfig, OmegaConf
+
+from skin.config import checked
+from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.learner.base import AbstractLearner
+from skin.tracking import Store
+
+__all__ = ["changed", "configuration", "find", "restore"]
+
+# What a run learned fits these as they were; the rest may be tried with others.
+_FIXED = (
+    "representation",
+    "model",
+    "fusion",
+    "learner",
+    "optimizer",
+    "trainer",
+    "experiment",
+    "sweep",
+    "seed",
+)
+
+
+def find(store: Store, name: str) -> Run:
+    """Return the finished training run with an id that begins so; ``latest`` is the last one that finished.
+
+    Raises:
+        InputError: there is none, or more than one.
+    """
+    runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
+    named = [run for run in runs if run.info.run_id.startswith(name)]
+    found = runs[:1] if name == "latest" else named
+    if not found:
+        raise InputError(f"no finished training run {name} in {store.uri}: experiments/train.py makes one")
+    if len(found) > 1:
+        raise InputError(f"{len(found)} runs have an id that begins with {name}: give more of it")
+    return found[0]
+
+
+def configuration(store: Store, run: Run) -> DictConfig:
+    """Return the configuration that a run was made from, every value in it final."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = download_artifacts(
+            run_id=run.info.run_id, artifact_path="config.yaml", dst_path=folder, tracking_uri=store.uri
+        )
+        return OmegaConf.load(path)  # type: ignore[return-value]
+
+
+def changed(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return a run's configuration with the changes that a command line asks for, checked.
+
+    Args:
+        stored: as :func:`configuration` gives it.
+        composed: a fresh configuration that the overrides have changed.
+        overrides: of the command line: only what they name is taken from ``composed``.
+
+    Raises:
+        InputError: an override would not fit what the run learned.
+    """
+    whole = OmegaConf.create(_raw(stored))
+    assert isinstance(whole, DictConfig)
+    _follow(whole, composed)
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.key_or_group
+        if key == "run" or key.startswith("hydra"):
+            continue
+        group = key.split(".")[0]
+        if group in _FIXED:
+            raise InputError(f"{key} was fixed when the run was trained: leave it out, or train another run")
+        parent, _, name = key.rpartition(".")
+        source = OmegaConf.select(composed, parent) if parent else composed
+        # As it stands there, unresolved: a device follows the simulator of this run, not of a default one.
+        OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+    whole.tracking = composed.tracking
+    return checked(whole)
+
+
+def restore(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -> None:
+    """Give a learner what a run learned.
+
+    Raises:
+        InputError: what it learned does not fit the touches, as another window does not fit early fusion.
+    """
+    name = run.data.tags["learned"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = download_artifacts(
+            run_id=run.info.run_id, artifact_path=name, dst_path=folder, tracking_uri=store.uri
+        )
+        try:
+            learner.load(data, Path(path))
+        except (RuntimeError, KeyError) as error:
+            reason = str(error).strip().splitlines()[-1].strip()
+            raise InputError(
+                f"what run {run.info.run_id} learned does not fit these touches: {reason}"
+            ) from error
+
+
+def _follow(whole: DictConfig, composed: DictConfig) -> None:
+    """Let the device follow other groups again, as a fresh configuration does, where it did in the run.
+
+    Stored configurations are resolved; without this ``simulator=naive`` would not reach ``device.simulator``.
+    """
+    device = _raw(whole.device)
+    for name, value in _raw(composed.device).items():
+        if not isinstance(value, str) or not value.startswith("${") or name not in device:
+            continue
+        if OmegaConf.select(whole, value[2:-1]) == device[name]:
+            device[name] = value
+    whole.device = device
+
+
+def _raw(config: DictConfig) -> dict[str, Any]:
+    """Return plain containers with interpolations as they stand."""
+    return OmegaConf.to_container(config, resolve=False)  # type: ignore[return-value]

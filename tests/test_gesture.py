@@ -1,0 +1,114 @@
+"""What gestures are drawn from."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.gesture import GestureSettings, draw_gestures, draw_paths, fold
+from skin.labels import Thresholds
+from skin.shapes import Shapes
+
+CONF = Path(__file__).parents[1] / "conf" / "touch.yaml"
+BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+
+
+def test_the_shipped_configuration_is_the_default_difficulty():
+    assert GestureSettings.of(OmegaConf.to_container(OmegaConf.load(CONF))["touch"]) == GestureSettings()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"shape": ["disc"]}, r"touch has no shape: it takes .*shapes"),
+        ({"thresholds": {"area": 0.3, "are": 1}}, r"touch.thresholds has no are"),
+        ({"shapes": []}, r"touch.shapes must list at least one shape"),
+        ({"shapes": "disc"}, r"touch.shapes must list at least one shape"),
+        ({"small_area": [0.2, 0.4]}, r"touch.small_area=\[0.2, 0.4\] must lie between 0 and 0.3"),
+        ({"big_area": [0.2, 0.4]}, r"touch.big_area"),
+        ({"press": [3, 20]}, r"touch.press=\[3, 20\] must lie between 4 and 30"),
+        ({"press": [4, 31]}, r"touch.press"),
+        ({"tap": [1, 4]}, r"touch.tap"),
+        ({"tap": [1, 1]}, r"slides over at least 2 frames"),
+        ({"safe_peak": [0, 90e3]}, r"pressure of 0 is no touch"),
+        ({"safe_peak": [0, 0]}, r"touch.safe_peak"),
+        ({"safe_peak": [float("nan"), 90e3]}, r"touch.safe_peak"),
+        ({"dangerous_peak": [50e3, 180e3]}, r"touch.dangerous_peak"),
+        ({"speed": [0.02, 0.003]}, r"touch.speed must be a range"),
+        ({"path": 0.03}, r"touch.path=0.03 m is longer"),
+        ({"redraws": 0}, r"touch.redraws must be at least 1"),
+    ],
+)
+def test_settings_that_no_gesture_can_meet_are_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        GestureSettings.of(given)
+
+
+def test_thresholds_move_the_ranges():
+    settings = {"thresholds": {"frames": 5}, "tap": [1, 5], "press": [6, 20]}
+    assert GestureSettings.of(settings).thresholds == Thresholds(frames=5)
+
+
+def test_fold_is_a_ball_between_two_walls():
+    """Against a ball stepped along and turned round at each wall."""
+    room, step, place, ways = 7.0, 0.3, 2.0, []
+    for _ in range(200):
+        ways.append(place)
+        place += step
+        if not 0 <= place <= room:
+            place, step = (2 * room - place if place > room else -place), -step
+    straight = 2.0 + 0.3 * np.arange(200)
+    np.testing.assert_allclose(fold(straight, np.full(200, room)), ways, atol=1e-9)
+
+
+def test_a_shape_that_never_fits_is_named():
+    settings = GestureSettings(shapes=("bar",), big_area=(0.4, 0.7))
+    labels = np.ones((1, 4), bool)
+    with pytest.raises(InputError, match=r"touch.shapes=\['bar'\] covers 0.4 to 0.7 of a sheet"):
+        draw_gestures(labels, settings, Shapes(("bar",), BODY), True, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    settings = GestureSettings()
+    shapes = Shapes(settings.shapes, BODY)
+    generator = np.random.default_rng(0)
+    labels = generator.random((4000, 4)) < 0.5
+    gestures = draw_gestures(labels, settings, shapes, True, generator)
+    paths = draw_paths(labels, gestures, settings, BODY.size, generator.random((4000, 5)))
+    return labels, gestures, paths
+
+
+def test_time_spans(drawn):
+    labels, gestures, _ = drawn
+    press, dynamic = labels[:, 2], labels[:, 1]
+    duration, onset = gestures["duration"], gestures["onset"]
+    assert set(duration[press]) == set(range(4, 21))
+    assert set(duration[~press & ~dynamic]) == {1, 2, 3}
+    assert set(duration[~press & dynamic]) == {2, 3}
+    assert onset.min() == 0
+    assert (onset + duration).max() == 30
+
+
+def test_every_gesture_leaves_room(drawn):
+    _, gestures, paths = drawn
+    assert (gestures["high"] - gestures["low"]).max() <= 0.15
+    assert paths["room"].min() >= 0.01
+    assert (paths["start"] >= 0).all()
+    assert (paths["start"] <= paths["room"]).all()
+
+
+def test_paths(drawn):
+    labels, gestures, paths = drawn
+    dynamic, dangerous = labels[:, 1], labels[:, 3]
+    speed, way = paths["speed"], paths["speed"] * (gestures["duration"] - 1)
+    assert (speed[~dynamic] == 0).all()
+    assert speed[dynamic].min() >= 0.003
+    assert speed.max() <= 0.020
+    assert way[dynamic].min() >= 0.010 - 1e-12
+    peak = paths["peak"]
+    assert 10e3 <= peak[~dangerous].min() < peak[~dangerous].max() <= 90.5e3
+    assert 90.5e3 <= peak[dangerous].min() < peak[dangerous].max() <= 180e3

@@ -1,0 +1,85 @@
+"""Pictures that press, and pictures that cannot."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from skin.errors import InputError
+from skin.images import check, load, pyramid
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+def save(path: Path, pixels: np.ndarray) -> str:
+    Image.fromarray(pixels).save(path)
+    return str(path)
+
+
+def test_the_shipped_shapes_are_what_the_script_draws():
+    shapes = runpy.run_path(str(DATA / "make_shapes.py"))["SHAPES"]
+    assert {path.stem for path in (DATA / "shapes").glob("*.png")} == set(shapes)
+    for name, shape in shapes.items():
+        np.testing.assert_allclose(load(name), shape() / shape().max(), atol=1.01 / 255)
+
+
+@pytest.mark.parametrize(
+    "pixels",
+    [
+        np.array([[0, 128], [255, 64], [0, 0]], np.uint8),
+        np.array([[0, 32896], [65535, 16448], [0, 0]], np.uint16),
+        np.array([[0, 128 / 255], [1, 64 / 255], [0, 0]], np.float32) * 7,
+    ],
+    ids=["8 bits", "16 bits", "float"],
+)
+def test_any_depth(tmp_path, pixels):
+    suffix = "tiff" if pixels.dtype == np.float32 else "png"
+    image = load(save(tmp_path / f"mine.{suffix}", pixels))
+    np.testing.assert_allclose(image, [[0, 128 / 255], [1, 64 / 255], [0, 0]], atol=1e-3)
+
+
+def test_transparent_means_no_force(tmp_path):
+    pixels = np.full((4, 4, 4), 255, np.uint8)
+    pixels[:2, :, 3] = 0
+    np.testing.assert_array_equal(load(save(tmp_path / "mine.png", pixels)), [[0] * 4] * 2 + [[1] * 4] * 2)
+
+
+def test_a_relative_path_starts_in_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save(tmp_path / "mine.png", np.full((3, 3), 9, np.uint8))
+    assert load("mine.png").shape == (3, 3)
+
+
+def test_refusals_name_the_picture(tmp_path):
+    with pytest.raises(InputError, match=r"no shape nothing: touch.shapes takes bar, .*square"):
+        load("nothing")
+    (tmp_path / "text.png").write_text("no picture")
+    with pytest.raises(InputError, match=r"cannot read the shape .*text.png"):
+        load(str(tmp_path / "text.png"))
+    (tmp_path / "empty.png").touch()
+    with pytest.raises(InputError, match=r"cannot read the shape .*empty.png"):
+        load(str(tmp_path / "empty.png"))
+    good = (DATA / "shapes" / "hand.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(good[: len(good) // 2])
+    with pytest.raises(InputError, match=r"cannot read the shape .*cut.png"):
+        load(str(tmp_path / "cut.png"))
+    with pytest.raises(InputError, match=r"black.png is black"):
+        load(save(tmp_path / "black.png", np.zeros((5, 5), np.uint8)))
+    with pytest.raises(InputError, match=r"nan.tiff has pixels that are NaN"):
+        load(save(tmp_path / "nan.tiff", np.array([[1, np.nan]], np.float32)))
+    with pytest.raises(InputError, match=r"below 0"):
+        load(save(tmp_path / "pull.tiff", np.array([[1, -1]], np.float32)))
+    with pytest.raises(InputError, match=r"must be a grey-scale picture"):
+        check(np.zeros((0, 4)), "nothing")
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 50), (640, 480), (97, 1)])
+def test_every_level_of_a_pyramid_holds_the_same_force(shape):
+    image = np.random.default_rng(0).random(shape)
+    levels = pyramid([image], 64)
+    assert [level.shape[-1] for level in levels] == [64, 32, 16, 8, 4, 2, 1]
+    force = [float(level.sum()) * 4**number for number, level in enumerate(levels)]
+    np.testing.assert_allclose(force, force[0], rtol=1e-5)
+    assert levels[0][0, 0, 0].max() == levels[0][0, 0, :, -1].max() == 0

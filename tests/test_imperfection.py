@@ -1,0 +1,95 @@
+"""Imperfections, one by one."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.imperfection import Imperfection
+
+NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}
+
+
+def generator(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def apply(readings: torch.Tensor, seed: int = 0, **settings):
+    imperfection = Imperfection(**(NONE | settings))
+    constants = imperfection.constants(readings.shape[-1], generator(seed))
+    return imperfection.apply(readings, constants, generator(seed + 1000))
+
+
+def test_a_perfect_device_says_the_truth():
+    readings = torch.linspace(-3, 9, 24).view(2, 3, 4)
+    said, valid = apply(readings)
+    torch.testing.assert_close(said, readings)
+    assert valid.all()
+
+
+def test_noise_and_offset_come_after_the_clip():
+    """So what is said passes the clip, as in the report (2.1.4)."""
+    said, _ = apply(torch.full((400, 30, 25), 50.0), noise=0.05, offset=0.1)
+    assert said.max() > 10.05
+    frames, sensors = said.std(dim=(0, 1)), said.mean(dim=(0, 1)) - 10
+    torch.testing.assert_close(frames, torch.full((25,), 0.05), rtol=0.05, atol=0)
+    assert 0.05 < sensors.std() < 0.16
+
+
+def test_gain_comes_before_the_clip():
+    said, _ = apply(torch.full((2, 3, 1000), 50.0), gain_spread=0.05)
+    assert (said == 10).all()
+    below, _ = apply(torch.full((2, 3, 1000), 5.0), gain_spread=0.05)
+    assert 0.045 < below[0, 0].div(5).log().std() < 0.055
+    assert torch.equal(below[0], below[1])
+
+
+def test_constants_belong_to_the_device_and_noise_does_not():
+    idle = torch.zeros(5, 30, 25)
+    one, _ = apply(idle, offset=0.1)
+    assert torch.equal(one[0, 0], one[4, 29])
+    other, _ = apply(idle, seed=1, offset=0.1)
+    assert not torch.equal(one, other)
+
+
+def test_dead_sensors_read_zero_and_are_invalid():
+    said, valid = apply(torch.full((5, 30, 25), 3.0), dead=4, offset=0.1, noise=0.05)
+    assert (~valid).sum(-1).eq(4).all()
+    assert (said[~valid] == 0).all()
+    assert (said[valid] > 2).all()
+    assert (valid == valid[0, 0]).all()
+
+
+def test_tare_removes_the_offset_but_for_the_noise_of_its_idle_frames():
+    idle = torch.zeros(1, 1, 4000)
+    with_offset, _ = apply(idle, offset=0.1)
+    tared, _ = apply(idle, offset=0.1, noise=0.05, tare=True)
+    assert with_offset.std() > 0.09
+    assert abs(float(tared.std()) - 0.05 * np.sqrt(1 + 1 / 30)) < 0.003
+
+
+def test_a_device_per_gesture():
+    imperfection = Imperfection(noise=0, dead=2)
+    constants = imperfection.constants(25, generator(), gestures=6)
+    said, valid = imperfection.apply(torch.zeros(6, 30, 25), constants, generator(1))
+    assert (said == said[:, :1]).all()
+    assert not torch.equal(said[0], said[1])
+    assert (~valid).sum(-1).eq(2).all()
+
+
+def test_clipped_looks_at_living_sensors():
+    imperfection = Imperfection(gain_spread=0, dead=1)
+    constants = imperfection.constants(2, generator())
+    readings = torch.zeros(3, 4, 2)
+    living = int((~constants.dead).nonzero())
+    readings[0, 2, living], readings[1, 2, 1 - living], readings[2, 0, living] = 11.0, 11.0, 9.9
+    assert imperfection.clipped(readings, constants).tolist() == [True, False, False]
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(InputError, match=r"device.noise must be at least 0, got -1"):
+        Imperfection(noise=-1)
+    with pytest.raises(InputError, match=r"device.clip must be above 0"):
+        Imperfection(clip=0)
+    with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
+        Imperfection(dead=25).constants(25, generator())

@@ -1,0 +1,156 @@
+"""Recordings in files: equal to the last bit, or refused by name."""
+
+import json
+from dataclasses import replace
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.labels import TOUCH, Task
+from skin.recording import Recording, Touches
+from skin.storage import read, write
+
+BATCH, TIME, SENSORS = 7, 5, 3
+
+
+def recording(**changes) -> Recording:
+    generator = torch.Generator().manual_seed(0)
+    # From 1e-10 to 1e10: a file that rounds would show it.
+    readings = torch.randn(BATCH, TIME, SENSORS, generator=generator) * 10 ** torch.linspace(-10, 10, SENSORS)
+    valid = torch.ones(BATCH, TIME, SENSORS, dtype=torch.bool)
+    valid[2, 1, 0], readings[2, 1, 0] = False, 0.0
+    touches = Touches(
+        readings,
+        valid,
+        torch.rand(SENSORS, 3, generator=generator),
+        (torch.rand(BATCH, 4, generator=generator) > 0.5).float(),
+        12.5,
+    )
+    parts = {
+        "touches": touches,
+        "task": TOUCH,
+        "size": (0.16, 0.1),
+        "footprint": (0.01, 0.02),
+        "force": torch.rand(BATCH, TIME, generator=generator),
+        "displacement": torch.rand(BATCH, TIME, SENSORS, 2, generator=generator),
+        "parameters": {"force": torch.rand(BATCH), "speed": torch.rand(BATCH)},
+        "metadata": {"seed": 3, "note": "ü"},
+    }
+    return Recording(**(parts | changes))
+
+
+def same(one, other) -> bool:
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other) and one.dtype == other.dtype
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, Recording | Touches):
+        return same(vars(one), vars(other))
+    return one == other
+
+
+def variants() -> dict[str, Recording]:
+    full = recording()
+    return {
+        "full": full,
+        "readings only": recording(force=None, displacement=None, parameters={}, metadata={}),
+        "unlabelled": replace(full, touches=replace(full.touches, labels=None)),
+        "direction": replace(
+            full,
+            task=Task(("cos", "sin"), "direction"),
+            touches=replace(full.touches, labels=torch.rand(BATCH, 2) - 0.5),
+        ),
+    }
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+@pytest.mark.parametrize("variant", variants())
+def test_reads_back_equal(tmp_path, suffix, variant):
+    kept = variants()[variant]
+    assert same(read(write(kept, tmp_path / f"x.{suffix}")), kept)
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_rows_are_the_reports(tmp_path, suffix):
+    """Read without this project's code."""
+    kept = recording()
+    path = write(kept, tmp_path / f"x.{suffix}")
+    table = pa.csv.read_csv(path) if suffix == "csv" else pa.parquet.read_table(path)
+    readings = [f"reading_0{number}" for number in range(SENSORS)]
+    moves = [f"{name}_0{number}" for name in ("D_s", "D_t") for number in range(SENSORS)]
+    ids = ["simulation", "frame", *TOUCH.names]
+    assert table.column_names == [*ids, *readings, "force", *moves, "gesture_force", "gesture_speed"]
+    row = table.slice(4 * TIME + 3, 1).to_pylist()[0]
+    assert (row["simulation"], row["frame"]) == (4, 3)
+    assert [row[name] for name in TOUCH.names] == kept.touches.labels[4].tolist()
+    assert row["reading_02"] == pytest.approx(float(kept.touches.readings[4, 3, 2]))
+    assert row["D_t_01"] == pytest.approx(float(kept.displacement[4, 3, 1, 1]))
+    assert table["reading_00"][2 * TIME + 1].as_py() is None
+
+
+def test_units_and_layout_are_in_the_file(tmp_path):
+    kept = recording()
+    about = json.loads(pa.parquet.read_schema(write(kept, tmp_path / "x.parquet")).metadata[b"skin"])
+    beside = json.loads(write(kept, tmp_path / "x.csv").with_name("x.csv.json").read_text())
+    assert about == beside
+    assert about["units"]["reading"] == "N"
+    assert about["positions"] == kept.touches.positions.tolist()
+    assert about["metadata"]["seed"] == 3
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = write(recording(), tmp_path / "x.parquet")
+    before = path.read_bytes()
+
+    def fail(table, partial, **options):
+        partial.write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr("pyarrow.parquet.write_table", fail)
+    with pytest.raises(InputError, match=r"cannot write .*disk full"):
+        write(recording(force=None), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_files_that_are_no_recordings_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no recording .*x.parquet: experiments/generate.py"):
+        read(tmp_path / "x.parquet")
+    with pytest.raises(InputError, match=r"\.parquet or \.csv file, got x.txt"):
+        write(recording(), tmp_path / "x.txt")
+    (tmp_path / "y.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"y.csv needs y.csv.json beside it"):
+        read(tmp_path / "y.csv")
+    pa.parquet.write_table(pa.table({"a": [1]}), tmp_path / "z.parquet")
+    with pytest.raises(InputError, match=r"z.parquet is no recording"):
+        read(tmp_path / "z.parquet")
+    path = write(recording(), tmp_path / "cut.parquet")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"cut.parquet is damaged"):
+        read(path)
+
+
+def test_a_csv_without_some_rows_or_columns_is_refused(tmp_path):
+    path = write(recording(), tmp_path / "x.csv")
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:-1]))
+    with pytest.raises(InputError, match=r"34 rows, not 7 touches of 5 frames"):
+        read(path)
+    path.write_text("".join([*lines[:8], lines[9], lines[8], *lines[10:]]))
+    with pytest.raises(InputError, match=r"row 8: simulation and frame are \[1, 3\], expected \[1, 2\]"):
+        read(path)
+    path.write_text("".join(lines).replace("reading_01", "reading_99"))
+    with pytest.raises(InputError, match=r"damaged or no recording.*reading_01"):
+        read(path)
+
+
+def test_other_units_are_refused(tmp_path):
+    path = write(recording(), tmp_path / "x.csv")
+    beside = path.with_name("x.csv.json")
+    beside.write_text(beside.read_text().replace('"reading": "N"', '"reading": "kgf"'))
+    with pytest.raises(InputError, match=r"has the units .*kgf"):
+        read(path)

@@ -1,0 +1,195 @@
+"""Movies of sampled gestures, looked at frame by frame."""
+
+import numpy as np
+import pytest
+import torch
+from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.model_selection import cross_val_score
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.scattered import Scattered
+from skin.touch import TouchSampler, balanced, join
+
+LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
+SHEETS = {
+    "default": Sheet([0.16, 0.16], [32, 32], LAYER),
+    "oblong": Sheet([0.20, 0.12], [25, 18], LAYER),
+}
+
+
+def sampler(body: Sheet, **settings) -> TouchSampler:
+    padded = settings.pop("padded", True)
+    sensors = Scattered(5, 5, seed=0).sensors(body)
+    return TouchSampler(body, body.footprints(sensors), settings, padded)
+
+
+@pytest.fixture(scope="module", params=SHEETS)
+def sampled(request):
+    """A sampler, what it sampled, and the dense movie."""
+    source = sampler(SHEETS[request.param])
+    movie = source.sample(160, np.random.default_rng(5))
+    return source, movie, movie.pressure().double().numpy()
+
+
+def longest_run(values) -> int:
+    best = run = 0
+    for value in values:
+        run = run + 1 if value else 0
+        best = max(best, run)
+    return best
+
+
+def test_labels_are_what_the_movie_gives(sampled):
+    """Recomputed from the dense movie alone, gesture by gesture, straight from the report's sentences."""
+    source, movie, pressure = sampled
+    body = source.body
+    weights = source.footprints.double().numpy()
+    x = (np.arange(body.cells[0]) + 0.5) * body.cell[0]
+    y = (np.arange(body.cells[1]) + 0.5) * body.cell[1]
+    for gesture, labels in zip(pressure, movie.labels.bool().tolist(), strict=True):
+        contact = gesture > 0.02 * gesture.max()
+        big = contact.mean((1, 2)).max() > 0.30
+        touched = contact.any((1, 2))
+        centres = [
+            (np.sum(frame.sum(0) * x) / frame.sum(), np.sum(frame.sum(1) * y) / frame.sum())
+            for frame in gesture[touched]
+        ]
+        dynamic = max(np.hypot(*np.subtract(centre, centres[0])) for centre in centres) > 1e-3
+        dangerous = (gesture.reshape(len(gesture), -1) @ weights.T).max() > 90.5e3
+        assert [big, dynamic, longest_run(touched) > 3, dangerous] == labels
+
+
+def test_all_combinations_are_balanced(sampled):
+    _, movie, _ = sampled
+    codes = movie.labels.numpy() @ [1, 2, 4, 8]
+    assert np.bincount(codes.astype(int), minlength=16).tolist() == [10] * 16
+
+
+@pytest.mark.parametrize("count", [1, 15, 100, 2350])
+def test_counts_of_combinations_differ_by_one_at_most(count):
+    codes = balanced(count, np.random.default_rng(0)) @ [1, 2, 4, 8]
+    counts = np.bincount(codes, minlength=16)
+    assert counts.sum() == count
+    assert np.ptp(counts) <= 1
+
+
+def test_force_is_conserved_in_every_frame(sampled):
+    source, movie, pressure = sampled
+    applied = pressure.sum((2, 3)) * np.prod(source.body.cell)
+    np.testing.assert_allclose(applied, movie.force.numpy(), rtol=1e-5)
+
+
+def test_the_drawn_peak_is_the_largest_cell(sampled):
+    _, movie, pressure = sampled
+    np.testing.assert_allclose(pressure.max((1, 2, 3)), movie.parameters["peak"].numpy(), rtol=1e-5)
+
+
+def test_safe_means_nowhere_above_the_threshold(sampled):
+    _, movie, pressure = sampled
+    assert pressure[movie.labels[:, 3].numpy() == 0].max() <= 90.5e3 * (1 + 1e-6)
+
+
+def test_contact_lasts_from_the_onset_for_the_duration(sampled):
+    _, movie, pressure = sampled
+    touched = (pressure > 0.02 * pressure.max((1, 2, 3), keepdims=True)).any((2, 3))
+    time, onset, duration = np.arange(30), *(movie.parameters[k].numpy() for k in ("onset", "duration"))
+    expected = (time >= onset[:, None]) & (time < (onset + duration)[:, None])
+    np.testing.assert_array_equal(touched, expected)
+    assert (pressure.max((2, 3))[~expected] == 0).all()
+
+
+def test_force_rises_over_a_third_and_falls_over_a_third(sampled):
+    _, movie, _ = sampled
+    for share, duration in zip(movie.scale, movie.parameters["duration"].int().tolist(), strict=True):
+        profile = share[share > 0]
+        ramp = duration // 3
+        assert len(profile) == duration
+        assert (profile[ramp : duration - ramp] == 1).all()
+        assert (profile[:ramp].diff() > 0).all()
+        torch.testing.assert_close(profile, profile.flip(0))
+
+
+def test_a_touch_that_stands_still_is_rendered_once(sampled):
+    _, movie, _ = sampled
+    dynamic = movie.labels[:, 1] == 1
+    duration = movie.parameters["duration"]
+    assert len(movie.frames) == (~dynamic).sum() + duration[dynamic].sum()
+    assert (movie.parameters["speed"][~dynamic] == 0).all()
+
+
+def test_sliding_is_straight_and_as_fast_as_drawn():
+    """On a large sheet, where nothing is reflected within a few frames of the middle."""
+    body = Sheet([1.0, 1.0], [200, 200], LAYER)
+    source = TouchSampler(body, np.full((1, 40000), 1 / 40000), {"tap": [1, 3], "shapes": ["fingertip"]})
+    wanted = np.tile([False, True, False, False], (40, 1))
+    movie = source.sample(40, np.random.default_rng(0), wanted)
+    weight = movie.frames / movie.frames.sum((1, 2), keepdim=True)
+    middle = (torch.arange(200) + 0.5) * 0.005
+    centre = torch.stack([(weight.sum(1) * middle).sum(1), (weight.sum(2) * middle).sum(1)], 1)[movie.index]
+    speed, direction = movie.parameters["speed"], movie.parameters["direction"]
+    step = speed[:, None] * torch.stack([direction.cos(), direction.sin()], 1)
+    moved = [one[share > 0].diff(dim=0) for one, share in zip(centre, movie.scale, strict=True)]
+    inner = [(one - way).abs().max() < 1e-3 for one, way in zip(moved, step, strict=True)]
+    assert sum(inner) >= 30
+
+
+def test_drawn_area_classes_hold_as_measured(sampled):
+    _, movie, _ = sampled
+    cells = movie.parameters["area"] * movie.frames[0].numel()
+    sheet, big = movie.frames[0].numel(), movie.labels[:, 0] == 1
+    # Cells at the rim are in or out, so a shape that covers 1 or 70 % may cover some cells less or more.
+    assert 0.01 * sheet - 4 <= cells[~big].min()
+    assert cells[~big].max() <= 0.30 * sheet < cells[big].min()
+    assert cells[big].max() <= 0.75 * sheet
+
+
+def test_unpadded_touches_begin_at_the_first_frame():
+    movie = sampler(SHEETS["default"], padded=False).sample(64, np.random.default_rng(0))
+    assert (movie.scale[:, 0] > 0).all()
+    assert (movie.parameters["onset"] == 0).all()
+
+
+def test_the_same_seed_is_the_same_movie_and_another_is_not():
+    source = sampler(SHEETS["default"])
+    one, same, other = (source.sample(32, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert torch.equal(one.pressure(), same.pressure())
+    assert not torch.equal(one.labels, other.labels)
+
+
+def test_rows_of_a_movie_are_its_gestures():
+    movie = sampler(SHEETS["oblong"]).sample(24, np.random.default_rng(0))
+    rows = torch.tensor([7, 3, 20])
+    some = movie[rows]
+    assert torch.equal(some.pressure(), movie.pressure()[rows])
+    assert len(some.frames) < len(movie.frames)
+    again = join([movie[:10], movie[10:]])
+    assert torch.equal(again.pressure(), movie.pressure())
+    assert torch.equal(again.parameters["peak"], movie.parameters["peak"])
+
+
+def test_a_picture_of_ones_own_presses(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "cross.png"
+    pixels = np.zeros((50, 70), np.uint8)
+    pixels[20:30], pixels[:, 30:40] = 255, 255
+    Image.fromarray(pixels).save(path)
+    movie = sampler(SHEETS["default"], shapes=["disc", str(path)]).sample(32, np.random.default_rng(0))
+    assert (movie.parameters["shape"] == 1).any()
+
+
+def test_a_combination_that_never_occurs_is_refused():
+    body = SHEETS["default"]
+    blind = np.zeros((1, 1024))
+    with pytest.raises(InputError, match=r"no gesture in .* draws was .*dangerous"):
+        TouchSampler(body, blind, {"redraws": 1}).sample(16, np.random.default_rng(0))
+
+
+def test_nothing_but_the_path_gives_dynamic_away():
+    """Duration, onset, shape and area predict it no better than .60; a tap of one frame cannot slide."""
+    movie = sampler(SHEETS["default"]).sample(2000, np.random.default_rng(0))
+    known = torch.stack([movie.parameters[name] for name in ("duration", "onset", "shape", "area")], 1)
+    booster = HistGradientBoostingClassifier(max_iter=60, random_state=0)
+    score = cross_val_score(booster, known.numpy(), movie.labels[:, 1].numpy(), cv=5).mean()
+    assert score <= 0.60

@@ -1,0 +1,77 @@
+"""Measure speed and memory, each against a peer in the same run, and write results/bench.json."""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+from benchmarks import mechanics, training
+from benchmarks.generation import GESTURES
+from benchmarks.setting import seconds
+from rich.console import Console
+
+from skin.config import ROOT
+from skin.table import write
+
+HERE = Path(__file__).parent
+PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "PyNiteFEA")
+
+
+def main() -> None:
+    """Take every figure and write the file whole; progress goes to standard error."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, choices=range(3, 100), default=3, metavar="N >= 3")
+    parser.add_argument("--rows", nargs="*", choices=training.ROWS, default=training.ROWS)
+    arguments = parser.parse_args()
+    repeats, say = arguments.repeats, Console(stderr=True).print
+    figures = {
+        "repeats": repeats,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}",
+        "versions": {name: version(name) for name in PACKAGES},
+    }
+    say("generation")
+    figures["generation"] = {name: _generation(name, repeats) for name in ("naive", "fem")}
+    say("operator")
+    built = mechanics.build_seconds(repeats)
+    figures["operator"] = {name: {"build_seconds": value} for name, value in built.items()}
+    say("peers of the finite-element skin: about a minute and a half")
+    fem = figures["generation"]["fem"]
+    frames = round(GESTURES * fem["frames_per_second"] / fem["gestures_per_second"])
+    fem["ratio_to_pynite"] = mechanics.pynite_seconds_per_frame(repeats) * fem["frames_per_second"]
+    fem["ratio_to_direct_solve"] = (
+        mechanics.direct_seconds_per_frame(frames, repeats) * fem["frames_per_second"]
+    )
+    say("start")
+    command = [sys.executable, str(HERE / "train.py"), "--help"]
+    help_seconds = seconds(lambda: subprocess.run(command, capture_output=True, check=True), repeats)
+    figures["startup"] = {"help_seconds": help_seconds}
+    figures["training"] = {}
+    for row in arguments.rows:
+        say(f"training of {row}")
+        figures["training"][row] = training.measure(row, repeats)
+    text = json.dumps(figures, indent=2)
+    write(text + "\n", ROOT / "results" / "bench.json")
+    print(text)
+
+
+def _generation(simulator: str, repeats: int) -> dict[str, float]:
+    """Measure in a process of its own, so that its peak memory is its own."""
+    command = [sys.executable, str(HERE / "benchmarks" / "generation.py"), simulator, str(repeats)]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def _processor() -> str:
+    """Return the processor's name where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""Gestures per second and peak memory, from the seed to imperfect readings; run in a process of its own.
+
+python experiments/benchmarks/generation.py fem 3
+"""
+
+import json
+import resource
+import sys
+import time
+from pathlib import Path
+from statistics import median
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+
+from benchmarks.setting import configuration
+from skin.build import build_device
+from skin.device.simulated import Simulated
+
+__all__ = ["measure"]
+
+GESTURES = 4038
+
+
+def measure(simulator: str, repeats: int) -> dict[str, float]:
+    """Return gestures per second (median), distinct frames per second and peak memory, bytes.
+
+    The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
+    readings, imperfections.
+    """
+    device = build_device(configuration(f"simulator={simulator}", f"data.gestures={GESTURES}"))
+    assert isinstance(device, Simulated)
+    taken = []
+    for seed in range(repeats + 1):
+        began = time.perf_counter()
+        device.replace(data_seed=seed).touches("train")
+        taken.append(time.perf_counter() - began)
+    speed = GESTURES / median(taken[1:])
+    movie = device.sampler.sample(1024, np.random.default_rng(0))
+    return {
+        "gestures_per_second": speed,
+        "frames_per_second": speed * len(movie.frames) / len(movie),
+        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]))))

@@ -1,0 +1,40 @@
+"""Seconds per epoch of each row, beside the same network as one would write it first."""
+
+import torch
+from plain import PLAIN, train_epoch
+
+from benchmarks.setting import configuration, seconds
+from skin.build import build_data, build_device, build_learner
+from skin.console import quiet
+from skin.datamodule import TouchData
+from skin.learner.network import Network
+
+__all__ = ["ROWS", "measure"]
+
+ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
+
+
+def measure(row: str, repeats: int) -> dict[str, float]:
+    """Return the median seconds per epoch on 4038 finite-element gestures, and the plain twin's times that.
+
+    Both train on the same touches with batches of 64; samples of the twin are made beforehand.
+    """
+    quiet()
+    config = configuration("simulator=fem", f"experiment={row}", f"trainer.max_epochs={repeats + 1}")
+    data, learner = build_data(config, build_device(config)), build_learner(config)
+    assert isinstance(learner, Network)
+    learner.fit(data)
+    ours = learner.seconds_per_epoch
+    return {"seconds_per_epoch": ours, "ratio_to_plain": plain_seconds(row, data, repeats) / ours}
+
+
+def plain_seconds(row: str, data: TouchData, repeats: int) -> float:
+    """Return the seconds per epoch of a row's plain twin, from a few batches: its slowest takes minutes."""
+    touches = data.touches("train")
+    assert touches.labels is not None
+    twin = PLAIN[row]()
+    samples, labels = twin.samples(touches, data.device.size), touches.labels
+    optimizer = torch.optim.Adam(twin.parameters(), 1e-3)
+    some = 8 * data.batch_size
+    taken = seconds(lambda: train_epoch(twin, optimizer, samples, labels[:some]), repeats)
+    return taken * len(labels) / some

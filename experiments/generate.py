@@ -2,24 +2,24 @@
 
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import command
+from skin.config import command, fingerprint, plain
+from skin.errors import InputError
 
 
 @command("generate")
 def main(config: DictConfig) -> None:
     """Draw a budget of n gestures and write all that is known about them."""
-    from dataclasses import replace
-    from pathlib import Path
-
-    from skin.build import build_device
-    from skin.config import fingerprint, plain
-    from skin.errors import InputError
-    from skin.storage import check_suffix, write
-    from skin.summary import line
-
     if config.out is None:
         raise InputError("where to? add out=touches.parquet or out=touches.csv")
-    check_suffix(Path(config.out))
+    if not config.out.endswith((".parquet", ".csv")):
+        raise InputError(f"a recording is a .parquet or .csv file, got {config.out}: add out=touches.parquet")
+
+    from dataclasses import replace
+
+    from skin.build import build_device
+    from skin.storage import write
+    from skin.summary import line
+
     recording = build_device(config).recording()
     # Where the touches go does not change them.
     source = OmegaConf.masked_copy(config, [key for key in config if key != "out"])

@@ -26,7 +26,7 @@ from skin.errors import InputError
 from skin.labels import Task
 from skin.recording import Recording, Touches
 
-__all__ = ["check_suffix", "read", "write"]
+__all__ = ["read", "write"]
 
 FORMAT = 1
 UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m", "size": "m", "rate": "Hz"}
@@ -43,7 +43,7 @@ def write(recording: Recording, path: str | Path) -> Path:
         InputError: another ending, or a folder that cannot be written.
     """
     path = Path(path)
-    check_suffix(path)
+    _check_suffix(path)
     table, about = _table(recording), _describe(recording)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,7 @@ def read(path: str | Path) -> Recording:
         InputError: no such file, not a recording, damaged, or rows that are not whole touches.
     """
     path = Path(path).expanduser()
-    check_suffix(path)
+    _check_suffix(path)
     if not path.is_file():
         raise InputError(f"no recording {path}: experiments/generate.py n=1000 out={path} makes one")
     try:
@@ -79,12 +79,7 @@ def read(path: str | Path) -> Recording:
         raise InputError(f"{path} is damaged or no recording of this project: {error}") from error
 
 
-def check_suffix(path: Path) -> None:
-    """Refuse what :func:`write` cannot write.
-
-    Raises:
-        InputError: the name ends neither in .parquet nor in .csv.
-    """
+def _check_suffix(path: Path) -> None:
     if path.suffix not in (".parquet", ".csv"):
         raise InputError(f"a recording is a .parquet or .csv file, got {path.name}: as in out=x.parquet")
 

@@ -1,0 +1,52 @@
+"""The contract of every device."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from skin.build import build_device
+from skin.device.base import AbstractDevice
+from skin.storage import write
+
+CONF = Path(__file__).parents[2] / "conf"
+SMALL = ["data.gestures=50", "device.test_gestures=20", "simulator=naive"]
+
+
+def build(*overrides: str) -> AbstractDevice:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return build_device(compose("train", overrides=list(overrides)))
+
+
+@pytest.fixture(scope="module", params=sorted(path.stem for path in (CONF / "device").glob("*.yaml")))
+def device(request, tmp_path_factory) -> AbstractDevice:
+    if request.param == "simulated":
+        return build(*SMALL)
+    if request.param == "recording":
+        path = tmp_path_factory.mktemp("recording") / "x.parquet"
+        write(build(*SMALL).recording(), path)
+        return build("device=recording", f"device.path={path}")
+    pytest.skip(f"{request.param} has hardware of its own to be tested with")
+
+
+def test_splits_have_one_form(device):
+    for split in ("train", "validation", "holdout", "test"):
+        touches = device.touches(split)
+        assert touches.readings.shape == (len(touches), 30, 25)
+        assert touches.readings.dtype == touches.labels.dtype == torch.float32
+        assert torch.isfinite(touches.readings).all()
+        assert touches.labels.shape == (len(touches), len(device.task))
+        assert touches.positions.shape == (25, 3)
+        assert touches.rate == 10.0
+    assert device.size == (0.16, 0.16)
+
+
+def test_the_budget_is_split_80_10_10_by_gesture(device):
+    parts = [device.touches(split).readings for split in ("train", "validation", "holdout")]
+    assert [len(part) for part in parts] == [40, 5, 5]
+    assert len(torch.cat(parts).flatten(1).unique(dim=0)) == 50
+
+
+def test_fixed_touches_stay_the_same(device):
+    assert torch.equal(device.touches("train").readings, device.touches("train", epoch=3).readings)

@@ -1,0 +1,169 @@
+"""A simulated device: seeds, splits, and what each setting changes."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.sheet import Sheet
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.labels import movie_labels
+from skin.layout.grid import Grid
+from skin.layout.scattered import Scattered
+from skin.simulator.fem import PlatesAndBeams
+from skin.simulator.naive import Naive
+from skin.streams import Stream, generator
+from skin.touch import balanced
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
+
+
+def device(**changes) -> Simulated:
+    settings = {"simulator": Naive, "gestures": 60, "test_gestures": 32, "layout": Scattered(seed=0)}
+    return Simulated(body=BODY, **(settings | changes))
+
+
+@pytest.fixture(scope="module")
+def plain() -> Simulated:
+    return device()
+
+
+def test_everything_comes_from_the_seeds(plain):
+    for split in ("train", "validation", "holdout", "test"):
+        one, other = plain.touches(split), device().touches(split)
+        assert torch.equal(one.readings, other.readings)
+        assert torch.equal(one.labels, other.labels)
+
+
+def test_the_number_of_threads_does_not_matter(plain, monkeypatch):
+    monkeypatch.setattr("skin.device.simulated._BATCH", 16)
+    threads = torch.get_num_threads()
+    try:
+        readings = []
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            readings.append(device().touches("train").readings)
+            assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*readings)
+
+
+def test_training_seeds_change_the_budget_and_never_the_test(plain):
+    other = device(data_seed=1)
+    assert torch.equal(plain.touches("test").readings, other.touches("test").readings)
+    assert not torch.equal(plain.touches("train").readings, other.touches("train").readings)
+
+
+def test_no_training_draws_a_test_gesture(plain):
+    test = {peak.item() for peak in plain.recording("test").parameters["peak"]}
+    for seed in range(5):
+        budget = device(data_seed=seed).recording().parameters["peak"]
+        assert not test & {peak.item() for peak in budget}
+
+
+def test_another_device_feels_the_same_gestures(plain):
+    other = plain.replace(seed=3)
+    mine, theirs = plain.recording("test"), other.recording("test")
+    assert torch.equal(mine.touches.labels, theirs.touches.labels)
+    assert torch.equal(mine.force, theirs.force)
+    apart = theirs.touches.readings - mine.touches.readings
+    idle = (mine.force == 0)[..., None].expand_as(apart)
+    assert apart[idle].std() == pytest.approx(np.sqrt(2) * np.hypot(0.1, 0.05), rel=0.3)
+
+
+def test_budget_labels_are_balanced(plain):
+    codes = plain.recording().touches.labels.numpy() @ [1, 2, 4, 8]
+    assert np.ptp(np.bincount(codes.astype(int), minlength=16)) <= 1
+
+
+def test_fresh_gestures_differ_by_epoch_in_train_alone():
+    fresh = device(fresh=True)
+    first, second = fresh.touches("train", 0), fresh.touches("train", 1)
+    assert len(first) == len(second) == 48
+    assert not torch.equal(first.readings, second.readings)
+    assert torch.equal(first.readings, device(fresh=True).touches("train", 0).readings)
+    for split in ("validation", "holdout", "test"):
+        assert torch.equal(fresh.touches(split, 0).readings, device().touches(split, 5).readings)
+
+
+def test_a_recording_holds_the_touches_of_its_split(plain):
+    recording, touches = plain.recording("holdout"), plain.touches("holdout")
+    assert torch.equal(recording.touches.readings, touches.readings)
+    assert recording.force.shape == (len(touches), 30)
+    assert recording.displacement is None
+    assert device(simulator=PlatesAndBeams).recording("holdout").displacement.shape == (6, 30, 25, 2)
+
+
+@pytest.mark.parametrize("simulator", [Naive, PlatesAndBeams])
+def test_a_perfect_device_reads_what_the_simulator_answers_frame_by_frame(simulator):
+    """Dense movies through the simulator give the readings that distinct frames and profiles gave."""
+    perfect = device(simulator=simulator, **PERFECT)
+    wanted = balanced(32, generator(Stream.TEST, 0))
+    movie = perfect.sampler.sample(32, generator(Stream.TEST, 1), wanted)
+    dense = simulator(BODY, perfect.sensors)(movie.pressure()).readings
+    torch.testing.assert_close(perfect.touches("test").readings, dense, rtol=1e-4, atol=1e-5)
+    weights = torch.from_numpy(BODY.footprints(perfect.sensors)).float()
+    assert torch.equal(perfect.touches("test").labels, movie_labels(movie.pressure(), weights, BODY.cell))
+
+
+def test_position_error_moves_the_sensors_and_not_what_is_reported(plain):
+    moved = device(position_error=0.005, **PERFECT)
+    assert torch.equal(moved.touches("test").positions, plain.touches("test").positions)
+    assert not torch.equal(moved.touches("test").readings, device(**PERFECT).touches("test").readings)
+    true = device(position_error=0.05)._true_sensors().positions
+    assert (true >= 0).all()
+    assert (true[:, :2] <= BODY.size).all()
+
+
+def test_randomise_gives_every_gesture_a_device():
+    touches = device(randomise=True, noise=0.0).touches("test")
+    idle = touches.readings.abs().amin(1)
+    assert (idle.std(0) > 0.02).all()
+
+
+def test_dead_sensors_are_invalid():
+    valid = device(dead=3).touches("test").valid
+    assert (~valid).sum(-1).eq(3).all()
+
+
+def test_layouts_are_replaced(plain):
+    other = plain.replace(layout=Grid(4, 4))
+    assert other.touches("test").readings.shape == (32, 30, 16)
+
+
+def test_unpadded_touches_begin_at_once():
+    assert (device(padded=False).recording("test").force[:, 0] > 0).all()
+
+
+def test_the_summary_counts(plain):
+    recording = plain.recording("test")
+    summary, known = recording.metadata["summary"], recording.parameters
+    assert summary["gestures"] == 32
+    assert summary["acceptance"] == pytest.approx(32 / known["draws"].sum().item())
+    assert summary["force"]["largest"] == pytest.approx(recording.force.max().item())
+    assert summary["strain_over_30_percent"] == pytest.approx((known["peak"] > 51e3).float().mean().item())
+    true = device(**(PERFECT | {"gain_spread": 0.05})).touches("test").readings
+    assert summary["clipped"] == pytest.approx((true.amax((1, 2)) > 10).float().mean().item())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gestures": 9}, r"gestures must be at least 10, got 9"),
+        ({"test_gestures": 0}, r"test_gestures must be at least 1"),
+        ({"position_error": -0.1}, r"position_error"),
+        ({"rate": 0}, r"device.rate"),
+        ({"dead": 25}, r"device.dead"),
+        ({"seed": -1}, r"from 0 up"),
+        ({"touch": {"shapes": ["potato"]}}, r"no shape potato"),
+    ],
+)
+def test_bad_settings_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        device(**changes)

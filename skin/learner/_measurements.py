@@ -115,10 +115,7 @@ def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
     mean = (weight * centre).sum(dim=1, keepdim=True)
     return {
         "singular value 1": strength[:, 0],
-        **{
-            f"singular value {i + 1} of the first": strength[:, i] / strength[:, 0].clamp(min=1e-6)
-            for i in (1, 2, 3)
-        },
+        **{f"singular value {i + 1} of the first": ratio[:, i] for i in (1, 2, 3)},
         "spread of the sensors in time": (weight * (centre - mean).square()).sum(dim=1).sqrt(),
         "share of the strongest sensor": peak.amax(dim=1) / frame.amax(dim=1).clamp(min=1e-6),
     }

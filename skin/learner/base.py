@@ -21,7 +21,7 @@ class AbstractLearner(ABC):
 
     Attributes:
         parameters: number of trained parameters, known after ``fit`` or ``load``.
-        seconds_per_epoch: mean duration of one training epoch, s, known after ``fit``.
+        seconds_per_epoch: median duration of one training epoch, s, known after ``fit``.
     """
 
     parameters: int

@@ -52,7 +52,7 @@ class Features(AbstractLearner):
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Grow the trees on the training split, as many as the validation split likes."""
-        table = {}
+        table: dict[str, np.ndarray] = {}
         for split in ("train", "validation"):
             touches = data.touches(split)
             if touches.labels is None:

@@ -1,8 +1,10 @@
 """Learning by gradient descent."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Network"]
 
-CHUNK = 256  # touches at a time when predicting: bounds memory to about 1 GB for the largest row
+CHUNK = 128  # touches at a time when predicting: bounds memory to a few hundred MB for the largest row
 
 
 class Network(AbstractLearner):
@@ -67,7 +69,7 @@ class Network(AbstractLearner):
         clock = Clock()
         with torch.random.fork_rng(), TemporaryDirectory() as folder:
             torch.manual_seed(self._seed)
-            classifier = self._build(data)
+            classifier = self.build(data)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
             settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
             trainer = Trainer(
@@ -77,10 +79,13 @@ class Network(AbstractLearner):
                 enable_model_summary=False,
                 default_root_dir=folder,
             )
-            trainer.fit(classifier, datamodule=data)
+            with warnings.catch_warnings():
+                # Lightning 2.6 asks torch 2.13 for a class of old
+                warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
+                trainer.fit(classifier, datamodule=data)
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
             classifier.load_state_dict(weights["state_dict"])
-        self.seconds_per_epoch = sum(clock.seconds) / len(clock.seconds)
+        self.seconds_per_epoch = median(clock.seconds)
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model takes."""
@@ -108,10 +113,14 @@ class Network(AbstractLearner):
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Take the weights that ``save`` wrote; ``data`` gives the shapes as in ``fit``."""
-        self._build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
+        self.build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
 
-    def _build(self, data: "TouchData") -> "TouchClassifier":
-        """Make the network for the frames that ``data`` gives."""
+    def build(self, data: "TouchData") -> "TouchClassifier":
+        """Make the untrained network for the frames that ``data`` gives, from torch's random state.
+
+        Raises:
+            InputError: the choices do not fit each other or the data.
+        """
         from skin.classifier import TouchClassifier
 
         frames, _ = data.frames(data.touches("train")[:1])

@@ -32,6 +32,8 @@ LOOK_AT = {
 }
 """How the names of the measurements begin that a rule for a label may use."""
 
+_Split = tuple[dict[str, Tensor], np.ndarray]
+
 
 @dataclass(frozen=True)
 class Rule:
@@ -80,7 +82,9 @@ class Rules(AbstractLearner):
         known, other = measurements(train.to("cpu")), measurements(validation.to("cpu"))
         self._set(
             {
-                name: _tune(name, known, train.labels[:, i].numpy(), other, validation.labels[:, i].numpy())
+                name: _tune(
+                    name, (known, train.labels[:, i].numpy()), (other, validation.labels[:, i].numpy())
+                )
                 for i, name in enumerate(data.task.names)
             }
         )
@@ -109,22 +113,17 @@ class Rules(AbstractLearner):
         self.parameters = 2 * len(rules)
 
 
-def _tune(
-    label: str,
-    values: dict[str, Tensor],
-    truth: np.ndarray,
-    other: dict[str, Tensor],
-    other_truth: np.ndarray,
-) -> Rule:
-    """Return the best rule for one label: threshold from ``values``, slope from ``other``."""
+def _tune(label: str, known: _Split, other: _Split) -> Rule:
+    """Return the best rule for one label: measurement and threshold from ``known``, slope from ``other``."""
+    values, truth = known
     allowed = [name for name in values if name.startswith(LOOK_AT[label])]
-    best = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
-    _, threshold, name = best
-    distance = other[name].double().numpy() - threshold
+    _, threshold, name = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
+    values, truth = other
+    distance = values[name].double().numpy() - threshold
     unit = np.std(distance) or 1.0
 
     def loss(log_slope: float) -> float:
-        return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * other_truth)).mean())
+        return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * truth)).mean())
 
     log_slope = minimize_scalar(loss, bounds=(-3, 6), method="bounded").x
     return Rule(name, threshold, float(np.exp(log_slope) / unit))

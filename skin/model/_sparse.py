@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Cells", "Plan", "convolve_and_pool", "dense", "plan"]
+__all__ = ["Cells", "Plan", "convolve_and_pool", "dense", "linear", "plan"]
 
 TAPS = 9  # of a 3x3 kernel
 WINDOW = 4  # a pooled cell sees 4x4 inputs
@@ -92,6 +92,23 @@ def dense(cells: Cells, images: int) -> Tensor:
     full = background.repeat(cells.active.numel(), 1, 1)
     full[cells.active.flatten()] = background + cells.difference
     return full.unflatten(0, cells.active.shape).permute(3, 2, 0, 1)
+
+
+def linear(cells: Cells, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return ``weight @ flat + bias``, (N, O), of the flattened images that ``cells`` stand for.
+
+    Args:
+        cells: of images (N, C, H, W).
+        weight: (O, C H W).
+        bias: (O,).
+    """
+    width, channels = len(weight), len(cells.background)
+    places = weight.view(width * channels, -1)
+    # a product with 0 and 1: the gradient of an index would be scattered one number at a time
+    chosen = torch.eye(places.shape[1], dtype=weight.dtype, device=weight.device)[:, cells.active.flatten()]
+    active = (places @ chosen).view(width, channels, -1).transpose(1, 2).reshape(width, -1)
+    background = places.sum(dim=1).view(width, channels) @ cells.background
+    return (active @ cells.difference.flatten(0, 1) + background + bias[:, None]).T
 
 
 class _FirstMaximum(torch.autograd.Function):

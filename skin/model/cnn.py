@@ -66,10 +66,10 @@ class Cnn(AbstractModel):
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of images (N, C, H, W)."""
-        active = (x != 0).flatten(0, 1).any(dim=0)
-        blocks = self._sparse if SPARSE * int(active.sum()) < active.numel() else self._dense
-        flat = blocks(x, active).flatten(1)
-        return flat if self.embedding is None else F.relu(self.embedding(flat))
+        active = x.abs().amax(dim=(0, 1)) != 0
+        if SPARSE * int(active.sum()) < active.numel():
+            return self._sparse(x, active)
+        return self._dense(x)
 
     def _weights(self) -> list[tuple[Tensor, Tensor]]:
         """Return weight and bias of each block, equal input channels as one with summed weights."""
@@ -77,14 +77,15 @@ class Cnn(AbstractModel):
         weight, bias = pairs[0]
         return [(weight.unflatten(1, (self.repeat, -1)).sum(dim=1), bias), *pairs[1:]]
 
-    def _dense(self, x: Tensor, active: Tensor) -> Tensor:
+    def _dense(self, x: Tensor) -> Tensor:
         x = x.contiguous(memory_format=torch.channels_last)
         for weight, bias in self._weights():
             weight = weight.contiguous(memory_format=torch.channels_last)
             # pooling first gives the same result on a quarter of the values
             x = F.relu(F.max_pool2d(F.conv2d(x, weight, bias), 2))
             x = F.dropout2d(x, self.dropout, self.training)
-        return x
+        x = x.flatten(1)
+        return x if self.embedding is None else F.relu(self.embedding(x))
 
     def _sparse(self, x: Tensor, active: Tensor) -> Tensor:
         difference = x.flatten(2)[:, :, active.flatten()].permute(2, 1, 0)
@@ -96,4 +97,6 @@ class Cnn(AbstractModel):
             # spatial dropout takes whole channels of an image: background and difference alike
             keep = F.dropout(x.new_ones(len(bias), len(x)), self.dropout, self.training)
             cells = _sparse.Cells(difference * keep, background * keep, cells.active)
-        return _sparse.dense(cells, len(x))
+        if self.embedding is None:
+            return _sparse.dense(cells, len(x)).flatten(1)
+        return F.relu(_sparse.linear(cells, self.embedding.weight, self.embedding.bias))

@@ -22,7 +22,8 @@ def check_pixels(pixels: int) -> int:
 
 def pixel_of(positions: np.ndarray, size: tuple[float, float], pixels: int) -> np.ndarray:
     """Return the flat index (S,) of the pixel in which each position (S, 3), m, falls; rows run along y."""
-    scaled = np.floor(positions[:, :2] / np.asarray(size) * pixels).astype(int)
+    # a sensor on the line between two pixels must not fall here or there by rounding to float32
+    scaled = np.floor(positions[:, :2] / np.asarray(size) * pixels + 1e-4).astype(int)
     column, row = np.clip(scaled, 0, pixels - 1).T
     return row * pixels + column
 

@@ -1,0 +1,64 @@
+"""Interpolation against planes and brute force."""
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from skin.errors import InputError
+from skin.representation._pixels import centres
+from skin.representation.interp import weights
+
+SIZE = (0.16, 0.12)
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).uniform((0.01, 0.01), (0.15, 0.11), (20, 2))
+
+
+@pytest.mark.parametrize(("method", "tolerance"), [("linear", 1e-12), ("cubic", 1e-8)])
+def test_a_plane_is_reproduced_inside_the_hull(points, method, tolerance):
+    def plane(xy):
+        return 3 + 40 * xy[:, 0] - 70 * xy[:, 1]
+
+    targets = centres(SIZE, 64)
+    inside = Delaunay(points).find_simplex(targets) >= 0
+    values = weights(points, targets, method) @ plane(points)
+    assert inside.sum() > 1000
+    assert np.abs(values - plane(targets))[inside].max() < tolerance
+
+
+def test_nearest_is_that_of_brute_force(points):
+    targets = centres(SIZE, 48)
+    nearest = np.linalg.norm(targets[:, None] - points, axis=2).argmin(axis=1)
+    assert (weights(points, targets, "nearest").argmax(axis=1) == nearest).all()
+    assert (weights(points, targets, "nearest").sum(axis=1) == 1).all()
+
+
+@pytest.mark.parametrize("method", ["linear", "cubic"])
+def test_outside_the_hull_the_nearest_value_holds(points, method):
+    targets = centres(SIZE, 48)
+    outside = Delaunay(points).find_simplex(targets) < 0
+    assert outside.sum() > 100
+    np.testing.assert_array_equal(
+        weights(points, targets, method)[outside], weights(points, targets, "nearest")[outside]
+    )
+
+
+def test_cubic_is_linear_in_the_readings(points):
+    from scipy.interpolate import CloughTocher2DInterpolator
+
+    values = np.random.default_rng(1).normal(size=len(points))
+    targets = centres(SIZE, 48)
+    inside = Delaunay(points).find_simplex(targets) >= 0
+    direct = CloughTocher2DInterpolator(points, values, tol=1e-12, maxiter=5000)(targets)
+    np.testing.assert_allclose(
+        (weights(points, targets, "cubic") @ values)[inside], direct[inside], atol=1e-7
+    )
+
+
+def test_an_unknown_method_and_sensors_in_a_line_are_refused(points):
+    with pytest.raises(InputError, match=r"representation\.method=nearest, linear or cubic"):
+        weights(points, points, "quintic")
+    with pytest.raises(InputError, match=r"got 3: set representation\.method=nearest"):
+        weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")

@@ -1,0 +1,92 @@
+"""What every fusion must do, whatever model it holds."""
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from skin.errors import InputError
+from skin.model.cnn import Cnn
+from skin.model.gcn import Gcn
+from skin.model.mlp import Mlp
+from skin.representation.base import Frames
+from skin.representation.graph import Graph
+
+OPTIONS = sorted((Path(__file__).parents[2] / "conf" / "fusion").glob("*.yaml"))
+HEADS = ["mean", "max", "conv", "lstm", "gru", "attention+gru"]
+MODELS = {
+    "readings": partial(Mlp, widths=[8]),
+    "graph": partial(Gcn, widths=[4, 8]),
+    "image": partial(Cnn, channels=[4], embedding=8, dropout=0.0),
+}
+SHAPES = {"readings": (9,), "graph": (9, 2), "image": (2, 16, 16)}
+WINDOW = 6
+VARIANTS = [
+    (path, extra, kind)
+    for path in OPTIONS
+    for extra in ([{"head": head} for head in HEADS] if path.stem == "late" else [{}])
+    for kind in (["graph"] if path.stem == "linked" else MODELS)
+]
+
+
+def windows(kind, length=WINDOW):
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(5, length, *SHAPES[kind], generator=generator)
+    positions = 0.1 * torch.rand(9, 3, generator=generator)
+    return Frames(x, Graph(positions, (0.16, 0.16)).adjacency if kind == "graph" else None)
+
+
+@pytest.fixture(params=VARIANTS, ids=lambda v: "-".join([v[0].stem, *v[1].values(), v[2]]))
+def given(request):
+    path, extra, kind = request.param
+
+    def make():
+        return instantiate(OmegaConf.load(path), **extra)(MODELS[kind], kind, SHAPES[kind], WINDOW)
+
+    torch.manual_seed(0)
+    return make, kind
+
+
+def test_a_window_becomes_one_embedding(given):
+    make, kind = given
+    fusion = make()
+    assert fusion(windows(kind)).shape == (5, fusion.width)
+
+
+def test_a_gradient_reaches_every_parameter(given):
+    make, kind = given
+    fusion = make()
+    fusion(windows(kind)).square().sum().backward()
+    for name, parameter in fusion.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_windows_do_not_see_each_other(given):
+    make, kind = given
+    fusion, (x, adjacency) = make().eval(), windows(kind)
+    together = fusion(Frames(x, adjacency))
+    assert torch.equal(fusion(Frames(x, adjacency)), together)
+    torch.testing.assert_close(fusion(Frames(x[1:3], adjacency)), together[1:3])
+
+
+def test_weights_reload(given):
+    make, kind = given
+    fusion, other, frames = make().eval(), make().eval(), windows(kind)
+    assert not torch.equal(other(frames), fusion(frames))
+    other.load_state_dict(fusion.state_dict())
+    assert torch.equal(other(frames), fusion(frames))
+
+
+@pytest.mark.parametrize("length", [1, 4, 11])
+def test_windows_of_other_lengths(given, length, request):
+    make, kind = given
+    fusion = make()
+    if "[early" in request.node.name or "-early" in request.node.name:
+        with pytest.raises(InputError, match=rf"windows of 6 frames, got {length}: train with fusion=late"):
+            fusion(windows(kind, length))
+    else:
+        assert fusion(windows(kind, length)).shape == (5, fusion.width)

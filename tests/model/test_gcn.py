@@ -1,0 +1,70 @@
+"""Graph networks against the laws of graphs and against PyTorch Geometric."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.model.gcn import Gcn
+from skin.representation.graph import adjacency, neighbours, normalised
+
+PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
+EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")
+MATRIX = torch.from_numpy(normalised(EDGES)).float()
+
+
+def gcn(**options):
+    torch.manual_seed(0)
+    return Gcn("graph", (8, 2), **({"widths": [16, 5]} | options)).eval()
+
+
+@pytest.mark.parametrize("pooling", ["max", "mean", "attention"])
+def test_the_order_of_the_sensors_does_not_matter(pooling):
+    model = gcn(pooling=pooling)
+    x = torch.randn(4, 8, 2)
+    order = torch.randperm(8)
+    torch.testing.assert_close(model(x[:, order], MATRIX[order][:, order]), model(x, MATRIX))
+
+
+def test_the_edges_matter():
+    x = torch.randn(4, 8, 2)
+    assert not torch.allclose(gcn()(x, MATRIX), gcn()(x, torch.eye(8)), atol=1e-3)
+
+
+@pytest.mark.parametrize("widths", [[16, 5], [5, 16, 3]])
+def test_a_graph_per_frame_gives_the_same_as_one_for_all(widths):
+    x = torch.randn(4, 8, 2)
+    model = gcn(widths=widths)
+    torch.testing.assert_close(model(x, MATRIX.expand(4, 8, 8)), model(x, MATRIX))
+
+
+@pytest.mark.parametrize(("features", "width"), [(3, 7), (7, 3)])
+def test_one_convolution_is_that_of_pytorch_geometric(features, width):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit.script", DeprecationWarning)
+        from torch_geometric.nn import GCNConv
+    model = Gcn("graph", (8, features), widths=[width], activation="relu", pooling="max")
+    theirs = GCNConv(features, width)
+    theirs.lin.weight.data = model.convolutions[0].linear.weight.data
+    theirs.bias.data = model.convolutions[0].bias.data.normal_()
+    x = torch.randn(8, features)
+    weights = torch.from_numpy(EDGES).float()
+    index = weights.nonzero().T
+    wanted = theirs(x, index, weights[index[0], index[1]]).relu().amax(dim=0)
+    torch.testing.assert_close(model(x[None], MATRIX)[0], wanted)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"widths": []}, "model.widths="),
+        ({"pooling": "set3set"}, "model.pooling=max, mean or attention"),
+        ({"norm": "group"}, "model.norm=none, layer or batch"),
+        ({"activation": "tanh"}, "activation=relu, elu or silu"),
+    ],
+)
+def test_bad_options_are_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        gcn(**options)

@@ -123,13 +123,25 @@ def draw_gestures(
     Returns:
         shape, angle (rad), scale (m), low and high (B, 2) (m), duration, onset (frames).
     """
-    big, dynamic, press = labels[:, 0], labels[:, 1], labels[:, 2]
+    dynamic, press = labels[:, 1], labels[:, 2]
+    drawn = _draw_bodies(labels[:, 0], settings, shapes, generator)
+    least, most = np.where(press[:, None], settings.press, settings.tap).T
+    least = np.where(dynamic, np.maximum(least, 2), least)
+    chance = generator.random((len(labels), 2))
+    duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
+    free = settings.window - duration if padded else np.zeros_like(duration)
+    return drawn | {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
+
+
+def _draw_bodies(
+    big: np.ndarray, settings: GestureSettings, shapes: Shapes, generator: np.random.Generator
+) -> Draws:
     least, most = np.where(big[:, None], settings.big_area, settings.small_area).T
     names = ("shape", "angle", "scale", "low", "high")
     drawn: Draws = {}
-    todo = np.arange(len(labels))
+    todo = np.arange(len(big))
     for _ in range(_TRIES):
-        chance = generator.random((len(labels), 3))[todo]
+        chance = generator.random((len(big), 3))[todo]
         shape = (chance[:, 0] * len(shapes.names)).astype(int)
         angle = 2 * np.pi * chance[:, 1]
         scale = shapes.scale(shape, least[todo] + (most - least)[todo] * chance[:, 2])
@@ -138,16 +150,8 @@ def draw_gestures(
             drawn.setdefault(name, value.copy())[todo] = value
         todo = todo[(high - low + settings.spare > shapes.body.size).any(axis=1)]
         if not len(todo):
-            break
-    else:
-        raise _no_room(big[todo[0]], settings, shapes.body)
-
-    least, most = np.where(press[:, None], settings.press, settings.tap).T
-    least = np.where(dynamic, np.maximum(least, 2), least)
-    chance = generator.random((len(labels), 2))
-    duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
-    free = settings.window - duration if padded else np.zeros_like(duration)
-    return drawn | {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
+            return drawn
+    raise _no_room(big[todo[0]], settings, shapes.body)
 
 
 def _no_room(big: bool, settings: GestureSettings, body: Sheet) -> InputError:

@@ -111,14 +111,8 @@ def measure(
     peak = (highest[index] * scale).amax(1)
     touched = highest[index] * scale > contact * peak[:, None]
 
-    # One product reads the frames once for the sensors' pressures, the total and both first moments.
-    y, x = torch.meshgrid(
-        (torch.arange(height) + 0.5) * cell[1], (torch.arange(width) + 0.5) * cell[0], indexing="ij"
-    )
-    moments = torch.stack([torch.ones_like(x), x, y]).flatten(1).to(frames)
-    means = flat @ torch.cat([footprints.to(frames), moments]).T
-    centre = means[:, -2:] / means[:, -3:-2].clamp(min=1e-30)
-    pressure = (means[:, :-3].amax(1)[index] * scale).amax(1)
+    sensors, centre = _means(frames, footprints, cell)
+    pressure = (sensors.amax(1)[index] * scale).amax(1)
 
     # The lowest pressure that counts as contact, where a frame is shown at its strongest.
     level = torch.full((count,), torch.inf).to(frames)
@@ -134,6 +128,18 @@ def measure(
     distance = torch.linalg.vector_norm(places - places[torch.arange(len(places)), first][:, None], dim=-1)
     travel = distance.where(touched, 0).amax(1)
     return Measures(area, travel, _longest_run(touched), pressure)
+
+
+def _means(frames: Tensor, footprints: Tensor, cell: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Return the mean pressure over each footprint (U, S), Pa, and the centre of pressure (U, 2), m."""
+    height, width = frames.shape[1:]
+    y, x = torch.meshgrid(
+        (torch.arange(height) + 0.5) * cell[1], (torch.arange(width) + 0.5) * cell[0], indexing="ij"
+    )
+    moments = torch.stack([torch.ones_like(x), x, y]).flatten(1)
+    # One product reads the frames once for the footprints, the total and both first moments.
+    means = frames.flatten(1) @ torch.cat([footprints.to(frames), moments.to(frames)]).T
+    return means[:, :-3], means[:, -2:] / means[:, -3:-2].clamp(min=1e-30)
 
 
 def _longest_run(touched: Tensor) -> Tensor:

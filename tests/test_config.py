@@ -1,0 +1,150 @@
+"""The configuration mirrors the package, refuses what it does not know, and tells which runs are the same."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.utils import get_class
+from omegaconf import OmegaConf
+from omegaconf.errors import ReadonlyConfigError
+
+from skin.build import build_device, build_learner
+from skin.config import CONF, ROOT, checked, fingerprint, plain
+from skin.errors import InputError
+
+GROUPS = ("body", "layout", "simulator", "device", "representation", "model", "fusion", "learner")
+ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+TRAIN = ROOT / "experiments" / "train.py"
+
+
+def keys(value):
+    """Return every key of nested containers."""
+    if isinstance(value, dict):
+        return set(value) | {key for entry in value.values() for key in keys(entry)}
+    return {key for entry in value for key in keys(entry)} if isinstance(value, list) else set()
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_options_are_the_public_modules_of_the_folder(group):
+    modules = {path.stem for path in (ROOT / "skin" / group).glob("*.py") if not path.stem.startswith("_")}
+    assert {path.stem for path in (CONF / group).glob("*.yaml")} == modules - {"base"}
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_an_option_names_a_class_of_its_own_module(group, option):
+    stored = OmegaConf.load(CONF / group / f"{option}.yaml")
+    assert stored["_convert_"] == "all"
+    assert get_class(stored["_target_"]).__module__ == f"skin.{group}.{option}"
+
+
+@pytest.mark.parametrize("group", ["data", "experiment", "sweep"])
+def test_groups_of_values_build_nothing(group):
+    for path in (CONF / group).glob("*.yaml"):
+        assert "_target_" not in keys(OmegaConf.to_container(OmegaConf.load(path), resolve=False)), path
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_composes(configured, group, option):
+    config = plain(checked(configured(f"{group}={option}")))
+    assert config[group]["_target_"].split(".")[:-1] == ["skin", group, option]
+
+
+@pytest.mark.parametrize("simulator", ["naive", "fem"])
+@pytest.mark.parametrize("row", ROWS)
+def test_every_row_composes_and_is_built(configured, row, simulator):
+    config = checked(configured(f"experiment={row}", f"simulator={simulator}"))
+    build_learner(config)
+    assert (config.row, config.data.name) == (row, simulator)
+    assert config.trainer.max_epochs == config.epochs[simulator]
+
+
+@pytest.mark.parametrize("simulator", ["naive", "fem"])
+def test_the_device_carries_the_groups_that_were_chosen(configured, simulator):
+    config = checked(configured(f"simulator={simulator}", "seed=3", "layout=grid", "layout.rows=3"))
+    device = build_device(config)
+    assert (len(device.sensors), device.data_seed, device.seed) == (15, 3, 0)
+    assert device.padded == (simulator == "fem")
+    assert device.gestures == {"naive": 2350, "fem": 4038}[simulator]
+
+
+def test_a_checked_configuration_cannot_be_changed(configured):
+    with pytest.raises(ReadonlyConfigError):
+        checked(configured()).seed = 1
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [("+typo=1", "typo"), ("+data.typo=1", "typo"), ("data.gestures=many", "many"), ("seed=x", "seed")],
+)
+def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
+    with pytest.raises(InputError, match=reason):
+        checked(configured(override))
+
+
+def test_keys_that_only_steer_leave_the_fingerprint(configured):
+    same = configured("tracking.uri=sqlite:///elsewhere.db", "tracking.resume=false", "tracking.threads=1")
+    assert fingerprint(same) == fingerprint(configured())
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["seed=1", "simulator=naive", "device.noise=0.06", "trainer.max_epochs=3", "evaluation.gestures=801"],
+)
+def test_anything_else_changes_the_fingerprint(configured, override):
+    assert fingerprint(configured(override)) != fingerprint(configured())
+
+
+def test_a_changed_layout_file_changes_the_fingerprint(configured, tmp_path):
+    path = tmp_path / "sensors.csv"
+    path.write_text("x_m,y_m\n0.05,0.05\n")
+    before = fingerprint(configured(f"layout.path={path}"))
+    assert fingerprint(configured(f"layout.path={path}")) == before
+    path.write_text("x_m,y_m\n0.05,0.06\n")
+    assert fingerprint(configured(f"layout.path={path}")) != before
+
+
+def train(*arguments: str, code: str = "") -> subprocess.CompletedProcess:
+    """Run train.py, or Python code in its place."""
+    command = [sys.executable, "-c", code] if code else [sys.executable, str(TRAIN)]
+    return subprocess.run(
+        [*command, *arguments], capture_output=True, text=True, timeout=120, check=False, cwd=ROOT
+    )
+
+
+@pytest.mark.parametrize(
+    ("argument", "named"),
+    [("sede=1", "sede"), ("+typo=1", "typo"), ("model=cn", "cn"), ("seed=x", "x"), ("model.typo=1", "typo")],
+)
+def test_a_mistake_ends_with_code_2_and_says_which(argument, named, tmp_path):
+    done = train(argument, f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a")
+    assert done.returncode == 2, done.stderr
+    assert named in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+LIGHT = f"""
+import runpy, sys
+sys.path.insert(0, {str(TRAIN.parent)!r})
+try:
+    runpy.run_path({str(TRAIN)!r}, run_name="__main__")
+except SystemExit as stop:
+    heavy = {{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)
+    print("exit", stop.code, *sorted(heavy))
+    raise
+print("exit 0", *sorted({{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize(("argument", "code"), [("--help", 0), ("+typo=1", 2), ("model=cn", 2)])
+def test_help_and_mistakes_wait_for_no_heavy_import(argument, code):
+    assert train(argument, code=LIGHT).stdout.splitlines()[-1] == f"exit {code}"
+
+
+def test_generate_and_evaluate_know_the_same_groups():
+    for name in ("generate", "evaluate"):
+        stored = OmegaConf.load(CONF / f"{name}.yaml")
+        assert stored.defaults[0] == "train"
+        assert Path(ROOT / "experiments" / f"{name}.py").is_file()

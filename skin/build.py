@@ -1,12 +1,16 @@
 """From a configuration to the objects it names, group by group."""
 
+from typing import TYPE_CHECKING
+
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from skin.config import plain
-from skin.datamodule import TouchData
 from skin.device.base import AbstractDevice
 from skin.learner.base import AbstractLearner
+
+if TYPE_CHECKING:
+    from skin.datamodule import TouchData
 
 __all__ = ["build_data", "build_device", "build_learner"]
 
@@ -19,8 +23,11 @@ def build_device(config: DictConfig) -> AbstractDevice:
     return instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
 
 
-def build_data(config: DictConfig, device: AbstractDevice) -> TouchData:
+def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
     """Return the batches of a device's touches, shown as the representation does."""
+    # Here, because it brings Lightning, which takes seconds and which commands without training do not need.
+    from skin.datamodule import TouchData
+
     return TouchData(
         device, instantiate(plain(config)["representation"]), config.data.batch_size, config.seed
     )

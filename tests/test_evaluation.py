@@ -1,0 +1,110 @@
+"""Every column is what it says: the same device, unseen devices, unseen layouts, the budget's last tenth."""
+
+import pytest
+import torch
+
+from skin.build import build_device
+from skin.config import Evaluation
+from skin.errors import InputError
+from skin.evaluation import evaluate
+from skin.labels import TOUCH
+
+SETTINGS = Evaluation(devices=2, layouts=2, gestures=32, false_alarm_rate=0.02)
+
+
+class Knows:
+    """Answers with the labels, and remembers what it was asked about; refuses other layouts if told so."""
+
+    def __init__(self, home=None):
+        self.home, self.asked = home, []
+
+    def probabilities(self, touches):
+        if self.home is not None and not torch.equal(touches.positions, self.home):
+            raise InputError("another layout")
+        self.asked.append(touches)
+        return touches.labels * 0.8 + 0.1
+
+
+@pytest.fixture(scope="module")
+def device(configured):
+    return build_device(configured("simulator=naive", "data.gestures=80", "device.test_gestures=48"))
+
+
+@pytest.fixture(scope="module")
+def tried(device):
+    """Return what an evaluation found, and its touches: same, holdout, two devices, two layouts."""
+    learner = Knows()
+    return evaluate(learner, device, SETTINGS), learner.asked
+
+
+def test_who_knows_the_labels_is_right_everywhere(tried):
+    found = tried[0].metrics
+    for column in ("same", "holdout", "device_shift", "unseen_layout"):
+        assert found[f"{column}/overall/accuracy"] == 1
+        assert found[f"{column}/dangerous/recall"] == 1
+
+
+def test_each_set_has_its_size(tried):
+    assert [len(touches) for touches in tried[1]] == [48, 8, 32, 32, 32, 32]
+
+
+def test_unseen_devices_feel_the_same_gestures_each_in_its_own_way(tried):
+    same, _, first, second, *_ = tried[1]
+    assert torch.equal(first.positions, same.positions)
+    assert torch.equal(second.positions, same.positions)
+    assert torch.equal(first.labels, second.labels)
+    assert not torch.equal(first.readings, second.readings)
+
+
+def test_no_unseen_device_is_the_one_of_the_training(device, tried):
+    mine = device.replace(test_gestures=SETTINGS.gestures).touches("test")
+    for other in tried[1][2:4]:
+        assert torch.equal(other.labels, mine.labels)
+        assert not torch.equal(other.readings, mine.readings)
+
+
+def test_an_unseen_layout_has_as_many_sensors_elsewhere(tried):
+    same, _, _, _, first, second = tried[1]
+    assert first.positions.shape == second.positions.shape == same.positions.shape
+    moved = (first.positions - same.positions).norm(dim=1)
+    assert moved.max() > 1e-3
+    assert not torch.equal(first.positions, second.positions)
+
+
+def test_the_holdout_was_not_trained_on(device, tried):
+    train = {tuple(row.tolist()) for row in device.touches("train").readings.flatten(1)[:, :60]}
+    held = {tuple(row.tolist()) for row in tried[1][1].readings.flatten(1)[:, :60]}
+    assert not train & held
+
+
+def test_who_cannot_take_another_layout_says_so(device):
+    report = evaluate(Knows(device.touches("test").positions), device, SETTINGS)
+    assert report.cannot == {"unseen_layout": "another layout"}
+    assert not [name for name in report.metrics if name.startswith("unseen_layout")]
+    assert report.metrics["device_shift/overall/accuracy"] == 1
+
+
+def test_predictions_tell_of_every_test_gesture(device, tried):
+    table = tried[0].predictions
+    test = device.recording("test")
+    assert table.num_rows == 48
+    for i, name in enumerate(TOUCH.names):
+        assert table[name].to_pylist() == test.touches.labels[:, i].int().tolist()
+        assert table[f"p_{name}"].to_pylist() == pytest.approx(
+            (test.touches.labels[:, i] * 0.8 + 0.1).tolist()
+        )
+    assert table["speed"].to_pylist() == test.parameters["speed"].tolist()
+
+
+def test_confusion_counts_the_test_gestures(tried):
+    assert tried[0].confusion.sum(dim=(1, 2)).tolist() == [48] * 4
+    assert tried[0].confusion[:, 0, 1].tolist() == [0] * 4
+
+
+def test_a_layout_of_a_prime_number_of_sensors_makes_no_grid(configured, tmp_path):
+    path = tmp_path / "seven.csv"
+    path.write_text("x_m,y_m\n" + "".join(f"{0.02 * i + 0.01},0.05\n" for i in range(7)))
+    device = build_device(
+        configured("simulator=naive", f"layout.path={path}", "data.gestures=80", "device.test_gestures=48")
+    )
+    assert "unseen_layout" in evaluate(Knows(), device, SETTINGS).cannot

@@ -1,0 +1,66 @@
+"""Metrics against scikit-learn and against counting."""
+
+import pytest
+import torch
+from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
+
+from skin.labels import TOUCH, Task
+from skin.metrics import confusion, metrics, recall_at
+
+
+@pytest.fixture
+def scored():
+    """Return probabilities (400, 4) that lean towards labels (400, 4); one label is rare."""
+    generator = torch.Generator().manual_seed(0)
+    labels = (torch.rand(400, 4, generator=generator) < torch.tensor([0.5, 0.1, 0.5, 0.4])).float()
+    noise = torch.randn(400, 4, generator=generator)
+    return (2 * labels - 1 + 1.5 * noise).sigmoid(), labels
+
+
+def test_accuracies_are_those_of_scikit_learn(scored):
+    chances, labels = scored
+    found = metrics(chances, labels, TOUCH, 0.02)
+    for i, name in enumerate(TOUCH.names):
+        said = chances[:, i] > 0.5
+        assert found[f"{name}/accuracy"] == pytest.approx(accuracy_score(labels[:, i], said))
+        assert found[f"{name}/balanced_accuracy"] == pytest.approx(
+            balanced_accuracy_score(labels[:, i], said)
+        )
+
+
+def test_overall_is_the_mean_of_the_labels(scored):
+    found = metrics(*scored, TOUCH, 0.02)
+    each = [found[f"{name}/accuracy"] for name in TOUCH.names]
+    assert found["overall/accuracy"] == pytest.approx(sum(each) / 4)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.02, 0.1, 0.5])
+def test_recall_is_the_best_of_all_thresholds_that_keep_the_rate(scored, rate):
+    chance, label = scored[0][:, 3], scored[1][:, 3]
+    best = 0.0
+    for threshold in chance.tolist():
+        said = chance >= threshold
+        if said[label == 0].float().mean() <= rate + 1e-9:
+            best = max(best, float(said[label == 1].float().mean()))
+    assert recall_at(rate, chance, label.long()) == pytest.approx(best)
+
+
+def test_calibration_error_of_a_constant_is_its_distance_from_the_share():
+    labels = torch.zeros(100, 4)
+    labels[:30] = 1
+    found = metrics(torch.full((100, 4), 0.9), labels, TOUCH, 0.02)
+    assert found["press/ece"] == pytest.approx(0.6, abs=1e-6)
+    assert found["overall/ece"] == pytest.approx(0.6, abs=1e-6)
+
+
+def test_confusion_has_the_true_class_down(scored):
+    chances, labels = scored
+    for i, counts in enumerate(confusion(chances, labels).numpy()):
+        assert (counts == confusion_matrix(labels[:, i], chances[:, i] > 0.5)).all()
+
+
+def test_exclusive_labels_have_one_accuracy():
+    task = Task(("poke", "stroke", "slap"), "exclusive")
+    labels = torch.eye(3)[torch.tensor([0, 1, 2, 2])]
+    chances = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.5, 0.3, 0.2], [0.2, 0.2, 0.6]])
+    assert metrics(chances, labels, task, 0.02) == {"overall/accuracy": 0.75}

@@ -1,5 +1,10 @@
 """What all tests share."""
 
+import os
+
+# Tests are many small problems: a second thread only waits, and for long where the machine is busy.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from collections.abc import Callable
 from pathlib import Path
 

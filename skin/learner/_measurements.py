@@ -144,7 +144,7 @@ def _path(x: Tensor, peak: Tensor, places: Tensor) -> dict[str, Tensor]:
             f"mean step of the centre {power}": step.sum(dim=1) / frames,
             f"longest step of the centre {power}": step.amax(dim=1),
             f"reach of the centre {power}": far,
-            f"extent of the centre {power}": (high - low).norm(dim=1),
+            f"extent of the centre {power}": torch.where(active.any(dim=1), (high - low).norm(dim=1), 0),
             f"way of the centre {power}": ends,
             f"speed of the centre {power}": ends / frames,
         }

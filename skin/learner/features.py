@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from sklearn.ensemble import HistGradientBoostingClassifier
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from skin.errors import InputError
@@ -94,7 +95,8 @@ class Features(AbstractLearner):
                 raise InputError(f"all training touches have the same label {name}: give more touches")
             model = HistGradientBoostingClassifier(**self._settings)
             validation = {"X_val": table["validation"], "y_val": table["validation_labels"][:, label]}
-            self._models.append(model.fit(table["train"], truth, **validation))
+            with threadpool_limits(torch.get_num_threads(), "openmp"):  # a job's share of the cores
+                self._models.append(model.fit(table["train"], truth, **validation))
         self._fitted, self._task = table, task
         self.seconds_per_epoch = time.perf_counter() - began
         # one number per leaf; scikit-learn counts leaves nowhere in public

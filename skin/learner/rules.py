@@ -99,6 +99,8 @@ class Rules(AbstractLearner):
 
     def save(self, folder: Path) -> Path:
         """Write the rules to ``rules.json`` in ``folder`` and return its path."""
+        if not self._rules:
+            raise RuntimeError("fit or load the learner first")
         path = Path(folder) / "rules.json"
         path.write_text(json.dumps({name: asdict(rule) for name, rule in self._rules.items()}, indent=2))
         return path

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
+from skin.errors import InputError
 from skin.model._activation import activation as activation_of
 from skin.model.base import AbstractModel, Kind
 
@@ -30,12 +31,20 @@ class Mlp(AbstractModel):
     ) -> None:
         super().__init__(kind)
         sizes = [*shape, *widths]
-        pairs = pairwise(sizes)
         self.layers = nn.Sequential(
-            *(layer for pair in pairs for layer in (nn.Linear(*pair), activation_of(activation)))
+            *(layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), activation_of(activation)))
         )
-        self.width = sizes[-1]
+        self.inputs, self.width = sizes[0], sizes[-1]
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
-        """Return the embeddings (N, E) of readings (N, F)."""
+        """Return the embeddings (N, E) of readings (N, F).
+
+        Raises:
+            InputError: another number of readings than the weights are made for.
+        """
+        if x.shape[-1] != self.inputs:
+            raise InputError(
+                f"model=mlp is made for {self.inputs} readings per frame, got {x.shape[-1]}: "
+                "train with representation=graph or image, which take other layouts"
+            )
         return self.layers(x)

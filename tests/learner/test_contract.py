@@ -1,0 +1,96 @@
+"""What every learner must do."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from skin.datamodule import TouchData
+
+OPTIONS = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "learner").glob("*.yaml"))
+CHEAP = {
+    "network": [
+        "representation=readings",
+        "model=mlp",
+        "fusion=early",
+        "optimizer.lr=0.01",
+        "trainer.max_epochs=15",
+    ],
+    "features": ["learner.rounds=20"],
+}
+
+
+@pytest.fixture(params=OPTIONS)
+def made(request, configured, made_up_device, tmp_path, monkeypatch):
+    """Return a function that makes the learner, its data, and the device; in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    config = configured(f"learner={request.param}", *CHEAP.get(request.param, []))
+    data = TouchData(made_up_device, instantiate(config.representation), 32)
+    return lambda: instantiate(config.learner, seed=0), data, made_up_device
+
+
+@pytest.fixture
+def fitted(made):
+    make, data, device = made
+    learner = make()
+    learner.fit(data)
+    return learner, data, device
+
+
+def test_it_learns(fitted):
+    learner, _, device = fitted
+    touches = device.touches("test")
+    result = learner.probabilities(touches)
+    assert result.shape == (40, 4)
+    assert ((result >= 0) & (result <= 1)).all()
+    right = ((result > 0.5) == (touches.labels > 0.5)).float().mean(dim=0)
+    assert right.mean() > 0.8
+    assert right.min() > 0.6
+
+
+def test_what_it_tells_of_itself(fitted):
+    learner = fitted[0]
+    assert learner.parameters > 0
+    assert 0 < learner.seconds_per_epoch < 60
+
+
+def test_touches_do_not_see_each_other(fitted):
+    learner, _, device = fitted
+    touches = device.touches("test")
+    torch.testing.assert_close(learner.probabilities(touches[3:5]), learner.probabilities(touches)[3:5])
+
+
+def test_it_reloads(made, fitted, tmp_path):
+    learner, data, device = fitted
+    path = learner.save(tmp_path)
+    other = made[0]()
+    other.load(data, path)
+    touches = device.touches("test")
+    assert torch.equal(other.probabilities(touches), learner.probabilities(touches))
+    assert other.parameters == learner.parameters
+
+
+def test_the_same_seed_gives_the_same_learner(made, fitted):
+    learner, data, device = fitted
+    again = made[0]()
+    again.fit(data)
+    touches = device.touches("test")
+    torch.testing.assert_close(again.probabilities(touches), learner.probabilities(touches))
+
+
+def test_it_leaves_no_file_and_no_trace_in_the_random_state(made):
+    make, data, _ = made
+    state = torch.get_rng_state()
+    make().fit(data)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert os.listdir() == []
+
+
+def test_nothing_is_told_before_it_has_learnt(made, tmp_path):
+    make, _, device = made
+    with pytest.raises(RuntimeError, match="fit or load"):
+        make().probabilities(device.touches("test"))
+    with pytest.raises(RuntimeError, match="fit or load"):
+        make().save(tmp_path)

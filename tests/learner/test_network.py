@@ -1,0 +1,89 @@
+"""Training by gradient descent."""
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from pytorch_lightning.loggers import CSVLogger
+
+from skin.build import build_data, build_device, build_learner
+from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.layout.scattered import Scattered
+
+
+def curve(folder):
+    """Return the logged losses of validation and training by epoch."""
+    lines = (folder / "lightning_logs" / "version_0" / "metrics.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
+    return ([float(row[name]) for row in rows if row[name]] for name in ("val_loss", "train_loss"))
+
+
+@pytest.mark.slow
+def test_it_learns_touches_of_the_naive_skin_and_takes_another_layout(configured, tmp_path):
+    config = configured(
+        "experiment=temporal_graph", "simulator=naive", "data.gestures=600", "device.test_gestures=300",
+        "trainer.max_epochs=12",
+    )  # fmt: skip
+    device = build_device(config)
+    data, learner = build_data(config, device), build_learner(config)
+    learner.fit(data, CSVLogger(tmp_path))
+    validation, train = curve(tmp_path)
+    assert len(train) == 12
+    assert train[-1] < 0.75 * train[0]
+    assert min(validation) < 0.9 * validation[0]
+    for tried in (device, device.replace(layout=Scattered(6, 4, seed=3))):
+        touches = tried.touches("test")
+        right = (learner.probabilities(touches) > 0.5) == (touches.labels > 0.5)
+        assert right.float().mean() > 0.65
+
+
+def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_device, tmp_path):
+    config = configured(
+        "representation=readings", "model=mlp", "fusion=early", "optimizer.lr=0.1", "trainer.max_epochs=12"
+    )
+    data = TouchData(made_up_device, instantiate(config.representation), 32)
+    learner = build_learner(config)
+    learner.fit(data, CSVLogger(tmp_path))
+    validation, _ = curve(tmp_path)
+    assert min(validation) < validation[-1]  # a rate so high that the last epoch is not the best
+    touches = made_up_device.touches("validation")
+    chance = learner.probabilities(touches)
+    loss = torch.nn.functional.binary_cross_entropy(chance, touches.labels)
+    assert loss.item() == pytest.approx(min(validation), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["model=gcn"], "model=gcn needs representation=graph, got image: add representation=graph"),
+        (
+            ["representation=graph"],
+            "model=cnn needs representation=image, got graph: add representation=image",
+        ),
+        (["fusion=linked"], "fusion=linked needs representation=graph, got image: add representation=graph"),
+        (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
+        (["learner.activation=sine"], "activation=relu, elu or silu"),
+        (["fusion.head=sum"], "set fusion.head to one of"),
+    ],
+)
+def test_choices_that_do_not_fit_are_refused(overrides, words, configured, made_up_device):
+    config = configured(*overrides)
+    data = TouchData(made_up_device, instantiate(config.representation))
+    with pytest.raises(InputError, match=words):
+        build_learner(config).fit(data)
+
+
+def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_device):
+    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1")
+    data = TouchData(made_up_device, instantiate(config.representation))
+    learner = build_learner(config)
+    learner.fit(data)
+    touches = made_up_device.touches("test")
+    fewer = type(touches)(
+        touches.readings[..., :9], touches.valid[..., :9], touches.positions[:9], touches.labels, 10.0
+    )
+    with pytest.raises(
+        InputError, match="12 readings per frame, got 9: train with representation=graph or image"
+    ):
+        learner.probabilities(fewer)

@@ -1,0 +1,114 @@
+"""The training step, and the sizes of the report's five systems."""
+
+import math
+
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from skin.classifier import TouchClassifier, probabilities
+from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.fusion.base import AbstractFusion
+from skin.labels import TOUCH, Task
+from skin.layout.scattered import Scattered
+from skin.recording import Touches
+from skin.representation.base import Frames
+
+GESTURES = Task(("grab", "hit", "stroke"), "exclusive")
+
+
+class Flat(AbstractFusion):
+    """Passes readings (B, T, F) on as they are, flattened."""
+
+    width = 6
+
+    def forward(self, frames: Frames) -> torch.Tensor:
+        return frames.x.flatten(1)
+
+
+def classifier(task=TOUCH, hidden=(5,)):
+    torch.manual_seed(0)
+    return TouchClassifier(Flat(), task, hidden, "relu", torch.optim.Adam)
+
+
+@pytest.mark.parametrize(
+    ("row", "parameters"),
+    [
+        ("linked_graph", 196),
+        ("temporal_graph", 145_774),
+        ("temporal_image", 209_844),
+        ("sequence_graph", 105_621),
+        ("sequence_image", 1_634_341),
+    ],
+)
+def test_the_rows_have_the_parameters_of_the_report(row, parameters, configured):
+    config = configured(f"experiment={row}")
+    body = instantiate(config.body)
+    positions = torch.from_numpy(Scattered(5, 5, seed=1).sensors(body).positions).float()
+    readings = torch.zeros(1, 30, 25)
+
+    class Device:
+        task, size = TOUCH, body.size
+
+        def touches(self, split, epoch=0):
+            return Touches(readings, readings == 0, positions, torch.zeros(1, 4), 10.0)
+
+    learner = instantiate(config.learner)
+    network = learner.build(TouchData(Device(), instantiate(config.representation)))
+    assert sum(parameter.numel() for parameter in network.parameters()) == parameters
+    assert learner.parameters == parameters
+    if row == "sequence_image":
+        assert network.fusion.model.convolutions[0].weight.shape == (8, 3, 3, 3)
+
+
+def test_the_loss_of_binary_labels_by_hand():
+    loss = classifier().loss(torch.tensor([[0.0, 2.0, -1.0, 0.0]]), torch.tensor([[1.0, 1.0, 0.0, 0.0]]))
+    wanted = (2 * math.log(2) + math.log1p(math.exp(-2)) + math.log1p(math.exp(-1))) / 4
+    assert loss.item() == pytest.approx(wanted)
+
+
+def test_the_loss_of_exclusive_labels_by_hand():
+    logits = torch.tensor([[1.0, 0.0, 0.0]])
+    loss = classifier(GESTURES).loss(logits, torch.tensor([[0.0, 1.0, 0.0]]))
+    assert loss.item() == pytest.approx(math.log(math.e + 2))
+    assert probabilities(logits, GESTURES).sum().item() == pytest.approx(1)
+
+
+def test_binary_probabilities_are_independent():
+    torch.testing.assert_close(
+        probabilities(torch.tensor([[0.0, math.log(3)]]), TOUCH), torch.tensor([[0.5, 0.75]])
+    )
+
+
+def test_the_head_is_as_wide_as_the_task():
+    assert classifier(GESTURES)(Frames(torch.randn(2, 3, 2), None)).shape == (2, 3)
+
+
+def test_what_a_step_logs(monkeypatch):
+    network = classifier(hidden=())
+    logged = {}
+    monkeypatch.setattr(network, "log_dict", lambda values, **_: logged.update(values))
+    with torch.no_grad():
+        network.head[0].weight.zero_()
+        network.head[0].bias.copy_(torch.tensor([1.0, 1.0, -1.0, -1.0]))
+    labels = torch.tensor([[1.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0]])
+    network.validation_step((Frames(torch.randn(2, 3, 2), None), labels), 0)
+    assert {name: value.item() for name, value in logged.items() if name != "val_loss"} == {
+        "val_accuracy": 0.75,
+        "val_accuracy_big": 1.0,
+        "val_accuracy_dynamic": 0.5,
+        "val_accuracy_press": 1.0,
+        "val_accuracy_dangerous": 0.5,
+    }
+
+
+def test_exclusive_accuracy_counts_the_largest(monkeypatch):
+    network = classifier(GESTURES)
+    values = network._accuracy(torch.tensor([[3.0, 1, 2], [0, 1, 2]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]))
+    assert values["accuracy"].item() == 0.5
+
+
+def test_a_direction_is_refused():
+    with pytest.raises(InputError, match="direction"):
+        classifier(Task(("x", "y"), "direction"))

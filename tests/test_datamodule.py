@@ -1,0 +1,120 @@
+"""Batches: every gesture once an epoch, in an order that only the seed decides."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.recording import Touches
+from skin.representation.readings import Readings
+
+
+class Numbered:
+    """Yields touches whose readings are their number, plus 1000 times the epoch."""
+
+    size, fresh = (0.16, 0.16), False
+
+    def __init__(self, task, count=23):
+        self.task, self.count, self.asked = task, count, []
+
+    def touches(self, split, epoch=0):
+        self.asked.append((split, epoch))
+        readings = (torch.arange(self.count) + 1000.0 * epoch)[:, None, None].repeat(1, 6, 2)
+        return Touches(readings, readings >= 0, torch.ones(2, 3), torch.zeros(self.count, 4), 10.0)
+
+
+class Trainer:
+    current_epoch = 0
+
+
+@pytest.fixture
+def make(made_up_device):
+    def make(seed=0, fresh=False, **options):
+        device = Numbered(made_up_device.task)
+        device.fresh = fresh
+        data = TouchData(device, partial(Readings, scale=1.0), seed=seed, **({"batch_size": 5} | options))
+        data.trainer = Trainer()
+        return data
+
+    return make
+
+
+def numbers(batches):
+    return [batch.readings[:, 0, 0].long().tolist() for batch in batches]
+
+
+def flat(batches):
+    return [number for batch in numbers(batches) for number in batch]
+
+
+def test_an_epoch_shows_every_gesture_once(make):
+    batches = make().train_dataloader()
+    assert sorted(flat(batches)) == list(range(23))
+    assert [len(batch) for batch in numbers(batches)] == [5, 5, 5, 5, 3]
+    assert len(batches) == 5
+
+
+def test_the_order_follows_from_seed_and_epoch(make):
+    data = make()
+    first = flat(data.train_dataloader())
+    assert flat(data.train_dataloader()) == first
+    assert first != list(range(23))
+    assert flat(make(seed=1).train_dataloader()) != first
+    data.trainer.current_epoch = 1
+    second = flat(data.train_dataloader())
+    assert second != first
+    assert flat(make(seed=1).train_dataloader()) != second
+
+
+def test_the_order_leaves_the_random_state_alone(make):
+    state = torch.get_rng_state()
+    flat(make().train_dataloader())
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_validation_keeps_its_order(make):
+    assert flat(make().val_dataloader()) == list(range(23))
+
+
+def test_a_device_with_fixed_gestures_is_asked_once_a_split(make):
+    data = make()
+    for epoch in range(3):
+        data.trainer.current_epoch = epoch
+        flat(data.train_dataloader())
+        flat(data.val_dataloader())
+    assert data.device.asked == [("train", 0), ("validation", 0)]
+
+
+def test_fresh_gestures_are_drawn_every_epoch(make):
+    data = make(fresh=True)
+    for epoch in range(3):
+        data.trainer.current_epoch = epoch
+        assert sorted(flat(data.train_dataloader())) == [1000 * epoch + i for i in range(23)]
+
+
+def test_a_batch_arrives_as_frames_and_labels(make):
+    data = make()
+    touches = next(iter(data.train_dataloader()))
+    frames, labels = data.on_after_batch_transfer(touches, 0)
+    assert torch.equal(frames.x, touches.readings)
+    assert labels.shape == (5, 4)
+    assert data.window == 6
+
+
+def test_a_layout_is_represented_once(make):
+    data = make()
+    positions = torch.rand(2, 3)
+    assert data.representation_for(positions) is data.representation_for(positions.clone())
+    assert data.representation_for(positions) is not data.representation_for(positions + 0.01)
+
+
+def test_what_cannot_be_batched_is_refused(make):
+    with pytest.raises(InputError, match=r"data\.batch_size=64"):
+        make(batch_size=0)
+    with pytest.raises(InputError, match="positions per frame"):
+        make().representation_for(torch.rand(4, 6, 2, 3))
+    readings = torch.zeros(1, 6, 2)
+    with pytest.raises(InputError, match="without labels"):
+        make().frames(Touches(readings, readings == 0, torch.rand(2, 3), None, 10.0))

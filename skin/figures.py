@@ -7,7 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-__all__ = ["confusions", "force_and_reading", "images", "misclassified", "save", "traces"]
+__all__ = ["confusions", "force_and_reading", "images", "misclassified", "overview", "save", "traces"]
+
+Layout = tuple[tuple[float, float], float]
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -41,6 +43,40 @@ def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float
         axis.set_title(name)
         axis.set_xticks([])
         axis.set_yticks([])
+    return figure
+
+
+def overview(
+    pressure: Tensor, picture: Tensor, readings: Tensor, frame: int, points: np.ndarray, layout: Layout
+) -> Figure:
+    """Draw one frame of a gesture, what the sensors make of it, and all readings over time.
+
+    Args:
+        pressure: (H, W), Pa, of the frame.
+        picture: (H', W'), interpolated readings of the frame, any unit.
+        readings: (T, S), N.
+        frame: which of the T.
+        points: (S, 2), m, where the sensors are.
+        layout: size of the sheet (x, y), m, and frames per second, Hz.
+    """
+    size, rate = layout
+    figure = Figure(figsize=(11, 3.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
+    extent = (0, size[0] * 1e3, size[1] * 1e3, 0)
+    shown = left.imshow(pressure / 1e3, cmap="magma", extent=extent)
+    figure.colorbar(shown, ax=left, label="pressure, kPa", shrink=0.85)
+    left.set_title("what touches")
+    middle.imshow(picture, cmap="magma", extent=extent)
+    middle.set_title(f"what {len(points)} sensors feel")
+    for axis in (left, middle):
+        axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, "o", color="#56B4E9", markersize=3)
+        axis.set_xlabel("x, mm")
+    time = np.arange(len(readings)) / rate
+    right.plot(time, readings, linewidth=1)
+    right.axvline(frame / rate, color="black", linewidth=0.8, linestyle=":")
+    right.set_title("their readings")
+    right.set_xlabel("time, s")
+    right.set_ylabel("N")
     return figure
 
 

@@ -67,6 +67,7 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
     presses = presses[drawn["force"][presses].argsort()]
     four = presses[torch.linspace(0, len(presses) - 1, 4).round().long()]
     return [
+        _overview(device, folder),
         figures.save(image, folder / "figure04_interpolations.png"),
         figures.save(figures.traces(readings, device.rate), folder / "figure10_naive_fem.png"),
         figures.save(
@@ -74,6 +75,28 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
             folder / "figure11_force_reading.png",
         ),
     ]
+
+
+def _overview(device: Simulated, folder: Path) -> Path:
+    """Draw a big, sliding, dangerous press of the hand, or of whatever presses where there is no hand."""
+    labels = np.ones((64, 4), dtype=bool)
+    movie = device.sampler.sample(len(labels), np.random.default_rng(0), labels)
+    names = device.sampler.shapes.names
+    shape = names.index("hand") if "hand" in names else 0
+    chosen = int((movie.parameters["shape"] == shape).int().argmax())
+    readings = movie.respond(device.model).readings[chosen]
+    frame = int(readings.sum(1).argmax())
+    positions = torch.from_numpy(device.sensors.positions).float()
+    picture = _pictures(readings[None], positions, device.size)["cubic"]
+    drawn = figures.overview(
+        movie.pressure()[chosen, frame],
+        picture,
+        readings,
+        frame,
+        device.sensors.positions,
+        (device.size, device.rate),
+    )
+    return figures.save(drawn, folder / "overview.png")
 
 
 def _pictures(readings: Tensor, positions: Tensor, size: tuple[float, float]) -> dict[str, Tensor]:

@@ -1,0 +1,111 @@
+"""A sweep counts its jobs as Hydra does, tells the time left, goes on after a failure, and resumes."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+
+import pytest
+
+from skin.config import ROOT
+from skin.sweep import Progress, jobs
+
+SMALL = [
+    "experiment=rules",
+    "simulator=naive",
+    "data.gestures=64",
+    "device.test_gestures=32",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.gestures=32",
+]
+
+
+def test_jobs_come_in_hydras_order():
+    found = jobs(["seed=0,1", "row=x"], {"simulator": "naive,fem"})
+    assert [(job["simulator"], job["seed"], job["row"]) for job in found] == [
+        ("naive", "0", "x"),
+        ("naive", "1", "x"),
+        ("fem", "0", "x"),
+        ("fem", "1", "x"),
+    ]
+
+
+def test_the_command_line_wins_over_the_sweeps_file():
+    found = jobs(["simulator=fem"], {"simulator": "naive,fem", "experiment": "rules,features"})
+    assert [job["experiment"] for job in found] == ["rules", "features"]
+    assert {job["simulator"] for job in found} == {"fem"}
+
+
+def test_nothing_known_gives_no_estimate():
+    assert Progress([None, None]).left() is None
+
+
+def test_what_took_before_is_the_first_estimate():
+    assert Progress([10.0, None, 20.0]).left() == 45  # the unknown one like the mean of the others
+
+
+def test_the_rest_follows_the_speed_of_this_machine():
+    progress = Progress([10.0, 10.0, 20.0])
+    progress.finish(0, 30.0, skipped=False)
+    assert progress.left() == 90
+
+
+def test_a_skipped_job_says_nothing_about_speed():
+    progress = Progress([10.0, 10.0, 20.0])
+    progress.finish(0, 0.01, skipped=True)
+    assert progress.left() == 30
+
+
+def command(folder, *overrides):
+    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+    train = [sys.executable, str(ROOT / "experiments" / "train.py"), "-m"]
+    return [*train, *SMALL, *own, *overrides, f"hydra.sweep.dir={folder}/out"]
+
+
+def run(folder, *overrides):
+    return subprocess.run(
+        command(folder, *overrides), capture_output=True, text=True, timeout=300, check=False, cwd=folder
+    )
+
+
+def runs(folder):
+    """Return (name, status, parent) of every run, oldest first."""
+    with sqlite3.connect(folder / "m.db") as database:
+        found = database.execute(
+            "select name, status, (select value from tags where tags.run_uuid = runs.run_uuid "
+            "and key = 'mlflow.parentRunId') from runs order by start_time"
+        ).fetchall()
+    database.close()
+    return found
+
+
+@pytest.mark.slow
+def test_a_sweep_that_was_killed_goes_on_where_it_was(tmp_path):
+    with subprocess.Popen(
+        command(tmp_path, "seed=0,1,2"), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as first:
+        for line in first.stdout:
+            if line.startswith("[2/3]"):
+                os.kill(first.pid, signal.SIGKILL)
+                break
+        first.wait(60)
+    assert [one[:2] for one in runs(tmp_path)][:2] == [("sweep", "RUNNING"), ("rules naive 0", "FINISHED")]
+    again = run(tmp_path, "seed=0,1,2")
+    assert again.returncode == 0, again.stderr
+    assert [line for line in again.stdout.splitlines() if "finished before" in line] == [
+        line for line in again.stdout.splitlines() if line.startswith("[1/3]") and "…" not in line
+    ]
+    finished = [name for name, status, parent in runs(tmp_path) if status == "FINISHED" and parent]
+    assert finished == ["rules naive 0", "rules naive 1", "rules naive 2"]
+
+
+@pytest.mark.slow
+def test_a_bad_job_fails_and_the_others_run(tmp_path):
+    done = run(tmp_path, "device.offset=-1,0.1")
+    assert done.returncode == 1
+    assert "offset" in done.stderr
+    states = [status for name, status, parent in runs(tmp_path) if parent]
+    assert states == ["FINISHED"]
+    assert [status for name, status, parent in runs(tmp_path) if not parent] == ["FAILED"]

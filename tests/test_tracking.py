@@ -1,0 +1,120 @@
+"""A run's status can be trusted, whatever ends it."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from skin.config import ROOT, Tracking
+from skin.tracking import Store, commit
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+BEGIN = f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+from skin.config import Tracking
+from skin.tracking import Store
+store = Store.open(Tracking(sys.argv[1], sys.argv[2], "skin", True, None))
+"""
+WAIT = """
+import time
+with store.run("waiting", {"fingerprint": "f"}):
+    print("open", flush=True)
+    time.sleep(120)
+"""
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("store")
+    return Tracking(f"sqlite:///{folder / 'm.db'}", str(folder / "artifacts"), "skin", True, None)
+
+
+@pytest.fixture(scope="module")
+def store(settings):
+    return Store.open(settings)
+
+
+def status(store, run):
+    return store.client.get_run(run.info.run_id).info.status
+
+
+def test_a_run_that_ends_by_itself_is_finished(store):
+    with store.run("good", {"fingerprint": "a"}) as run:
+        assert status(store, run) == "RUNNING"
+        assert not store.find("FINISHED", fingerprint="a")
+    assert status(store, run) == "FINISHED"
+    assert [found.info.run_id for found in store.find("FINISHED", fingerprint="a")] == [run.info.run_id]
+
+
+def test_a_run_that_raises_is_failed_and_says_why(store):
+    with pytest.raises(ValueError, match="broken"), store.run("bad", {"fingerprint": "b"}) as run:
+        raise ValueError("broken")
+    assert status(store, run) == "FAILED"
+    assert store.client.get_run(run.info.run_id).data.tags["error"] == "ValueError: broken"
+    assert not store.find("FINISHED", fingerprint="b")
+
+
+def test_an_interrupted_run_is_killed(store):
+    with pytest.raises(KeyboardInterrupt), store.run("stopped", {"fingerprint": "c"}) as run:
+        raise KeyboardInterrupt
+    assert status(store, run) == "KILLED"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [(signal.SIGTERM, "KILLED"), (signal.SIGINT, "KILLED"), (signal.SIGKILL, "RUNNING")],
+)
+def test_a_signal_leaves_no_finished_run(settings, store, number, expected):
+    command = [sys.executable, "-c", BEGIN + WAIT, settings.uri, settings.artifacts]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout.readline() == "open\n"
+        os.kill(process.pid, number)
+        process.wait(60)
+    assert store.find(fingerprint="f")[0].info.status == expected
+    assert not store.find("FINISHED", fingerprint="f")
+
+
+def test_a_child_knows_its_parent(store):
+    with store.run("parent", {}) as parent, store.run("child", {}, parent.info.run_id) as child:
+        assert child.data.tags["mlflow.parentRunId"] == parent.info.run_id
+        assert child.data.tags["commit"] == commit()
+
+
+def test_opening_twice_gives_the_same_experiment(settings, store):
+    assert Store.open(settings).experiment == store.experiment
+
+
+def test_artifacts_lie_where_they_were_meant_to(settings, store):
+    with store.run("with a file", {}) as run:
+        store.client.log_text(run.info.run_id, "hello", "note.txt")
+    (found,) = (ROOT / settings.artifacts).glob("**/note.txt")
+    assert found.read_text() == "hello"
+
+
+def test_readers_and_writers_work_side_by_side(settings, store):
+    path = settings.uri.removeprefix("sqlite:///")
+    database = sqlite3.connect(path)
+    assert database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    database.close()
+
+
+@pytest.mark.slow
+def test_processes_that_start_at_once_share_one_new_database(tmp_path):
+    command = [sys.executable, "-c", BEGIN + "print(store.experiment)"]
+    command += [f"sqlite:///{tmp_path}/m.db", str(tmp_path / "a")]
+
+    def start(_):
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    with ThreadPoolExecutor(3) as pool:
+        done = list(pool.map(start, range(3)))
+    assert [one.returncode for one in done] == [0, 0, 0], done[-1].stderr
+    assert len({one.stdout for one in done}) == 1

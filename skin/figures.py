@@ -36,9 +36,9 @@ def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float
     for axis, (name, picture) in zip(axes, pictures.items(), strict=True):
         extent = (0, size[0] * 1e3, size[1] * 1e3, 0)
         if name == "fourier":
-            axis.imshow(picture, cmap="magma")
+            axis.imshow(np.asarray(picture), cmap="magma")
         else:
-            axis.imshow(picture, cmap="magma", extent=extent, interpolation="nearest")
+            axis.imshow(np.asarray(picture), cmap="magma", extent=extent, interpolation="nearest")
             axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, ".", color="#56B4E9", markersize=2)
         axis.set_title(name)
         axis.set_xticks([])
@@ -63,10 +63,10 @@ def overview(
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
     extent = (0, size[0] * 1e3, size[1] * 1e3, 0)
-    shown = left.imshow(pressure / 1e3, cmap="magma", extent=extent)
+    shown = left.imshow(np.asarray(pressure) / 1e3, cmap="magma", extent=extent)
     figure.colorbar(shown, ax=left, label="pressure, kPa", shrink=0.85)
     left.set_title("what touches")
-    middle.imshow(picture, cmap="magma", extent=extent)
+    middle.imshow(np.asarray(picture), cmap="magma", extent=extent)
     middle.set_title(f"what {len(points)} sensors feel")
     for axis in (left, middle):
         axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, "o", color="#56B4E9", markersize=3)

@@ -18,6 +18,7 @@ from skin.evaluation import Report, evaluate
 from skin.figures import confusions, save
 from skin.labels import Task
 from skin.recording import Touches
+from skin.show import report as show
 from skin.tracking import Store
 
 __all__ = ["PARENT", "train"]
@@ -37,6 +38,8 @@ def train(config: DictConfig) -> bool:
     store, identity = Store.open(config.tracking), fingerprint(config)
     finished = store.find("FINISHED", fingerprint=identity) if config.tracking.resume else []
     if finished:
+        if PARENT not in os.environ:
+            print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
         return False
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
@@ -58,6 +61,10 @@ def train(config: DictConfig) -> bool:
             store.client.set_tag(run.info.run_id, "learned", learner.save(Path(folder)).name)
             _write(report, device.task, Path(folder))
             store.client.log_artifacts(run.info.run_id, folder)
+        for column, reason in report.cannot.items():
+            store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
+    if PARENT not in os.environ:
+        show(report, f"{name}, run {run.info.run_id}")
     return True
 
 
@@ -86,5 +93,3 @@ def _write(report: Report, task: Task, folder: Path) -> None:
     if report.confusion is not None:
         named = dict(zip(task.names, report.confusion.numpy(), strict=True))
         save(confusions(named, ("no", "yes")), folder / "confusion.png")
-    for column, reason in report.cannot.items():
-        (folder / f"cannot_{column}.txt").write_text(reason + "\n")

@@ -38,6 +38,7 @@ COLUMNS = (
     "unseen_layout",
     "seconds_per_epoch",
     "parameters",
+    "failed",
 )
 
 
@@ -61,6 +62,12 @@ class Cell:
         """Return a metric of every run that has it."""
         found = (run.data.metrics.get(metric) for run in self.runs)
         return [value for value in found if value is not None]
+
+    def shift(self, column: str, label: str) -> str:
+        """Return the mean over seeds on other devices or layouts; ``cannot`` where the row takes none."""
+        if any(f"cannot_{column}" in run.data.tags for run in self.runs):
+            return "cannot"
+        return _number(self.values(_metric(column, label)))
 
 
 def collect(store: Store, jobs: Iterable[tuple[str, str, DictConfig]]) -> list[Cell]:
@@ -88,7 +95,7 @@ def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> li
     """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
 
     ``ours`` is the mean over seeds of the accuracy on the test gestures, or of that recall; ``failed`` where
-    no run finished.
+    no run finished. The column ``failed`` counts the seeds that are missing.
     """
     lines = []
     for cell in cells:
@@ -98,10 +105,11 @@ def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> li
                 "ours": _number(same) if same else "failed",
                 "ours_sd": f"{stdev(same):.4f}" if len(same) > 1 else "",
                 "report": _reported(report.get((cell.row, cell.simulator, label))),
-                "device_shift": _number(cell.values(_metric("device_shift", label))),
-                "unseen_layout": _number(cell.values(_metric("unseen_layout", label))),
+                "device_shift": cell.shift("device_shift", label),
+                "unseen_layout": cell.shift("unseen_layout", label),
                 "seconds_per_epoch": _number(cell.values("seconds_per_epoch"), 2),
                 "parameters": _number(cell.values("parameters"), 0),
+                "failed": str(cell.missing),
             }
             lines.append({"row": cell.row, "simulator": cell.simulator, "label": label, **values})
     return lines
@@ -117,8 +125,9 @@ def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
     for start in range(0, len(lines), len(LABELS)):
         group = {line["label"]: line for line in lines[start : start + len(LABELS)]}
         whole = group["overall"]
+        partly = whole["failed"] != "0" and whole["ours"] != "failed"
         table.append(
-            [whole["row"], whole["simulator"]]
+            [whole["row"] + (f" ({whole['failed']} failed)" if partly else ""), whole["simulator"]]
             + [_beside(group[label]) for label in LABELS]
             + [_percent(whole["device_shift"]), _percent(whole["unseen_layout"])]
             + [whole["seconds_per_epoch"], whole["parameters"]]
@@ -168,7 +177,7 @@ def _beside(line: dict[str, str]) -> str:
 
 
 def _percent(value: str, deviation: str = "") -> str:
-    if not value or value == "failed":
+    if value in ("", "failed", "cannot"):
         return value
     spread = f" ± {100 * float(deviation):.1f}" if deviation else ""
     return f"{100 * float(value):.1f}{spread}"

@@ -19,7 +19,7 @@ def run(same, shifted=None, recall=0.5):
     metrics |= {"same/dangerous/recall": recall, "seconds_per_epoch": 2.0, "parameters": 145774.0}
     if shifted is not None:
         metrics["device_shift/overall/accuracy"] = shifted
-    return SimpleNamespace(data=SimpleNamespace(metrics=metrics))
+    return SimpleNamespace(data=SimpleNamespace(metrics=metrics, tags={}))
 
 
 @pytest.fixture
@@ -50,6 +50,19 @@ def test_the_reports_number_stands_where_it_has_one(lines):
 def test_a_row_without_a_finished_run_shows_as_failed(lines):
     assert {lines["linked_graph", label]["ours"] for label in LABELS} == {"failed"}
     assert "failed" in markdown(grid(list(lines.values())), "x").splitlines()[-1]
+
+
+def test_a_row_that_misses_a_seed_says_so():
+    lines = rows([Cell("rules", "fem", (run(0.8), run(0.9)), 1)], {})
+    assert {line["failed"] for line in lines} == {"1"}
+    assert grid(lines)[1][0] == "rules (1 failed)"
+
+
+def test_a_row_that_takes_no_other_layout_says_so():
+    fixed = run(0.8, 0.7)
+    fixed.data.tags["cannot_unseen_layout"] = "readings are of 25 sensors in this order"
+    (line, *_) = rows([Cell("mlp", "fem", (fixed,), 0)], {})
+    assert (line["device_shift"], line["unseen_layout"]) == ("0.7000", "cannot")
 
 
 def test_the_recall_is_a_label_of_its_own(lines):

@@ -32,6 +32,8 @@ LOOK_AT = {
 }
 """How the names of the measurements begin that a rule for a label may use."""
 
+_LARGEST_LOGIT = 12.0
+
 _Split = tuple[dict[str, Tensor], np.ndarray]
 
 
@@ -127,7 +129,9 @@ def _tune(label: str, known: _Split, other: _Split) -> Rule:
     def loss(log_slope: float) -> float:
         return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * truth)).mean())
 
-    log_slope = minimize_scalar(loss, bounds=(-3, 6), method="bounded").x
+    # No steeper than float32 can tell apart at the furthest touch: ties would blur the ranking.
+    steepest = np.log(_LARGEST_LOGIT * unit / max(float(np.abs(distance).max()), 1e-12))
+    log_slope = minimize_scalar(loss, bounds=(steepest - 9, steepest), method="bounded").x
     return Rule(name, threshold, float(np.exp(log_slope) / unit))
 
 

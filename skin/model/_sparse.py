@@ -79,7 +79,8 @@ def convolve_and_pool(cells: Cells, steps: Plan, weight: Tensor, bias: Tensor) -
     local = (steps.taps.to(weight.dtype) @ kernel).view(count, 4, most, width, channels)
     local = local.transpose(2, 3).reshape(count, 4 * width, most * channels)
     padded = torch.cat([cells.difference, cells.difference.new_zeros(1, channels, images)])
-    inputs = padded[steps.inputs.flatten()].view(count, most * channels, images)
+    # not padded[...]: the gradient of that is summed in an order that changes from run to run
+    inputs = padded.index_select(0, steps.inputs.flatten()).view(count, most * channels, images)
     pooled = _FirstMaximum.apply(torch.bmm(local, inputs).view(count, 4, width, images))
     # the background is the same at all four positions, so that it may be added after the maximum
     background = weight.sum(dim=(2, 3)) @ cells.background + bias[:, None]

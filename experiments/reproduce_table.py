@@ -28,11 +28,9 @@ def main() -> None:
 
 def report(overrides: list[str], folder: Path) -> int:
     """Write and print what finished runs say; return how many are missing."""
-    from rich import box, print
-    from rich.table import Table
-
     from skin.build import build_device
     from skin.gallery import draw_runs, draw_skin
+    from skin.show import results
     from skin.table import as_csv, collect, grid, markdown, report_values, rows, write
     from skin.tracking import Store
 
@@ -46,15 +44,11 @@ def report(overrides: list[str], folder: Path) -> int:
     cells = collect(store, ((config.row, config.data.name, config) for config in configs))
     lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"))
     write(as_csv(lines), folder / "table.csv")
-    head, *body = grid(lines)
     title = "Accuracy on the test gestures in per cent (the report's in brackets)"
-    write(markdown([head, *body], title), folder / "table.md")
+    write(markdown(grid(lines), title), folder / "table.md")
     skin = next(config for config in configs if config.data.name == "fem")
     pictures = [*draw_runs(cells, store, folder), *draw_skin(build_device(skin), folder)]
-    table = Table(*head, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True, title=title)
-    for line in body:
-        table.add_row(*line)
-    print(table)
+    results(lines, title)
     print(f"{folder / 'table.md'}, {folder / 'table.csv'} and {len(pictures)} figures beside them")
     return sum(cell.missing for cell in cells)
 

@@ -1,11 +1,14 @@
-"""An evaluation for a person at the terminal."""
+"""Evaluations for a person at the terminal."""
+
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
 
 from skin.evaluation import Report
+from skin.table import LABELS, beside, percent
 
-__all__ = ["report"]
+__all__ = ["report", "results"]
 
 
 def report(found: Report, title: str, console: Console | None = None) -> None:
@@ -28,3 +31,32 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
     console.print(table)
     for column, reason in found.cannot.items():
         console.print(f"{column}: {reason}", markup=False)
+
+
+def results(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:
+    """Print the results table, narrow enough for 80 columns with one seed; the report's overall in brackets.
+
+    Args:
+        lines: as :func:`skin.table.rows` gives them.
+        title: of the table.
+        console: where to print; None takes standard output.
+    """
+    table = Table(title=title, box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for head in ("row", "data"):
+        table.add_column(head, no_wrap=True)
+    for head in ("overall", "big", "dyn.", "press", "dang.", "recall", "device", "layout"):
+        table.add_column(head, no_wrap=True, justify="right")
+    for start in range(0, len(lines), len(LABELS)):
+        group = {line["label"]: line for line in lines[start : start + len(LABELS)]}
+        whole = group["overall"]
+        table.add_row(
+            whole["row"],
+            whole["simulator"],
+            beside(whole),
+            *(percent(group[label]["ours"]) for label in LABELS[1:]),
+            percent(whole["device_shift"]),
+            percent(whole["unseen_layout"]),
+        )
+    console = console or Console()
+    # A number cut short would be another number: rather let a narrow terminal wrap.
+    console.print(table, width=max(console.width, console.measure(table).maximum), crop=False)

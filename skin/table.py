@@ -128,8 +128,8 @@ def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
         partly = whole["failed"] != "0" and whole["ours"] != "failed"
         table.append(
             [whole["row"] + (f" ({whole['failed']} failed)" if partly else ""), whole["simulator"]]
-            + [_beside(group[label]) for label in LABELS]
-            + [_percent(whole["device_shift"]), _percent(whole["unseen_layout"])]
+            + [beside(group[label]) for label in LABELS]
+            + [percent(whole["device_shift"]), percent(whole["unseen_layout"])]
             + [whole["seconds_per_epoch"], whole["parameters"]]
         )
     return table
@@ -170,13 +170,14 @@ def _reported(value: float | None) -> str:
     return "" if value is None else f"{value:g}"
 
 
-def _beside(line: dict[str, str]) -> str:
+def beside(line: dict[str, str]) -> str:
     """Return our number with its deviation and, in brackets, the report's."""
-    reported = _percent(line["report"])
-    return _percent(line["ours"], line["ours_sd"]) + (f" ({reported})" if reported else "")
+    reported = percent(line["report"])
+    return percent(line["ours"], line["ours_sd"]) + (f" ({reported})" if reported else "")
 
 
-def _percent(value: str, deviation: str = "") -> str:
+def percent(value: str, deviation: str = "") -> str:
+    """Return a share in per cent, with its deviation if there is one; what is no number stays as it is."""
     if value in ("", "failed", "cannot"):
         return value
     spread = f" ± {100 * float(deviation):.1f}" if deviation else ""

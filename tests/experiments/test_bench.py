@@ -1,0 +1,36 @@
+"""The benchmark measures what it says, in a form that others can read."""
+
+import json
+import subprocess
+import sys
+
+from skin.config import ROOT
+
+GENERATION = ROOT / "experiments" / "benchmarks" / "generation.py"
+
+
+def test_generation_reports_rates_and_its_own_memory():
+    # 400 MB in this process must not count in the one that is measured
+    ballast = bytearray(400_000_000)
+    command = [sys.executable, str(GENERATION), "naive", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    figures = json.loads(done.stdout)
+    assert set(figures) == {"gestures_per_second", "frames_per_second", "peak_memory_bytes"}
+    # a gesture shows between one frame (static) and twenty (the longest slide)
+    assert 1 < figures["frames_per_second"] / figures["gestures_per_second"] < 20
+    assert 2e8 < figures["peak_memory_bytes"] < 1.5e9
+    assert len(ballast) == 400_000_000
+
+
+def test_bad_arguments_exit_with_2():
+    command = [sys.executable, str(ROOT / "experiments" / "bench.py"), "--repeats", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 2
+    assert "repeats" in done.stderr
+
+
+def test_the_table_refuses_bad_arguments():
+    command = [sys.executable, str(ROOT / "experiments" / "reproduce_table.py"), "--seeds", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 2
+    assert "1 or more" in done.stderr

@@ -16,6 +16,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from skin.config import CONF, ROOT, Tracking, checked
+from skin.errors import InputError
 
 if TYPE_CHECKING:
     from skin.tracking import Store
@@ -88,7 +89,12 @@ class Sweep(Callback):
         from skin.run import PARENT
         from skin.tracking import Store
 
-        settings = _tracking(config)
+        try:
+            settings = _tracking(config)
+        except InputError as refusal:
+            # What no job could accept is refused once, before any of them; Hydra lets only exits pass here.
+            print(refusal, file=sys.stderr)
+            sys.exit(2)
         _share_cores(config.hydra.launcher)
         self._store = store = Store.open(settings)
         name = config.hydra.runtime.choices.get("sweep") or "sweep"

@@ -109,3 +109,11 @@ def test_a_bad_job_fails_and_the_others_run(tmp_path):
     states = [status for name, status, parent in runs(tmp_path) if parent]
     assert states == ["FINISHED"]
     assert [status for name, status, parent in runs(tmp_path) if not parent] == ["FAILED"]
+
+
+def test_what_no_job_could_accept_is_refused_once():
+    command = [sys.executable, str(ROOT / "experiments" / "train.py"), "-m", "+typo=1", "seed=0,1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 2
+    assert "typo" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -10,6 +10,8 @@ from skin.table import LABELS, beside, percent
 
 __all__ = ["report", "results"]
 
+_WIDEST = 200
+
 
 def report(found: Report, title: str, console: Console | None = None) -> None:
     """Print one line per label and one column per set of touches, accuracies in per cent.
@@ -59,4 +61,5 @@ def results(lines: Sequence[dict[str, str]], title: str, console: Console | None
         )
     console = console or Console()
     # A number cut short would be another number: rather let a narrow terminal wrap.
-    console.print(table, width=max(console.width, console.measure(table).maximum), crop=False)
+    needed = console.measure(table, options=console.options.update(width=_WIDEST)).maximum
+    console.print(table, width=max(console.width, needed), crop=False)

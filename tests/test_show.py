@@ -1,0 +1,19 @@
+"""What a person sees at the terminal is whole."""
+
+import io
+
+from rich.console import Console
+
+from skin.show import results
+from skin.table import COLUMNS, LABELS
+
+
+def test_no_number_is_cut_on_a_narrow_terminal():
+    line = dict.fromkeys(COLUMNS, "0.1234") | {"row": "temporal_graph", "simulator": "naive", "failed": "0"}
+    lines = [line | {"label": label, "ours_sd": "0.0123", "report": "0.85"} for label in LABELS]
+    seen = io.StringIO()
+    results(lines, "title", Console(file=seen, width=40))
+    text = seen.getvalue()
+    assert "…" not in text
+    assert "12.3 ± 1.2 (85.0)" in text
+    assert all(head in text for head in ("overall", "recall", "device", "layout"))

@@ -62,4 +62,5 @@ def results(lines: Sequence[dict[str, str]], title: str, console: Console | None
     console = console or Console()
     # A number cut short would be another number: rather let a narrow terminal wrap.
     needed = console.measure(table, options=console.options.update(width=_WIDEST)).maximum
-    console.print(table, width=max(console.width, needed), crop=False)
+    console.width = max(console.width, needed)
+    console.print(table)

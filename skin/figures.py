@@ -135,7 +135,7 @@ def misclassified(
     axis.set_xlabel("speed, mm per frame (0: static)")
     axis.set_ylabel(f"share with “{label}” wrong")
     axis.set_ylim(bottom=0)
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside right upper", fontsize=8)
     return figure
 
 

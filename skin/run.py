@@ -27,6 +27,17 @@ PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
 
 
+class _OpenLogger(MLFlowLogger):
+    """Logs a training to its run and leaves the run open.
+
+    Lightning's own calls a run FINISHED when the fit ends; one that is killed during its evaluation would
+    then count as finished without having any result.
+    """
+
+    def finalize(self, status: str = "success") -> None:
+        """Do nothing: the run ends with its evaluation."""
+
+
 def train(config: DictConfig) -> bool:
     """Train and evaluate as a configuration says; return False if a finished run holds the results already.
 
@@ -51,7 +62,7 @@ def train(config: DictConfig) -> bool:
     }
     name = f"{config.row} {config.data.name} {config.seed}"
     with store.run(name, tags, os.environ.get(PARENT)) as run:
-        logger = MLFlowLogger(tracking_uri=store.uri, run_id=run.info.run_id)
+        logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         _describe(store, run.info.run_id, config, data.touches("train"))
         learner.fit(data, logger)
         report = evaluate(learner, device, config.evaluation)

@@ -1,0 +1,50 @@
+"""A run counts as finished only with all its results."""
+
+import pytest
+
+import skin.run
+from skin.config import checked
+from skin.tracking import Store
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+SMALL = (
+    "experiment=linked_graph",
+    "simulator=naive",
+    "data.gestures=64",
+    "trainer.max_epochs=1",
+    "device.test_gestures=32",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.gestures=32",
+)
+
+
+@pytest.fixture
+def config(configured, tmp_path):
+    """Return a small training that logs to a folder of its own."""
+    return checked(
+        configured(
+            *SMALL, f"tracking.uri=sqlite:///{tmp_path}/runs.db", f"tracking.artifacts={tmp_path}/artifacts"
+        )
+    )
+
+
+@pytest.mark.slow
+def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
+    seen = []
+    evaluate = skin.run.evaluate
+
+    def looking(*arguments):
+        # What a kill would leave behind between training and evaluation.
+        seen.extend(run.info.status for run in Store.open(config.tracking).find())
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(skin.run, "evaluate", looking)
+    assert skin.run.train(config) is True
+    assert seen == ["RUNNING"]
+    (run,) = Store.open(config.tracking).find("FINISHED")
+    assert run.data.metrics["parameters"] == 196
+    assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
+    assert skin.run.train(config) is False

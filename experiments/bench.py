@@ -15,7 +15,7 @@ from benchmarks.setting import seconds
 from rich.console import Console
 
 from skin.config import ROOT
-from skin.table import write
+from skin.results.table import write
 
 HERE = Path(__file__).parent
 PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "PyNiteFEA")

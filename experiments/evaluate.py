@@ -13,7 +13,7 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.evaluation import evaluate
     from skin.reload import changed, configuration, find, restore
-    from skin.show import report
+    from skin.results.show import report
     from skin.tracking import Store
 
     quiet()

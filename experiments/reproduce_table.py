@@ -29,9 +29,9 @@ def main() -> None:
 def report(overrides: list[str], folder: Path) -> int:
     """Write and print what finished runs say; return how many are missing."""
     from skin.build import build_device
-    from skin.gallery import draw_runs, draw_skin
-    from skin.show import results
-    from skin.table import as_csv, collect, grid, markdown, report_values, rows, write
+    from skin.results.gallery import draw_runs, draw_skin
+    from skin.results.show import results
+    from skin.results.table import as_csv, collect, grid, markdown, report_values, rows, write
     from skin.tracking import Store
 
     parameters = OmegaConf.load(CONF / "sweep" / "table.yaml").hydra.sweeper.params

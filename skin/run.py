@@ -15,10 +15,10 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.console import quiet
 from skin.evaluation import Report, evaluate
-from skin.figures import confusions, save
 from skin.labels import Task
 from skin.recording import Touches
-from skin.show import report as show
+from skin.results.figures import confusions, save
+from skin.results.show import report as show
 from skin.tracking import Store
 
 __all__ = ["PARENT", "train"]

@@ -13,7 +13,6 @@ from skin import __version__
 from skin.body.sheet import Sheet
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
-from skin.gesture import GestureSettings
 from skin.imperfection import Imperfection
 from skin.labels import TOUCH
 from skin.layout.base import AbstractLayout, Sensors
@@ -21,7 +20,8 @@ from skin.recording import Recording, Touches, join
 from skin.simulator.base import AbstractSimulator
 from skin.streams import Stream, generator
 from skin.summary import summarise
-from skin.touch import TouchSampler, balanced
+from skin.touch.gesture import GestureSettings
+from skin.touch.sampler import TouchSampler, balanced
 
 __all__ = ["Simulated"]
 

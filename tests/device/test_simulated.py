@@ -13,7 +13,7 @@ from skin.layout.scattered import Scattered
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
 from skin.streams import Stream, generator
-from skin.touch import balanced
+from skin.touch.sampler import balanced
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

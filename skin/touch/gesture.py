@@ -9,7 +9,7 @@ import numpy as np
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.labels import Thresholds
-from skin.shapes import Shapes
+from skin.touch.shapes import Shapes
 
 __all__ = ["Draws", "GestureSettings", "draw_gestures", "draw_paths", "fold"]
 

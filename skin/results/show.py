@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from skin.evaluation import Report
-from skin.table import LABELS, beside, percent
+from skin.results.table import LABELS, beside, percent
 
 __all__ = ["report", "results"]
 
@@ -39,7 +39,7 @@ def results(lines: Sequence[dict[str, str]], title: str, console: Console | None
     """Print the results table, narrow enough for 80 columns with one seed; the report's overall in brackets.
 
     Args:
-        lines: as :func:`skin.table.rows` gives them.
+        lines: as :func:`skin.results.table.rows` gives them.
         title: of the table.
         console: where to print; None takes standard output.
     """

@@ -9,7 +9,7 @@ from sklearn.model_selection import cross_val_score
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
-from skin.touch import TouchSampler, balanced, join
+from skin.touch.sampler import TouchSampler, balanced, join
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 SHEETS = {

@@ -8,11 +8,11 @@ from omegaconf import OmegaConf
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.gesture import GestureSettings, draw_gestures, draw_paths, fold
 from skin.labels import Thresholds
-from skin.shapes import Shapes
+from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold
+from skin.touch.shapes import Shapes
 
-CONF = Path(__file__).parents[1] / "conf" / "touch.yaml"
+CONF = Path(__file__).parents[2] / "conf" / "touch.yaml"
 BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 
 

@@ -10,14 +10,14 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from skin import figures
 from skin.device.simulated import Simulated
 from skin.metrics import confusion
 from skin.representation.fourier import Fourier
 from skin.representation.image import Image
 from skin.representation.interp import Interpolation
+from skin.results import figures
+from skin.results.table import Cell
 from skin.simulator.naive import Naive
-from skin.table import Cell
 from skin.tracking import Store
 
 __all__ = ["draw_runs", "draw_skin"]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.shapes import Shapes
+from skin.touch.shapes import Shapes
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 NAMES = ("disc", "blurred_disc", "square", "bar", "fist", "hand", "fingertip")

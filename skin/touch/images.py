@@ -13,7 +13,7 @@ from skin.errors import InputError
 
 __all__ = ["check", "load", "pyramid"]
 
-_ROOT = Path(__file__).parents[1]
+_ROOT = Path(__file__).parents[2]
 _FOLDER = _ROOT / "data" / "shapes"
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.figures import confusions, force_and_reading, images, misclassified, save, traces
+from skin.results.figures import confusions, force_and_reading, images, misclassified, save, traces
 
 
 def test_a_confusion_matrix_shows_shares_of_each_true_class():

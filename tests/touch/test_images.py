@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from skin.errors import InputError
-from skin.images import check, load, pyramid
+from skin.touch.images import check, load, pyramid
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = Path(__file__).parents[2] / "data"
 
 
 def save(path: Path, pixels: np.ndarray) -> str:

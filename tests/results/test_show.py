@@ -4,8 +4,8 @@ import io
 
 from rich.console import Console
 
-from skin.show import results
-from skin.table import COLUMNS, LABELS
+from skin.results.show import results
+from skin.results.table import COLUMNS, LABELS
 
 
 def test_no_number_is_cut_on_a_narrow_terminal():

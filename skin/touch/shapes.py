@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from skin.body.sheet import Sheet
-from skin.images import load, pyramid
+from skin.touch.images import load, pyramid
 
 __all__ = ["Shapes"]
 
@@ -34,7 +34,7 @@ class Shapes:
         hulls: (N, K, 2), corners of each shape's convex outline (pixels above ``contact``), in scales.
 
     Raises:
-        InputError: no shape, or a picture that cannot be used (:func:`skin.images.load`).
+        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load`).
     """
 
     def __init__(self, names: Sequence[str], body: Sheet, contact: float = 0.02) -> None:

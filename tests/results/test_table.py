@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from skin.config import CONF, ROOT
-from skin.table import COLUMNS, LABELS, Cell, as_csv, grid, markdown, report_values, rows, write
+from skin.results.table import COLUMNS, LABELS, Cell, as_csv, grid, markdown, report_values, rows, write
 
 REPORT = {("temporal_graph", "fem", "overall"): 0.732, ("temporal_graph", "fem", "big"): 0.646}
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.gesture import Draws, GestureSettings, draw_gestures, draw_paths, fold
 from skin.labels import TOUCH, measure
-from skin.shapes import Shapes
 from skin.simulator.base import AbstractSimulator, Response
+from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, fold
+from skin.touch.shapes import Shapes
 
 __all__ = ["Movie", "TouchSampler", "balanced", "join"]
 

@@ -8,7 +8,7 @@ import pytest
 
 from skin.storage import read
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def generate(folder: Path, *overrides: str) -> subprocess.CompletedProcess:

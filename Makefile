@@ -15,7 +15,7 @@ help:  ## list the targets
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel]"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings]"
 	touch $@
 
 install: $(READY)  ## build .venv; the other targets call it

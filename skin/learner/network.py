@@ -14,6 +14,7 @@ from torch import Tensor
 from skin.fusion.base import AbstractFusion
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.representation.base import Frames
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -91,6 +92,20 @@ class Network(AbstractLearner):
         """Return the probability of each label, (B, L), for touches of any layout that the model takes."""
         from skin.classifier import probabilities
 
+        return self._map(touches, lambda of, frames: probabilities(of(frames), of.task))
+
+    def embeddings(self, touches: Touches) -> Tensor:
+        """Return what the fusion makes of touches, (B, E): the input of the dense layers.
+
+        Takes touches of any layout that the model takes, as :meth:`probabilities` does.
+
+        Raises:
+            RuntimeError: before ``fit`` or ``load``.
+        """
+        return self._map(touches, lambda of, frames: of.fusion(frames))
+
+    def _map(self, touches: Touches, function: "Callable[[TouchClassifier, Frames], Tensor]") -> Tensor:
+        """Return what a function of the classifier and frames gives, (B, ...), a chunk at a time."""
         if self._classifier is None or self._data is None:
             raise RuntimeError("fit or load the learner first")
         classifier = self._classifier.eval()
@@ -99,8 +114,8 @@ class Network(AbstractLearner):
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
                 part = touches[start : start + CHUNK].to(classifier.device)
-                logits = classifier(representation(part.readings, part.valid))
-                parts.append(probabilities(logits, classifier.task).cpu())
+                frames = representation(part.readings, part.valid)
+                parts.append(function(classifier, frames).cpu())
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:

@@ -87,3 +87,18 @@ def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_d
         InputError, match="12 readings per frame, got 9: train with representation=graph or image"
     ):
         learner.probabilities(fewer)
+
+
+def test_probabilities_are_the_dense_layers_on_the_embedding(configured, made_up_device):
+    config = configured("representation=graph", "model=gcn", "fusion.hidden=24", "trainer.max_epochs=1")
+    data = TouchData(made_up_device, instantiate(config.representation))
+    learner = build_learner(config)
+    with pytest.raises(RuntimeError, match="fit or load"):
+        learner.embeddings(made_up_device.touches("test"))
+    classifier = learner.build(data)
+    touches = made_up_device.touches("train")  # more than one chunk
+    found = learner.embeddings(touches)
+    assert found.shape == (160, 24)
+    with torch.inference_mode():
+        expected = classifier.head(found).sigmoid()
+    assert torch.allclose(learner.probabilities(touches), expected, atol=1e-6)

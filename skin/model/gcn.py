@@ -9,12 +9,13 @@ from torch import Tensor, nn
 
 from skin.errors import InputError
 from skin.model._activation import activation as activation_of
+from skin.model._pooling import POOLINGS
 from skin.model.base import AbstractModel, Kind
 
 __all__ = ["Gcn"]
 
-Pooling = Literal["max", "mean", "attention"]
-Norm = Literal["none", "layer", "batch"]
+Pooling = Literal["max", "mean", "attention", "set2set"]
+Norm = Literal["none", "layer", "batch", "instance"]
 
 
 class _Convolution(nn.Module):
@@ -45,19 +46,6 @@ def _mix(adjacency: Tensor, x: Tensor) -> Tensor:
     return torch.einsum("nij,jnf->inf", adjacency, x)
 
 
-class _Attention(nn.Module):
-    """Global attention pooling: the mean of the nodes, weighted by a softmax over a learned gate."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.gate = nn.Linear(width, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (N, E) of nodes x (S, N, E)."""
-        share = self.gate(x).softmax(dim=0)
-        return torch.bmm(share.permute(1, 2, 0), x.transpose(0, 1)).squeeze(1)
-
-
 class Gcn(AbstractModel):
     """Graph convolutions, then one vector per graph (report, sections 3.2.1, 3.2.2 and 3.2.4).
 
@@ -68,9 +56,10 @@ class Gcn(AbstractModel):
         shape: (S, F).
         widths: of the graph convolutions; the last one is the embedding.
         activation: relu, elu or silu, after every convolution.
-        norm: none, layer or batch; over the features, between convolutions.
-        pooling: over the nodes. max (the report's choice for temporal_graph: many sensors are idle), mean, or
-            attention (its choice for sequence_graph).
+        norm: between convolutions: none, layer (over the features of a node), batch (over all nodes of all
+            graphs) or instance (over the nodes of each graph).
+        pooling: over the nodes. max (the report's choice for temporal_graph: many sensors are idle), mean,
+            attention (its choice for sequence_graph) or set2set, which doubles the width of the embedding.
 
     Raises:
         InputError: not a graph, no layer, or an unknown option.
@@ -91,14 +80,15 @@ class Gcn(AbstractModel):
         if not widths:
             raise InputError("model=gcn needs at least one layer, got none: set model.widths=[32,128]")
         sizes = [shape[-1], *widths]
-        self.width = sizes[-1]
         self.convolutions = nn.ModuleList(_Convolution(*pair) for pair in pairwise(sizes))
         self.activation = activation_of(activation)
         self.norms = nn.ModuleList(_norm(norm, width) for width in widths[:-1])
-        if pooling not in ("max", "mean", "attention"):
-            raise InputError(f"unknown pooling {pooling!r}: set model.pooling=max, mean or attention")
-        self.pooling = pooling
-        self.attention = _Attention(self.width) if pooling == "attention" else None
+        if pooling not in POOLINGS:
+            raise InputError(
+                f"unknown pooling {pooling!r}: set model.pooling to one of {', '.join(POOLINGS)}"
+            )
+        self.pooling = POOLINGS[pooling](sizes[-1])
+        self.width = int(self.pooling.width)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
         """Return the embeddings (N, E) of graphs x (N, S, F) with their adjacency."""
@@ -107,9 +97,7 @@ class Gcn(AbstractModel):
         nodes = x.transpose(0, 1).contiguous()  # nodes first: mixing them is then one product for all graphs
         for convolution, norm in zip(self.convolutions, [*self.norms, nn.Identity()], strict=True):
             nodes = self.activation(norm(convolution(nodes, adjacency)))
-        if self.attention is not None:
-            return self.attention(nodes)
-        return nodes.amax(dim=0) if self.pooling == "max" else nodes.mean(dim=0)
+        return self.pooling(nodes)
 
 
 class _BatchNorm(nn.BatchNorm1d):
@@ -119,8 +107,25 @@ class _BatchNorm(nn.BatchNorm1d):
         return super().forward(x.flatten(0, 1)).view_as(x)
 
 
+class _InstanceNorm(nn.Module):
+    """Instance norm (Ulyanov et al., 2016): over its nodes each feature of a graph has mean 0 and spread 1.
+
+    Not torch's, which refuses a graph of one node.
+    """
+
+    def __init__(self, width: int, eps: float = 1e-5) -> None:
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
+        self.eps = eps
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return nodes (S, N, F) of nodes x (S, N, F)."""
+        variance, mean = torch.var_mean(x, dim=0, correction=0)
+        return (x - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias
+
+
 def _norm(name: Norm, width: int) -> nn.Module:
-    known = {"none": nn.Identity, "layer": nn.LayerNorm, "batch": _BatchNorm}
+    known = {"none": nn.Identity, "layer": nn.LayerNorm, "batch": _BatchNorm, "instance": _InstanceNorm}
     if name not in known:
-        raise InputError(f"unknown norm {name!r}: set model.norm=none, layer or batch")
+        raise InputError(f"unknown norm {name!r}: set model.norm to one of {', '.join(known)}")
     return known[name](width)

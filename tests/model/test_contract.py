@@ -15,6 +15,7 @@ CHANGES = {
     "gcn": [
         {"pooling": "max", "norm": "batch", "activation": "relu"},
         {"pooling": "mean", "norm": "layer", "activation": "elu"},
+        {"pooling": "set2set", "norm": "instance"},
         {"widths": [40, 8]},
     ],
     "cnn": [{"channels": [4], "embedding": None}, {"repeat": 3}],

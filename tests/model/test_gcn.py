@@ -1,13 +1,15 @@
 """Graph networks against the laws of graphs and against PyTorch Geometric."""
 
 import warnings
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
 
 from skin.errors import InputError
-from skin.model.gcn import Gcn
+from skin.model._pooling import POOLINGS
+from skin.model.gcn import Gcn, _InstanceNorm
 from skin.representation.graph import adjacency, neighbours, normalised
 
 PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
@@ -15,12 +17,20 @@ EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")
 MATRIX = torch.from_numpy(normalised(EDGES)).float()
 
 
+@contextmanager
+def quiet():
+    """Bear the warnings that PyTorch Geometric gives when it is imported."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit.script", DeprecationWarning)
+        yield
+
+
 def gcn(**options):
     torch.manual_seed(0)
     return Gcn("graph", (8, 2), **({"widths": [16, 5]} | options)).eval()
 
 
-@pytest.mark.parametrize("pooling", ["max", "mean", "attention"])
+@pytest.mark.parametrize("pooling", POOLINGS)
 def test_the_order_of_the_sensors_does_not_matter(pooling):
     model = gcn(pooling=pooling)
     x = torch.randn(4, 8, 2)
@@ -42,8 +52,7 @@ def test_a_graph_per_frame_gives_the_same_as_one_for_all(widths):
 
 @pytest.mark.parametrize(("features", "width"), [(3, 7), (7, 3)])
 def test_one_convolution_is_that_of_pytorch_geometric(features, width):
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`torch.jit.script", DeprecationWarning)
+    with quiet():
         from torch_geometric.nn import GCNConv
     model = Gcn("graph", (8, features), widths=[width], activation="relu", pooling="max")
     theirs = GCNConv(features, width)
@@ -56,12 +65,53 @@ def test_one_convolution_is_that_of_pytorch_geometric(features, width):
     torch.testing.assert_close(model(x[None], MATRIX)[0], wanted)
 
 
+def plain(nodes):
+    """Return nodes (S, N, F) as PyTorch Geometric lists them, (N S, F), and the graph of each."""
+    return nodes.transpose(0, 1).flatten(0, 1), torch.arange(nodes.shape[1]).repeat_interleave(len(nodes))
+
+
+def test_set2set_is_that_of_pytorch_geometric():
+    with quiet():
+        from torch_geometric.nn import Set2Set
+    torch.manual_seed(0)
+    ours, theirs = POOLINGS["set2set"](5), Set2Set(5, processing_steps=3)
+    theirs.lstm.load_state_dict({f"{name}_l0": value for name, value in ours.lstm.state_dict().items()})
+    nodes = torch.randn(8, 4, 5)
+    torch.testing.assert_close(ours(nodes), theirs(*plain(nodes)))
+    assert ours.width == 10
+
+
+def test_attention_is_that_of_pytorch_geometric():
+    with quiet():
+        from torch_geometric.nn import AttentionalAggregation
+    torch.manual_seed(0)
+    ours = POOLINGS["attention"](5)
+    nodes = torch.randn(8, 4, 5)
+    torch.testing.assert_close(ours(nodes), AttentionalAggregation(ours.gate)(*plain(nodes)))
+
+
+def test_instance_norm_is_that_of_pytorch_geometric():
+    with quiet():
+        from torch_geometric.nn import InstanceNorm
+    torch.manual_seed(0)
+    ours, theirs = _InstanceNorm(5), InstanceNorm(5, affine=True)
+    theirs.weight.data, theirs.bias.data = ours.weight.data.normal_(), ours.bias.data.normal_()
+    nodes = 3 + 2 * torch.randn(8, 4, 5)
+    wanted = theirs(*plain(nodes)).unflatten(0, (4, 8)).transpose(0, 1)
+    torch.testing.assert_close(ours(nodes), wanted)
+
+
+def test_a_graph_of_one_sensor_can_be_normed():
+    model = gcn(norm="instance").train()
+    assert torch.isfinite(model(torch.randn(4, 1, 2), torch.ones(1, 1))).all()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"widths": []}, "model.widths="),
-        ({"pooling": "set3set"}, "model.pooling=max, mean or attention"),
-        ({"norm": "group"}, "model.norm=none, layer or batch"),
+        ({"pooling": "set3set"}, "model.pooling to one of max, mean, attention, set2set"),
+        ({"norm": "group"}, "model.norm to one of none, layer, batch, instance"),
         ({"activation": "tanh"}, "activation=relu, elu or silu"),
     ],
 )

@@ -1,0 +1,81 @@
+"""How the nodes of a graph become one vector."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["POOLINGS"]
+
+STEPS = 3  # of Set2Set
+
+
+class Max(nn.Module):
+    """The maximum over the nodes."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (N, E) of nodes x (S, N, E)."""
+        return x.amax(dim=0)
+
+
+class Mean(nn.Module):
+    """The mean of the nodes."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.width = width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (N, E) of nodes x (S, N, E)."""
+        return x.mean(dim=0)
+
+
+class Attention(nn.Module):
+    """Global attention pooling: the mean of the nodes, weighted by a softmax over a learned gate."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.gate = nn.Linear(width, 1)
+        self.width = width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (N, E) of nodes x (S, N, E)."""
+        share = self.gate(x).softmax(dim=0)
+        return torch.bmm(share.permute(1, 2, 0), x.transpose(0, 1)).squeeze(1)
+
+
+class Set2Set(nn.Module):
+    """A recurrent query that reads the nodes by attention, step after step (Vinyals et al., 2016).
+
+    Not PyTorch Geometric's: that wants the nodes of all graphs in one list with their graph's index, while
+    here every graph has the same number of them; a test compares the two.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.lstm = nn.LSTMCell(2 * width, width)
+        self.width = 2 * width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the last query and what it read, (N, 2 E), of nodes x (S, N, E)."""
+        nodes = x.transpose(0, 1)
+        query = memory = x.new_zeros(x.shape[1:])
+        read = query
+        for _ in range(STEPS):
+            query, memory = self.lstm(torch.cat([query, read], dim=-1), (query, memory))
+            share = torch.bmm(nodes, query[:, :, None]).softmax(dim=1)
+            read = torch.bmm(share.mT, nodes).squeeze(1)
+        return torch.cat([query, read], dim=-1)
+
+
+POOLINGS: dict[str, Callable[[int], nn.Module]] = {
+    "max": Max,
+    "mean": Mean,
+    "attention": Attention,
+    "set2set": Set2Set,
+}
+"""Each makes a module (S, N, E) -> (N, ``module.width``) from E."""

@@ -30,7 +30,7 @@ class TouchClassifier(pl.LightningModule):
     """Dense layers on the embedding of a window, and how they learn.
 
     Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
-    per epoch.
+    per epoch. Labels that mean nothing because the task's gate is shut count in neither.
 
     Args:
         fusion: makes the embedding (B, E) of frames.
@@ -68,10 +68,17 @@ class TouchClassifier(pl.LightningModule):
         return self.head(self.fusion(frames))
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1."""
+        """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1.
+
+        Where the task has a gate (report, 4.2), the mean is over the labels that mean something: those of a
+        window without touch have no loss and no gradient, but for the gate itself.
+        """
         if self.task.kind == "exclusive":
             return F.cross_entropy(logits, labels)
-        return F.binary_cross_entropy_with_logits(logits, labels)
+        if self.task.gate is None:
+            return F.binary_cross_entropy_with_logits(logits, labels)
+        counts = self.task.counts(labels)
+        return F.binary_cross_entropy_with_logits(logits[counts], labels[counts])
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         frames, labels = batch
@@ -86,9 +93,12 @@ class TouchClassifier(pl.LightningModule):
     def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
         if self.task.kind == "exclusive":
             return {"accuracy": (logits.argmax(dim=-1) == labels.argmax(dim=-1)).float().mean()}
-        right = ((logits > 0) == (labels > 0.5)).float().mean(dim=0)
-        each = {f"accuracy_{name}": right[i] for i, name in enumerate(self.task.names)}
-        return {"accuracy": right.mean(), **each}
+        counts = self.task.counts(labels)
+        right = ((logits > 0) == (labels > 0.5)) & counts
+        shares = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
+        each = dict(zip(self.task.names, shares, strict=True))
+        overall = torch.stack([each[name] for name in self.task.gated]).mean()
+        return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in each.items()}
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """Return the loss of one batch."""

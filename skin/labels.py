@@ -8,7 +8,7 @@ from torch import Tensor
 
 from skin.errors import InputError
 
-__all__ = ["TOUCH", "Measures", "Task", "Thresholds", "measure", "movie_labels"]
+__all__ = ["TOUCH", "TOUCH_OR_NOT", "Measures", "Task", "Thresholds", "measure", "movie_labels"]
 
 _PART = 256
 
@@ -21,17 +21,44 @@ class Task:
         names: one name per label, in the order of the label tensor's last axis.
         kind: ``binary`` (each label holds or not by itself), ``exclusive`` (exactly one holds) or
             ``direction``.
+        gate: the label without which the others mean nothing (report, 4.2), such as ``touch``; None: all
+            labels always mean something.
+
+    Raises:
+        ValueError: a gate that is no label, or of labels that are not binary.
     """
 
     names: tuple[str, ...]
     kind: Literal["binary", "exclusive", "direction"] = "binary"
+    gate: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.gate is not None and (self.kind != "binary" or self.gate not in self.names):
+            raise ValueError(f"{self.gate} is no gate of the {self.kind} labels {self.names}")
 
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def gated(self) -> tuple[str, ...]:
+        """The names of all labels but the gate."""
+        return tuple(name for name in self.names if name != self.gate)
+
+    def counts(self, labels: Tensor) -> Tensor:
+        """Return which of the labels (B, L) mean something, bool: all of them, unless a gate is shut."""
+        if self.gate is None:
+            return torch.ones_like(labels, dtype=torch.bool)
+        gate = self.names.index(self.gate)
+        counts = (labels[:, gate : gate + 1] > 0.5).repeat(1, len(self))
+        counts[:, gate] = True
+        return counts
+
 
 TOUCH = Task(("big", "dynamic", "press", "dangerous"))
 """The four binary labels of the report, section 2.1.1."""
+
+TOUCH_OR_NOT = Task((*TOUCH.names, "touch"), gate="touch")
+"""The same with the report's fifth label (section 4.2); where it is 0 the other four are 0 too."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from skin.classifier import TouchClassifier, probabilities
 from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
-from skin.labels import TOUCH, Task
+from skin.labels import TOUCH, TOUCH_OR_NOT, Task
 from skin.layout.scattered import Scattered
 from skin.recording import Touches
 from skin.representation.base import Frames
@@ -73,6 +73,33 @@ def test_the_loss_of_exclusive_labels_by_hand():
     loss = classifier(GESTURES).loss(logits, torch.tensor([[0.0, 1.0, 0.0]]))
     assert loss.item() == pytest.approx(math.log(math.e + 2))
     assert probabilities(logits, GESTURES).sum().item() == pytest.approx(1)
+
+
+def test_without_touch_only_the_gate_learns():
+    logits = torch.tensor([[0.0, 2.0, -1.0, 0.0, 3.0], [5.0, -4.0, 3.0, 2.0, 1.0]], requires_grad=True)
+    labels = torch.tensor([[1.0, 1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    loss = classifier(TOUCH_OR_NOT).loss(logits, labels)
+    touched = 2 * math.log(2) + math.log1p(math.exp(-2)) + math.log1p(math.exp(-1))
+    gates = math.log1p(math.exp(-3)) + math.log1p(math.exp(1))
+    assert loss.item() == pytest.approx((touched + gates) / 6)
+    loss.backward()
+    assert logits.grad[1, :4].tolist() == [0.0] * 4
+    assert (logits.grad[0] != 0).all()
+    assert logits.grad[1, 4] > 0
+
+
+def test_accuracy_without_touch_is_the_gates_alone():
+    logits = torch.tensor([[1.0, 1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0, -1.0]])
+    labels = torch.tensor([[1.0, 0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    found = classifier(TOUCH_OR_NOT)._accuracy(logits, labels)
+    assert {name: value.item() for name, value in found.items()} == {
+        "accuracy": 0.5,
+        "accuracy_big": 1.0,
+        "accuracy_dynamic": 0.0,
+        "accuracy_press": 1.0,
+        "accuracy_dangerous": 0.0,
+        "accuracy_touch": 0.5,
+    }
 
 
 def test_binary_probabilities_are_independent():

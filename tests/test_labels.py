@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.labels import Thresholds, measure, movie_labels
+from skin.labels import TOUCH, TOUCH_OR_NOT, Task, Thresholds, measure, movie_labels
 
 CELL = (0.01, 0.02)
 # Two sensors on a sheet of 10 x 10 cells: one over a whole cell, one over four quarters.
@@ -99,3 +99,16 @@ def test_a_factorised_movie_measures_as_its_dense_one():
 def test_shares_are_shares(wrong):
     with pytest.raises(InputError, match=r"touch.thresholds"):
         Thresholds(**wrong)
+
+
+def test_a_shut_gate_silences_the_other_labels():
+    given = torch.tensor([[1.0, 0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    assert TOUCH_OR_NOT.counts(given).tolist() == [[True] * 5, [False] * 4 + [True]]
+    assert TOUCH_OR_NOT.gated == TOUCH.names
+    assert TOUCH.counts(given[:, :4]).all()
+
+
+@pytest.mark.parametrize("kind", ["binary", "exclusive"])
+def test_a_gate_is_one_of_the_binary_labels(kind):
+    with pytest.raises(ValueError, match="no gate"):
+        Task(("poke", "touch"), kind, gate="touched" if kind == "binary" else "touch")

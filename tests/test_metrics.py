@@ -4,7 +4,7 @@ import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
-from skin.labels import TOUCH, Task
+from skin.labels import TOUCH, TOUCH_OR_NOT, Task
 from skin.metrics import confusion, metrics, recall_at
 
 
@@ -64,3 +64,18 @@ def test_exclusive_labels_have_one_accuracy():
     labels = torch.eye(3)[torch.tensor([0, 1, 2, 2])]
     chances = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.5, 0.3, 0.2], [0.2, 0.2, 0.6]])
     assert metrics(chances, labels, task, 0.02) == {"overall/accuracy": 0.75}
+
+
+def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
+    chances, labels = scored
+    touched = torch.arange(400) % 3 > 0
+    said = torch.where(torch.arange(400) % 4 > 0, 0.9, 0.2)
+    labels = torch.cat([labels * touched[:, None], touched[:, None].float()], dim=1)
+    found = metrics(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT, 0.02)
+    alone = metrics(chances[touched], labels[touched, :4], TOUCH, 0.02)
+    gate = {name: value for name, value in found.items() if name.startswith("touch/")}
+    assert {name: value for name, value in found.items() if name not in gate} == alone
+    assert gate["touch/accuracy"] == pytest.approx(accuracy_score(touched, said > 0.5))
+    counts = confusion(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
+    assert counts.sum(dim=(1, 2)).tolist() == [int(touched.sum())] * 4 + [400]
+    assert torch.equal(counts[:4], confusion(chances[touched], labels[touched, :4]))

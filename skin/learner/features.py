@@ -89,14 +89,23 @@ class Features(AbstractLearner):
     def _grow(self, table: dict[str, np.ndarray], task: Task) -> None:
         began = time.perf_counter()
         self._models = []
+        # A label is learnt from the touches in which it means something.
+        known, other = (
+            task.counts(torch.from_numpy(table[f"{split}_labels"])).numpy()
+            for split in ("train", "validation")
+        )
         for label, name in enumerate(task.names):
-            truth = table["train_labels"][:, label]
+            rows, held = known[:, label], other[:, label]
+            truth = table["train_labels"][rows, label]
             if len(np.unique(truth)) < 2:
                 raise InputError(f"all training touches have the same label {name}: give more touches")
             model = HistGradientBoostingClassifier(**self._settings)
-            validation = {"X_val": table["validation"], "y_val": table["validation_labels"][:, label]}
+            validation = {
+                "X_val": table["validation"][held],
+                "y_val": table["validation_labels"][held, label],
+            }
             with threadpool_limits(torch.get_num_threads(), "openmp"):  # a job's share of the cores
-                self._models.append(model.fit(table["train"], truth, **validation))
+                self._models.append(model.fit(table["train"][rows], truth, **validation))
         self._fitted, self._task = table, task
         self.seconds_per_epoch = time.perf_counter() - began
         # one number per leaf; scikit-learn counts leaves nowhere in public

@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.labels import TOUCH
+from skin.labels import Task
 from skin.learner._measurements import measurements
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
@@ -29,6 +29,7 @@ LOOK_AT = {
     "dynamic": ("path of", "reach of", "extent of", "way of"),
     "press": ("longest run",),
     "dangerous": ("raw sensor maximum 1", "sensor maximum 1"),
+    "touch": ("sensor maximum 1",),
 }
 """How the names of the measurements begin that a rule for a label may use."""
 
@@ -70,11 +71,11 @@ class Rules(AbstractLearner):
         """Tune the thresholds.
 
         Raises:
-            InputError: the labels are not the four of the report, or the touches have none.
+            InputError: labels that are not the report's, or the touches have none.
         """
-        if set(data.task.names) != set(TOUCH.names):
+        if not set(data.task.names) <= set(LOOK_AT):
             raise InputError(
-                f"learner=rules knows the labels {', '.join(TOUCH.names)}, got {', '.join(data.task.names)}: "
+                f"learner=rules knows the labels {', '.join(LOOK_AT)}, got {', '.join(data.task.names)}: "
                 "use learner=features"
             )
         began = time.perf_counter()
@@ -85,7 +86,9 @@ class Rules(AbstractLearner):
         self._set(
             {
                 name: _tune(
-                    name, (known, train.labels[:, i].numpy()), (other, validation.labels[:, i].numpy())
+                    name,
+                    _told(known, train.labels, data.task, i),
+                    _told(other, validation.labels, data.task, i),
                 )
                 for i, name in enumerate(data.task.names)
             }
@@ -115,6 +118,12 @@ class Rules(AbstractLearner):
     def _set(self, rules: dict[str, Rule]) -> None:
         self._rules = rules
         self.parameters = 2 * len(rules)
+
+
+def _told(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
+    """Return the measurements and one label of the touches in which that label means something."""
+    rows = task.counts(labels)[:, label].cpu()
+    return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()
 
 
 def _tune(label: str, known: _Split, other: _Split) -> Rule:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Literal, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -15,14 +16,20 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.labels import Task
 from skin.layout.scattered import Scattered
-from skin.learner.base import AbstractLearner
 from skin.metrics import confusion, metrics
 from skin.recording import Touches
 
-__all__ = ["Report", "evaluate"]
+__all__ = ["Answers", "Report", "columns", "evaluate"]
 
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
+
+
+class Answers(Protocol):
+    """What can be evaluated: a trained learner, or whatever else has an answer to touches."""
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L); InputError where it cannot take such touches."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +51,26 @@ class Report:
     predictions: pa.Table
 
 
-def evaluate(learner: AbstractLearner, device: AbstractDevice, settings: Evaluation) -> Report:
+def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
+    """Return the sets of touches behind every column of a report, drawn as they are asked for.
+
+    Those of ``unseen_layout`` raise InputError where the sensors make no grid that could be scattered anew.
+    """
+    sets = {"same": _once(device, "same"), "holdout": _once(device, "holdout")}
+    if isinstance(device, Simulated):
+        sets |= {"device_shift": _devices(device, settings), "unseen_layout": _layouts(device, settings)}
+    return sets
+
+
+def evaluate(learner: Answers, device: AbstractDevice, settings: Evaluation) -> Report:
     """Try a trained learner on a device and, where it is simulated, on others like it."""
     task, found, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
     found |= _named("same", metrics(chances, _labels(same), task, settings.false_alarm_rate))
-    columns: dict[str, Iterator[Touches]] = {"holdout": iter([device.touches("holdout")])}
-    if isinstance(device, Simulated):
-        columns |= {"device_shift": _devices(device, settings), "unseen_layout": _layouts(device, settings)}
-    for column, sets in columns.items():
+    others = columns(device, settings)
+    del others["same"]
+    for column, sets in others.items():
         try:
             each = [
                 metrics(learner.probabilities(touches), _labels(touches), task, settings.false_alarm_rate)
@@ -74,6 +91,11 @@ def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
         recording = device.recording("test")
         return recording.touches, recording.parameters
     return device.touches("test"), {}
+
+
+def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterator[Touches]:
+    """Yield the one set of a column."""
+    yield _test(device)[0] if column == "same" else device.touches("holdout")
 
 
 def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:

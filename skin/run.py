@@ -1,13 +1,12 @@
 """One run: build, learn, evaluate, log."""
 
-import hashlib
-import io
 import os
 import tempfile
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import torch
+from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
 
@@ -15,13 +14,14 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.console import quiet
 from skin.evaluation import Report, evaluate
+from skin.exchange import digest
 from skin.labels import Task
 from skin.recording import Touches
 from skin.results.figures import confusions, save
 from skin.results.show import report as show
 from skin.tracking import Store
 
-__all__ = ["PARENT", "train"]
+__all__ = ["PARENT", "conclude", "describe", "tags", "train"]
 
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
@@ -46,56 +46,67 @@ def train(config: DictConfig) -> bool:
     quiet()
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
-    store, identity = Store.open(config.tracking), fingerprint(config)
-    finished = store.find("FINISHED", fingerprint=identity) if config.tracking.resume else []
+    store, identity = Store.open(config.tracking), tags(config)
+    finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
         if PARENT not in os.environ:
             print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
         return False
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
-    tags = {
-        "fingerprint": identity,
-        "row": config.row,
-        "simulator": config.data.name,
-        "seed": str(config.seed),
-    }
     name = f"{config.row} {config.data.name} {config.seed}"
-    with store.run(name, tags, os.environ.get(PARENT)) as run:
+    with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
-        _describe(store, run.info.run_id, config, data.touches("train"))
+        describe(store, run.info.run_id, config, data.touches("train"))
         learner.fit(data, logger)
         report = evaluate(learner, device, config.evaluation)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
-        store.log_metrics(run, report.metrics | values)
         with tempfile.TemporaryDirectory() as folder:
-            store.client.set_tag(run.info.run_id, "learned", learner.save(Path(folder)).name)
-            _write(report, device.task, Path(folder))
-            store.client.log_artifacts(run.info.run_id, folder)
-        for column, reason in report.cannot.items():
-            store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
+            path = learner.save(Path(folder))
+            store.client.log_artifact(run.info.run_id, str(path))
+            store.client.set_tag(run.info.run_id, "learned", path.name)
+        conclude(store, run, report, device.task, values)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
 
 
-def _describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
-    """Log what the run is made from, before it starts."""
+def tags(config: DictConfig) -> dict[str, str]:
+    """Return the tags by which a run is found again."""
+    return {
+        "fingerprint": fingerprint(config),
+        "row": config.row,
+        "simulator": config.data.name,
+        "seed": str(config.seed),
+    }
+
+
+def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
+    """Log what a run is made from, before it starts.
+
+    Args:
+        store: where.
+        run: its id.
+        config: its configuration; groups that had no part in it may be left out.
+        touches: that it learns from.
+    """
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(plain(config))), "config.yaml")
-    store.client.set_tag(run, "data_hash", _hash(touches))
+    store.client.set_tag(run, "data_hash", digest(touches))
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
-    choices = {group: config[group]["_target_"].split(".")[-2] for group in groups}
+    choices = {group: config[group]["_target_"].split(".")[-2] for group in groups if group in config}
     scalars = {"seed": config.seed, "row": config.row, "gestures": config.data.gestures}
     for name, value in (choices | scalars | {"fresh": config.data.fresh}).items():
         store.client.log_param(run, name, value)
 
 
-def _hash(touches: Touches) -> str:
-    """Return a hash of readings and labels."""
-    buffer = io.BytesIO(touches.readings.contiguous().numpy().tobytes())
-    if touches.labels is not None:
-        buffer.write(touches.labels.contiguous().numpy().tobytes())
-    return hashlib.sha256(buffer.getvalue()).hexdigest()[:16]
+def conclude(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
+    """Log what an evaluation found, with its predictions and confusion matrices, and further values."""
+    store.log_metrics(run, report.metrics | values)
+    with tempfile.TemporaryDirectory() as folder:
+        _write(report, task, Path(folder))
+        store.client.log_artifacts(run.info.run_id, folder)
+    for column, reason in report.cannot.items():
+        store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
 
 
 def _write(report: Report, task: Task, folder: Path) -> None:

@@ -19,6 +19,7 @@ class Stream(IntEnum):
     CONSTANTS = 5
     NOISE = 6
     POSITION = 7
+    MODULUS = 8
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skin.body._memory import require_memory
+from skin.body._variation import along, check_variation, factors
 from skin.errors import InputError
 from skin.material import Material
 
@@ -46,17 +47,24 @@ class Sheet:
             and W = cells[0].
         layers: from the table up. A configuration gives each as ``{material, thickness}``, with the material
             as in :meth:`skin.material.Material.of` and the thickness in m.
+        variation: standard deviation of Young's modulus from cell to cell of each layer, as a share of the
+            layer's own, which stays its mean (log-normal, independent, so never below 0); 0: the same
+            everywhere. Another mesh is another draw.
+        variation_seed: what the moduli are drawn from.
 
     Raises:
         InputError: a size or thickness that is not positive, fewer than two cells along a side, no layer, an
-            unknown material, or more cells than memory allows.
+            unknown material, a variation below 0, or more cells than memory allows.
     """
 
     size: tuple[float, float]
     cells: tuple[int, int]
     layers: tuple[Layer, ...]
+    variation: float = 0.0
+    variation_seed: int = 0
 
     def __post_init__(self) -> None:
+        check_variation(self.variation, self.variation_seed)
         object.__setattr__(self, "size", _size(self.size))
         object.__setattr__(self, "cells", _cells(self.cells))
         object.__setattr__(self, "layers", _layers(self.layers))
@@ -94,6 +102,26 @@ class Sheet:
     def sensor_depth(self) -> float:
         """Where sensors lie by default, m: under the top layer; on the surface of a single layer."""
         return self.interfaces[-2] if len(self.layers) > 1 else 0.0
+
+    @cached_property
+    def moduli(self) -> np.ndarray:
+        """Young's modulus of each cell over that of its layer, (layers, H, W), from the table up."""
+        return factors(self.variation, self.variation_seed, (len(self.layers), *self.shape))
+
+    def stiffness(self, first: np.ndarray, second: np.ndarray, width: float) -> np.ndarray:
+        """Return how stiff strips of the sheet between places are along themselves, (n,), N/m.
+
+        That is the layers' E h, averaged along the straight line where the modulus varies, times w / d.
+
+        Args:
+            first: where the strips begin, (n, 3), m.
+            second: where they end, (n, 3), m; elsewhere than they begin.
+            width: w of every strip, m.
+        """
+        per_layer = [layer.material.young * layer.thickness for layer in self.layers]
+        per_cell = np.tensordot(per_layer, self.moduli, axes=1)
+        tension = along(per_cell, self.cell, first[:, :2], second[:, :2])
+        return tension * width / np.linalg.norm(second - first, axis=1)
 
     def footprint_areas(self, sensors: "Sensors") -> np.ndarray:
         """Return the area that each sensor's footprint shares with each cell, (S, H*W), m^2.

@@ -102,13 +102,21 @@ class Structure:
 
     def deflection(self, sensors: Sensors, levels: np.ndarray) -> sparse.csr_matrix:
         """Return rows (S, N) that read the motion into the skin at each sensor's x, y on an interface, m."""
+        return -self._read(self._hats(sensors), levels, dof=2)
+
+    def shift(self, sensors: Sensors, levels: np.ndarray, axis: int) -> sparse.csr_matrix:
+        """Return rows (S, N) that read the motion along x (axis 0) or y (1), if free, at each sensor, m."""
+        return self._read(self._hats(sensors), levels, dof=axis)
+
+    def _hats(self, sensors: Sensors) -> np.ndarray:
+        """Return how much each node of an interface counts at each sensor's x, y, (S, ny+1, nx+1)."""
         weights = np.ones((len(sensors), 1, 1))
         for axis in (1, 0):
             steps = sensors.positions[:, axis] / self.body.cell[axis]
             # Linear between the nearest two lines of nodes: a hat around each.
             hats = np.clip(1 - np.abs(steps[:, None] - np.arange(self.body.cells[axis] + 1)), 0, None)
             weights = weights * (hats[:, :, None] if axis == 1 else hats[:, None, :])
-        return self._read(weights, levels)
+        return weights
 
     def carried(self, sensors: Sensors, levels: np.ndarray) -> sparse.csr_matrix:
         """Return rows (S, N) that read the force in the beams below each sensor's footprint, N.
@@ -121,15 +129,16 @@ class Structure:
         )
         per_metre = np.array([layer.material.young / layer.thickness for layer in self.body.layers])
         weights = per_metre[levels][:, None, None] * np.einsum("sh,sw->shw", along_y, along_x)
+        weights = weights * _beam_moduli(self.body)[levels]
         above_table = levels > 0
-        below = self._read(weights * above_table[:, None, None], np.maximum(levels - 1, 0))
-        return self._read(weights, levels) - below
+        below = self._read(weights * above_table[:, None, None], np.maximum(levels - 1, 0), dof=2)
+        return below - self._read(weights, levels, dof=2)
 
-    def _read(self, weights: np.ndarray, levels: np.ndarray) -> sparse.csr_matrix:
-        """Return rows (S, N) that weigh an interface's downward motion by weights (S, ny+1, nx+1)."""
+    def _read(self, weights: np.ndarray, levels: np.ndarray, dof: int) -> sparse.csr_matrix:
+        """Return rows (S, N) that weigh a motion (u, v, w: 0, 1, 2) of an interface by (S, ny+1, nx+1)."""
         sensor, row, column = np.nonzero(weights)
-        unknown = self.nodes[levels[sensor], row, column] * len(self.free) + self.free.index(2)
-        values = -weights[sensor, row, column]
+        unknown = self.nodes[levels[sensor], row, column] * len(self.free) + self.free.index(dof)
+        values = weights[sensor, row, column]
         return sparse.coo_matrix((values, (sensor, unknown)), (len(weights), self.unknowns)).tocsr()
 
     def _layer(self, level: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -140,13 +149,14 @@ class Structure:
         beams = _beam.stiffness(
             np.tile(width, len(height)), np.repeat(height, len(width)), layer.thickness, layer.material
         )
+        beams = beams * _beam_moduli(self.body)[level].reshape(-1, 1, 1)
         upper = self.nodes[level].reshape(-1, 1)
         if level == 0:
             ends, kept = upper, _dofs([1], self.free)
         else:
             ends, kept = np.hstack([self.nodes[level - 1].reshape(-1, 1), upper]), _dofs([0, 1], self.free)
         corners, corner_kept = self._unknowns(self._corners(level)), _dofs(range(4), self.free)
-        plates = np.repeat(plate[None, corner_kept][:, :, corner_kept], len(corners), axis=0)
+        plates = plate[None, corner_kept][:, :, corner_kept] * self.body.moduli[level].reshape(-1, 1, 1)
         return [_scatter(corners, plates), _scatter(self._unknowns(ends), beams[:, kept][:, :, kept])]
 
     def _corners(self, level: int) -> np.ndarray:
@@ -164,6 +174,20 @@ def _section_edges(body: Sheet, axis: int) -> np.ndarray:
     """Return the borders between nodes' parts of the sheet, m: halfway between them, and the edges."""
     nodes = np.linspace(0, body.size[axis], body.cells[axis] + 1)
     return np.concatenate([nodes[:1], (nodes[1:] + nodes[:-1]) / 2, nodes[-1:]])
+
+
+def _beam_moduli(body: Sheet) -> np.ndarray:
+    """Return each beam's modulus over its layer's, (layers, ny+1, nx+1): the mean of the cells it touches.
+
+    A beam's section takes an equal part of each of them.
+    """
+    cells = body.moduli
+    total, count = np.zeros((2, len(cells), cells.shape[1] + 1, cells.shape[2] + 1))
+    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        part = np.s_[:, row : row + cells.shape[1], column : column + cells.shape[2]]
+        total[part] += cells
+        count[part] += 1
+    return total / count
 
 
 def _dofs(ends: Iterable[int], free: tuple[int, ...]) -> list[int]:

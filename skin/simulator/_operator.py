@@ -23,7 +23,7 @@ from skin.simulator._assembly import Structure
 __all__ = ["Operator", "build", "cache_folder", "cached"]
 
 # Raise it when the meaning of a stored file changes.
-_FORMAT = 1
+_FORMAT = 2
 _HERE = Path(__file__).parent
 # Mechanics that changed must not be answered from a file that the old mechanics wrote.
 _SOURCES = [
@@ -41,12 +41,16 @@ class Operator:
         surface: D_t, how far the surface above it does, m/Pa.
         applied: F_in, the force on the footprint at the surface, N/Pa.
         carried: the force that the layer below the sensor carries under the footprint, N/Pa.
+        along_x: how far the sensor moves along x, m/Pa; 0 where supports hold it.
+        along_y: how far it moves along y, m/Pa.
     """
 
     sensor: np.ndarray
     surface: np.ndarray
     applied: np.ndarray
     carried: np.ndarray
+    along_x: np.ndarray
+    along_y: np.ndarray
 
 
 def build(structure: Structure, sensors: Sensors) -> Operator:
@@ -67,6 +71,7 @@ def build(structure: Structure, sensors: Sensors) -> Operator:
         structure.deflection(sensors, levels),
         structure.deflection(sensors, top),
         structure.carried(sensors, levels),
+        *(structure.shift(sensors, levels, axis) for axis in (0, 1) if axis in structure.free),
     ]
     # K is symmetric and positive definite: no pivoting, and an ordering for symmetric matrices.
     factors = splu(
@@ -76,10 +81,11 @@ def build(structure: Structure, sensors: Sensors) -> Operator:
         options={"SymmetricMode": True},
     )
     load = structure.load()
-    deflection, surface, carried = (
+    deflection, surface, carried, *along = (
         np.ascontiguousarray((load.T @ factors.solve(rows.T.toarray())).T) for rows in functionals
     )
-    return Operator(deflection, surface, body.footprint_areas(sensors), carried)
+    along_x, along_y = along or (np.zeros_like(deflection), np.zeros_like(deflection))
+    return Operator(deflection, surface, body.footprint_areas(sensors), carried, along_x, along_y)
 
 
 def cached(structure: Structure, sensors: Sensors, folder: Path) -> Operator:
@@ -116,6 +122,7 @@ def _key(structure: Structure, sensors: Sensors) -> str:
         "size": body.size,
         "cells": body.cells,
         "layers": [(layer.material.young, layer.material.poisson, layer.thickness) for layer in body.layers],
+        "moduli": hashlib.sha256(body.moduli.tobytes()).hexdigest(),
         "constraint": structure.constraint,
         "positions": sensors.positions.tolist(),
         "footprint": sensors.footprint,
@@ -165,4 +172,4 @@ def _bytes(structure: Structure, sensors: int) -> float:
     filling = max(7.5 * np.log2(places**0.5) - 17, 7.0)
     factors = 16 * places * per_place**2 * filling
     elements = 32 * places * layers * ((4 * each) ** 2 + (2 * each) ** 2)
-    return factors + elements + 16 * 3 * sensors * (places * per_place + places)
+    return factors + elements + 16 * 5 * sensors * (places * per_place + places)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from skin.material import Material
 from skin.simulator._assembly import Structure
 
 if TYPE_CHECKING:
@@ -26,15 +27,15 @@ def model(structure: Structure, pressure: np.ndarray) -> "FEModel3D":
     built = FEModel3D()
     _add_nodes(built, structure)
     for number, layer in enumerate(body.layers, start=1):
-        material = f"layer {number}"
-        built.add_material(
-            material, layer.material.young, layer.material.shear, layer.material.poisson, rho=1.0
-        )
-        _add_beams(built, structure, number, material)
+        _add_beams(built, structure, number)
         for row, column in np.ndindex(body.shape):
             corners = [(row, column), (row, column + 1), (row + 1, column + 1), (row + 1, column)]
             names = [f"{number},{j},{i}" for j, i in corners]
-            built.add_plate(f"{number},{row},{column}", *names, layer.thickness, material)
+            name = f"{number},{row},{column}"
+            material = _add_material(
+                built, f"plate {name}", layer.material, body.moduli[number - 1, row, column]
+            )
+            built.add_plate(name, *names, layer.thickness, material)
     for (row, column), value in np.ndenumerate(pressure):
         if value:
             built.add_plate_surface_pressure(f"{len(body.layers)},{row},{column}", -float(value))
@@ -67,14 +68,22 @@ def _add_nodes(built: "FEModel3D", structure: Structure) -> None:
             built.def_support(name, *held)
 
 
-def _add_beams(built: "FEModel3D", structure: Structure, number: int, material: str) -> None:
+def _add_material(built: "FEModel3D", name: str, material: Material, factor: float) -> str:
+    """Add a material whose moduli are ``factor`` times those given, and return its name."""
+    built.add_material(name, factor * material.young, factor * material.shear, material.poisson, rho=1.0)
+    return name
+
+
+def _add_beams(built: "FEModel3D", structure: Structure, number: int) -> None:
     """Join each node of an interface to the one below by the part of the sheet nearest to it."""
-    body = structure.body
+    body, layer = structure.body, structure.body.layers[number - 1]
     rows, columns = structure.grid[1:]
     for row, column in np.ndindex(rows, columns):
         width = body.cell[0] * (0.5 if column in {0, columns - 1} else 1)
         height = body.cell[1] * (0.5 if row in {0, rows - 1} else 1)
         second_y, second_x = width * height**3 / 12, height * width**3 / 12
         name = f"{number},{row},{column}"
+        around = body.moduli[number - 1, max(row - 1, 0) : row + 1, max(column - 1, 0) : column + 1]
+        material = _add_material(built, f"beam {name}", layer.material, float(around.mean()))
         built.add_section(name, width * height, second_y, second_x, second_y + second_x)
         built.add_member(name, f"{number - 1},{row},{column}", name, material, name)

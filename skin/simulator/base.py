@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
+from skin.errors import InputError
+
 __all__ = ["AbstractSimulator", "Response"]
 
 
@@ -31,3 +33,17 @@ class AbstractSimulator(nn.Module, ABC):
     @abstractmethod
     def forward(self, pressure: Tensor) -> Response:
         """Return the response to pressure (..., H, W), Pa."""
+
+    def motion(self, pressure: Tensor) -> Tensor:
+        """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
+
+        Positively homogeneous like the response.
+
+        Raises:
+            InputError: in this simulator sensors do not move along the sheet.
+        """
+        name = type(self).__module__.rpartition(".")[2]
+        raise InputError(
+            f"sensors that move need a simulator in which they can, got simulator={name}: "
+            "set simulator=fem simulator.constraint=free"
+        )

@@ -39,7 +39,7 @@ class PlatesAndBeams(AbstractSimulator):
             ``interface`` is the force that the layer below carries under the footprint: linear, and
             neighbours feel a touch.
         constraint: ``vertical`` is the report's: nodes move vertically and tilt. ``free`` lets them move
-            along the sheet too.
+            along the sheet too; then :meth:`motion` tells where the sensors go.
         cache: folder of operators kept from earlier runs; None means the variable SKIN_CACHE, else the
             user's cache.
 
@@ -48,11 +48,12 @@ class PlatesAndBeams(AbstractSimulator):
             allows.
 
     Attributes:
-        operator: the rows D_s, D_t, F_in and the carried force in float64, as computed. The buffers that
-            ``forward`` multiplies by are float32 copies of them.
+        operator: the rows D_s, D_t, F_in, the carried force and the motion along x and y in float64, as
+            computed. The buffers that pressures are multiplied by are float32 copies of them.
     """
 
     transfer: Tensor
+    along: Tensor
 
     def __init__(
         self,
@@ -65,12 +66,14 @@ class PlatesAndBeams(AbstractSimulator):
         super().__init__()
         if reading not in get_args(Reading):
             raise InputError(f"simulator.reading must be {' or '.join(get_args(Reading))}, got {reading}")
-        self.reading = reading
+        self.reading, self.constraint = reading, constraint
         self.shape = body.shape
         self.operator: Operator = cached(Structure(body, constraint), sensors, cache_folder(cache))
         force = self.operator.applied if reading == "equation10" else self.operator.carried
         rows = np.concatenate([self.operator.sensor, self.operator.surface, force])
         self.register_buffer("transfer", torch.from_numpy(rows.T.copy()).float())
+        moves = np.concatenate([self.operator.along_x, self.operator.along_y, self.operator.sensor])
+        self.register_buffer("along", torch.from_numpy(moves.T.copy()).float())
 
     def forward(self, pressure: Tensor) -> Response:
         """Return the response to pressure (..., H, W), Pa, with D_s and D_t as its displacement."""
@@ -84,3 +87,17 @@ class PlatesAndBeams(AbstractSimulator):
         moves = surface.abs() > torch.finfo(surface.dtype).tiny
         share = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
         return Response(share * force, displacement)
+
+    def motion(self, pressure: Tensor) -> Tensor:
+        """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
+
+        Raises:
+            InputError: nodes are held along x and y.
+        """
+        if self.constraint != "free":
+            raise InputError(
+                "sensors that move need a skin that does, got simulator.constraint="
+                f"{self.constraint}: set simulator.constraint=free"
+            )
+        cells = flatten(pressure, self.shape, self.along.dtype)
+        return (cells @ self.along).unflatten(-1, (3, -1)).transpose(-1, -2)

@@ -1,5 +1,7 @@
 """Laws that the plates and beams obey, whatever their code."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from skin.layout.scattered import Scattered
 from skin.simulator._assembly import Structure
 from skin.simulator._operator import build
 from skin.simulator.fem import PlatesAndBeams
+from skin.simulator.naive import Naive
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
@@ -199,6 +202,69 @@ def test_64_cells_are_within_5_percent_of_128_and_the_default_is_as_its_docstrin
     np.testing.assert_allclose(fine, finer, rtol=0.05)
     sensor, surface = default / finer
     assert (sensor, surface, sensor / surface) == pytest.approx((0.84, 0.89, 0.95), abs=0.006)
+
+
+def test_a_centred_press_moves_symmetric_sensors_symmetrically(cache):
+    """Left goes as far as right, up as far as down, the diagonal is none of x or y, the middle stays."""
+    body = Sheet([0.12, 0.12], [12, 12], LAYERS)
+    skin = PlatesAndBeams(body, Grid(5, 5).sensors(body), constraint="free", cache=cache).double()
+    pressure = torch.zeros(body.shape).double()
+    pressure[4:8, 4:8] = 1e5
+    motion = skin.motion(pressure).view(5, 5, 3)
+    x, y, _ = motion.unbind(-1)
+    largest = motion[..., :2].abs().max()
+    assert largest > 1e-6
+    close = {"rtol": 0, "atol": float(1e-6 * largest)}
+    torch.testing.assert_close(x, -x.flip(1), **close)
+    torch.testing.assert_close(x, x.flip(0), **close)
+    torch.testing.assert_close(x, y.T, **close)
+    torch.testing.assert_close(motion[2, 2, :2], torch.zeros(2).double(), **close)
+
+
+def test_a_sensor_sinks_as_far_as_its_displacement_says(cache):
+    body = Sheet([0.16, 0.12], [10, 8], LAYERS)
+    skin = PlatesAndBeams(body, Grid(3, 4).sensors(body), constraint="free", cache=cache)
+    pressure = torch.rand(2, *body.shape, generator=torch.Generator().manual_seed(0))
+    motion = skin.motion(pressure)
+    assert motion.shape == (2, 12, 3)
+    torch.testing.assert_close(motion[..., 2], skin(pressure).displacement[..., 0])
+    torch.testing.assert_close(skin.motion(3 * pressure), 3 * motion)
+
+
+def test_what_does_not_move_along_the_sheet_says_so(cache):
+    body = Sheet([0.16, 0.16], [8, 8], LAYERS)
+    held = PlatesAndBeams(body, at((0.08, 0.08, 0.005)), cache=cache)
+    with pytest.raises(InputError, match=r"simulator\.constraint=vertical: set simulator\.constraint=free"):
+        held.motion(torch.zeros(body.shape))
+    with pytest.raises(InputError, match=r"simulator=naive: set simulator=fem simulator\.constraint=free"):
+        Naive(body, at((0.08, 0.08, 0.005))).motion(torch.zeros(body.shape))
+
+
+def test_twice_the_modulus_everywhere_is_half_the_motion():
+    """The varied moduli enter plates and beams alike: all of them doubled halves every displacement."""
+    body = Sheet([0.06, 0.05], [6, 5], LAYERS, variation=0.3, variation_seed=1)
+    stiffer = [{**layer, "material": {"name": layer["material"]}} for layer in LAYERS]
+    for layer, young in zip(stiffer, (2 * 560e3, 2 * 170e3), strict=True):
+        layer["material"]["young"] = young
+    sensors = at((0.02, 0.03, 0.005), (0.05, 0.01, 0.0))
+    soft, stiff = (
+        build(Structure(one, "free"), sensors) for one in (body, replace(body, layers=tuple(stiffer)))
+    )
+    for name in ("sensor", "surface", "along_x", "along_y"):
+        np.testing.assert_allclose(vars(stiff)[name], vars(soft)[name] / 2, rtol=1e-8, atol=1e-18)
+    np.testing.assert_allclose(stiff.carried, soft.carried, rtol=1e-8, atol=1e-12)
+
+
+def test_thin_wide_cells_are_springs_of_their_own_moduli():
+    """Plates of 0.1 m cells hardly bend 5 mm layers: a node sinks p t / E per layer, E of its four cells."""
+    body = Sheet([0.8, 0.6], [8, 6], LAYERS, variation=0.2, variation_seed=2)
+    places = [(0.1 * i, 0.1 * j) for j in range(1, 6) for i in range(1, 8)]
+    operator = build(Structure(body), at(*[(x, y, 0.0) for x, y in places]))
+    young = np.array([560e3, 170e3])
+    for (x, y), sunk in zip(places, operator.surface.sum(axis=1), strict=True):
+        i, j = round(x / 0.1), round(y / 0.1)
+        four = body.moduli[:, j - 1 : j + 1, i - 1 : i + 1].reshape(2, 4).mean(axis=1)
+        assert sunk == pytest.approx((np.array([0.010, 0.005]) / (young * four)).sum(), rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ BODIES = {
     "3x6, wide cells, two layers": Sheet([0.16, 0.07], [3, 6], [DRAGON, ECOFLEX]),
     "5x4, three layers": Sheet([0.06, 0.05], [5, 4], [DRAGON, ECOFLEX, FOAM]),
     "4x4, stiff on soft": Sheet([0.04, 0.04], [4, 4], [FOAM, DRAGON]),
+    "4x5, three layers, moduli that vary": Sheet([0.06, 0.05], [4, 5], [DRAGON, ECOFLEX, FOAM], 0.2, 3),
 }
 LOADS = ("one cell off the centre", "random")
 
@@ -88,6 +89,39 @@ def test_pynite_agrees_with_the_cached_operator_on_sensors_at_every_interface(ca
     np.testing.assert_allclose(given, np.stack([at_sensor, at_surface], axis=-1), atol=1e-5 * largest)
 
 
+def test_pynite_agrees_on_where_the_sensors_go(case, tmp_path):
+    """Motion along x, along y and into the skin, at places between nodes of every interface."""
+    structure, pressure, _, expected = case
+    body = structure.body
+    where = np.random.default_rng(2).uniform(0.05, 0.95, (7, 2)) * body.size
+    levels = np.arange(7) % len(body.layers)
+    positions = np.column_stack([where, np.array(body.interfaces)[levels]])
+    skin = PlatesAndBeams(
+        body, Sensors(positions, (0.01, 0.01)), constraint=structure.constraint, cache=tmp_path
+    )
+    if structure.constraint == "vertical":
+        assert not skin.operator.along_x.any()
+        assert not skin.operator.along_y.any()
+        return
+    lines = [np.linspace(0, body.size[axis], body.cells[axis] + 1) for axis in (1, 0)]
+    answer = np.array(
+        [
+            [
+                sign * RegularGridInterpolator(lines, expected[level, ..., dof])(place[[1, 0]])[0]
+                for dof, sign in ((0, 1), (1, 1), (2, -1))
+            ]
+            for level, place in zip(levels, where, strict=True)
+        ]
+    )
+    rows = (skin.operator.along_x, skin.operator.along_y, skin.operator.sensor)
+    for ours, theirs in zip(rows, answer.T, strict=True):
+        largest = np.abs(theirs).max()
+        assert largest > 0
+        np.testing.assert_allclose(ours @ pressure.ravel(), theirs, rtol=0, atol=1e-6 * largest)
+    given = skin.double().motion(torch.from_numpy(pressure)).numpy()
+    np.testing.assert_allclose(given, answer, rtol=0, atol=1e-5 * np.abs(answer).max())
+
+
 def test_pynite_reactions_on_the_table_carry_the_load(case):
     """Held nodes above the table take nothing vertically: what is pressed on comes out below."""
     structure, pressure, model, _ = case
@@ -96,9 +130,10 @@ def test_pynite_reactions_on_the_table_carry_the_load(case):
     assert table == pytest.approx(force, rel=1e-6)
 
 
-def test_pynite_agrees_on_the_force_that_the_layer_below_carries(tmp_path):
+@pytest.mark.parametrize("name", ["5x4, three layers", "4x5, three layers, moduli that vary"])
+def test_pynite_agrees_on_the_force_that_the_layer_below_carries(name, tmp_path):
     """A footprint around one node on its own section feels the axial force of that node's beam."""
-    structure = Structure(BODIES["5x4, three layers"])
+    structure = Structure(BODIES[name])
     body = structure.body
     pressure = load(body, "random")
     model, _ = solved(structure, pressure)

@@ -1,0 +1,64 @@
+"""A modulus that differs from cell to cell."""
+
+import math
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.streams import Stream, generator
+
+__all__ = ["along", "check_variation", "factors"]
+
+
+def check_variation(variation: float, seed: int) -> None:
+    """Refuse a variation or a seed from which nothing can be drawn.
+
+    Raises:
+        InputError: a variation that is no number from 0 up, or a seed that is no whole number from 0 up.
+    """
+    number = isinstance(variation, int | float) and not isinstance(variation, bool)
+    if not number or not math.isfinite(variation) or variation < 0:
+        raise InputError(
+            f"body.variation must be a share of Young's modulus of at least 0, got {variation!r}: "
+            "as in body.variation=0.2"
+        )
+    if type(seed) is not int or seed < 0:
+        raise InputError(
+            f"body.variation_seed must be a whole number from 0 up, got {seed!r}: as in body.variation_seed=0"
+        )
+
+
+def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return independent log-normal numbers with mean 1 and standard deviation ``variation``.
+
+    Without variation they are 1 to the last bit.
+    """
+    spread = math.sqrt(math.log1p(variation**2))
+    drawn = generator(Stream.MODULUS, seed).standard_normal(shape)
+    values = np.exp(spread * drawn - spread**2 / 2)
+    values.setflags(write=False)
+    return values
+
+
+def along(field: np.ndarray, cell: tuple[float, float], first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the exact means (n,) of a field, constant in each cell, along straight lines.
+
+    Args:
+        field: (H, W).
+        cell: extent (x, y) of a cell, m.
+        first: where the lines begin, (n, 2), m.
+        second: where they end, (n, 2), m; elsewhere than they begin.
+    """
+    rows, columns = field.shape
+    crossings = []
+    for axis, count in ((0, columns), (1, rows)):
+        start, way = first[:, axis, None], (second - first)[:, axis, None]
+        level = way == 0
+        share = (cell[axis] * np.arange(count + 1) - start) / np.where(level, 1, way)
+        crossings.append(np.where(level, 0, share))
+    ends = np.broadcast_to([0.0, 1.0], (len(first), 2))
+    cuts = np.sort(np.clip(np.hstack([*crossings, ends]), 0, 1), axis=1)
+    middle = (cuts[:, 1:] + cuts[:, :-1])[..., None] / 2
+    place = (first[:, None] + middle * (second - first)[:, None]) / np.array(cell)
+    column, row = np.clip(place, 0, [columns - 1, rows - 1]).astype(np.int64).transpose(2, 0, 1)
+    return (np.diff(cuts, axis=1) * field[row, column]).sum(axis=1)

@@ -2,7 +2,10 @@
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor, nn
+
+from skin.model._attention import encoder
 
 __all__ = ["HEADS"]
 
@@ -72,6 +75,33 @@ class AttentionGru(nn.Module):
         return (self.score(states).softmax(dim=1) * states).sum(dim=1)
 
 
+def positions(length: int, width: int) -> Tensor:
+    """Return sines and cosines (length, width) that tell frames apart (Vaswani et al., 2017, section 3.5).
+
+    Column 2i of frame t is sin(t / 10000^(2i / width)), column 2i + 1 its cosine; ``width`` is even.
+    """
+    rates = 10_000 ** (-torch.arange(0, width, 2) / width)
+    angles = torch.arange(length)[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)
+
+
+class Transformer(nn.Module):
+    """The mean over time of what two layers of self-attention make of the frames.
+
+    Positions are computed, not learnt, so that windows of other lengths are taken too.
+    """
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.tokens = nn.Linear(width, hidden)
+        self.encoder = encoder(hidden, 4, 2, 2 * hidden, 0.1, "fusion.hidden")
+        self.width = hidden
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (B, hidden) of x (B, T, E)."""
+        return self.encoder(self.tokens(x) + positions(x.shape[1], self.width).to(x)).mean(dim=1)
+
+
 HEADS: dict[str, Callable[[int, int], nn.Module]] = {
     "mean": Mean,
     "max": Max,
@@ -79,5 +109,6 @@ HEADS: dict[str, Callable[[int, int], nn.Module]] = {
     "lstm": lambda width, hidden: Recurrent(nn.LSTM(width, hidden, batch_first=True)),
     "gru": lambda width, hidden: Recurrent(nn.GRU(width, hidden, batch_first=True)),
     "attention+gru": AttentionGru,
+    "transformer": Transformer,
 }
 """Each makes a module (B, T, E) -> (B, ``module.width``) from E and the width of its hidden layer."""

@@ -23,11 +23,11 @@ class Late(AbstractFusion):
         kind: what the representation yields.
         shape: of one frame: (C, H, W), (S, F) or (F,).
         window: number of frames; any other length is taken too.
-        head: over time: mean, max, conv, lstm, gru or attention+gru.
-        hidden: width of the head, where it has weights.
+        head: over time: mean, max, conv, lstm, gru, attention+gru or transformer.
+        hidden: width of the head, where it has weights; of a transformer a multiple of 4.
 
     Raises:
-        InputError: an unknown head.
+        InputError: an unknown head, or a width that it cannot have.
     """
 
     def __init__(
@@ -42,6 +42,8 @@ class Late(AbstractFusion):
         super().__init__()
         if head not in HEADS:
             raise InputError(f"unknown head {head!r}: set fusion.head to one of {', '.join(HEADS)}")
+        if hidden < 1:
+            raise InputError(f"a head is at least 1 wide, got {hidden}: set e.g. fusion.hidden=64")
         self.model = model(kind, shape)
         self.head = HEADS[head](self.model.width, hidden)
         self.width = int(self.head.width)  # type: ignore[arg-type]

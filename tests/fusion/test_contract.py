@@ -9,6 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from skin.errors import InputError
+from skin.fusion._heads import HEADS
 from skin.model.cnn import Cnn
 from skin.model.gcn import Gcn
 from skin.model.mlp import Mlp
@@ -16,7 +17,6 @@ from skin.representation.base import Frames
 from skin.representation.graph import Graph
 
 OPTIONS = sorted((Path(__file__).parents[2] / "conf" / "fusion").glob("*.yaml"))
-HEADS = ["mean", "max", "conv", "lstm", "gru", "attention+gru"]
 MODELS = {
     "readings": partial(Mlp, widths=[8]),
     "graph": partial(Gcn, widths=[4, 8]),
@@ -79,6 +79,24 @@ def test_weights_reload(given):
     assert not torch.equal(other(frames), fusion(frames))
     other.load_state_dict(fusion.state_dict())
     assert torch.equal(other(frames), fusion(frames))
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("kind", MODELS)
+def test_late_fusion_trained_on_30_frames_takes_20_and_60(kind, head):
+    torch.manual_seed(0)
+    late = next(path for path in OPTIONS if path.stem == "late")
+    fusion = instantiate(OmegaConf.load(late), head=head)(MODELS[kind], kind, SHAPES[kind], 30)
+    optimizer = torch.optim.Adam(fusion.parameters())
+    fusion(windows(kind, 30)).square().sum().backward()
+    optimizer.step()
+    fusion.eval()
+    x, adjacency = windows(kind, 60)
+    short, long = fusion(Frames(x[:, :20], adjacency)), fusion(Frames(x, adjacency))
+    assert short.shape == long.shape == (5, fusion.width)
+    assert torch.isfinite(short).all()
+    assert torch.isfinite(long).all()
+    assert not torch.allclose(short, long)  # the frames after the 20th are not overlooked
 
 
 @pytest.mark.parametrize("length", [1, 4, 11])

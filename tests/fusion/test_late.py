@@ -1,11 +1,13 @@
 """Late fusion: which heads know the order of frames."""
 
+import math
 from functools import partial
 
 import pytest
 import torch
 
 from skin.errors import InputError
+from skin.fusion._heads import HEADS, positions
 from skin.fusion.late import Late
 from skin.model.gcn import Gcn
 from skin.model.mlp import Mlp
@@ -14,10 +16,10 @@ from skin.representation.base import Frames
 MODEL = partial(Mlp, widths=[8])
 
 
-@pytest.mark.parametrize("head", ["mean", "max", "conv", "lstm", "gru", "attention+gru"])
+@pytest.mark.parametrize("head", HEADS)
 def test_only_mean_and_max_forget_the_order(head):
     torch.manual_seed(0)
-    fusion = Late(MODEL, "readings", (4,), 6, head=head)
+    fusion = Late(MODEL, "readings", (4,), 6, head=head).eval()
     x = torch.randn(3, 6, 4)
     same = torch.allclose(fusion(Frames(x.flip(1), None)), fusion(Frames(x, None)), atol=1e-6)
     assert same == (head in ("mean", "max"))
@@ -31,7 +33,36 @@ def test_a_graph_per_frame_is_taken():
 
 
 def test_an_unknown_head_is_refused():
-    with pytest.raises(
-        InputError, match=r"fusion\.head to one of mean, max, conv, lstm, gru, attention\+gru"
-    ):
-        Late(MODEL, "readings", (4,), 6, head="transformer")
+    names = r"mean, max, conv, lstm, gru, attention\+gru, transformer"
+    with pytest.raises(InputError, match=rf"unknown head 'tcn': set fusion\.head to one of {names}"):
+        Late(MODEL, "readings", (4,), 6, head="tcn")
+
+
+@pytest.mark.parametrize(
+    ("head", "hidden", "words"),
+    [
+        ("transformer", 30, r"got fusion\.hidden=30: set fusion\.hidden=32"),
+        ("gru", 0, r"at least 1 wide, got 0: set e\.g\. fusion\.hidden=64"),
+        ("transformer", -4, r"at least 1 wide, got -4"),
+    ],
+)
+def test_a_width_that_a_head_cannot_have_is_refused(head, hidden, words):
+    with pytest.raises(InputError, match=words):
+        Late(MODEL, "readings", (4,), 6, head=head, hidden=hidden)
+
+
+def test_positions_of_frames_by_hand():
+    sin, cos = math.sin, math.cos
+    wanted = [[sin(t), cos(t), sin(t / 100), cos(t / 100)] for t in range(3)]
+    torch.testing.assert_close(positions(3, 4), torch.tensor(wanted))
+
+
+def test_a_transformer_looks_back_over_the_whole_window():
+    torch.manual_seed(0)
+    head = HEADS["transformer"](4, 8).eval()
+    x = torch.zeros(1, 60, 4, requires_grad=True)
+    states = []
+    head.encoder.register_forward_hook(lambda *call: states.append(call[-1]))
+    head(x)
+    states[0][0, 59].sum().backward()
+    assert (x.grad[0] != 0).any(dim=1).all()

@@ -19,6 +19,7 @@ CHANGES = {
         {"widths": [40, 8]},
     ],
     "cnn": [{"channels": [4], "embedding": None}, {"repeat": 3}],
+    "transformer": [{"pooling": "max", "layers": 1, "heads": 1}],
     "mlp": [{"widths": [5], "activation": "silu"}],
 }
 VARIANTS = [(path, extra) for path in OPTIONS for extra in ({}, *CHANGES.get(path.stem, []))]

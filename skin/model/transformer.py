@@ -1,0 +1,60 @@
+"""A transformer over the sensors."""
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+from torch import Tensor, nn
+
+from skin.errors import InputError
+from skin.model._attention import encoder
+from skin.model.base import AbstractModel, Kind
+
+__all__ = ["Transformer"]
+
+Pooling = Literal["mean", "max"]
+
+
+class Transformer(AbstractModel):
+    """Lets every sensor attend to every other one, then takes one vector per frame (report, section 3.2.2).
+
+    Takes any layout and any number of sensors with the same weights. It does not look at the edges of the
+    graph and knows of places only what the nodes tell: add ``representation.coordinates=true``.
+
+    Args:
+        kind: must be ``graph``.
+        shape: (S, F).
+        width: of a sensor's token and of the embedding.
+        layers: number of encoder layers.
+        heads: of attention in each layer; they share the width.
+        feedforward: width of the hidden layer in each encoder layer.
+        dropout: share of values dropped in training, as everywhere in torch's encoder layer.
+        pooling: over the sensors: mean or max.
+
+    Raises:
+        InputError: not a graph, an unknown pooling, or a width that the heads cannot share.
+    """
+
+    takes: ClassVar[Kind] = "graph"
+
+    def __init__(
+        self,
+        kind: Kind,
+        shape: Sequence[int],
+        width: int = 64,
+        layers: int = 2,
+        heads: int = 4,
+        feedforward: int = 128,
+        dropout: float = 0.1,
+        pooling: Pooling = "mean",
+    ) -> None:
+        super().__init__(kind)
+        if pooling not in ("mean", "max"):
+            raise InputError(f"unknown pooling {pooling!r}: set model.pooling=mean or max")
+        self.tokens = nn.Linear(shape[-1], width)
+        self.encoder = encoder(width, heads, layers, feedforward, dropout, "model.width")
+        self.pooling, self.width = pooling, width
+
+    def forward(self, x: Tensor, adjacency: Tensor | None) -> Tensor:
+        """Return the embeddings (N, E) of graphs x (N, S, F); the adjacency is not used."""
+        tokens = self.encoder(self.tokens(x))
+        return tokens.amax(dim=1) if self.pooling == "max" else tokens.mean(dim=1)

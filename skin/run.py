@@ -54,7 +54,7 @@ def train(config: DictConfig) -> bool:
         return False
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
-    name = f"{config.row} {config.data.name} {config.seed}"
+    name = f"{config.row} {identity['simulator']} {config.seed}"
     with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         describe(store, run.info.run_id, config, data.touches("train"))
@@ -72,11 +72,12 @@ def train(config: DictConfig) -> bool:
 
 
 def tags(config: DictConfig) -> dict[str, str]:
-    """Return the tags by which a run is found again."""
+    """Return the tags by which a run is found again; without a simulator, its device stands in its place."""
+    device = config.device["_target_"].split(".")[-2]
     return {
         "fingerprint": fingerprint(config),
         "row": config.row,
-        "simulator": config.data.name,
+        "simulator": config.data.name if "simulator" in config.device else device,
         "seed": str(config.seed),
     }
 
@@ -94,8 +95,12 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
     store.client.set_tag(run, "data_hash", digest(touches))
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     choices = {group: config[group]["_target_"].split(".")[-2] for group in groups if group in config}
-    scalars = {"seed": config.seed, "row": config.row, "gestures": config.data.gestures}
-    for name, value in (choices | scalars | {"fresh": config.data.fresh}).items():
+    scalars = {"seed": config.seed, "row": config.row}
+    if "simulator" in config.device:
+        scalars |= {"gestures": config.data.gestures, "fresh": config.data.fresh}
+    else:
+        choices.pop("simulator", None)
+    for name, value in (choices | scalars).items():
         store.client.log_param(run, name, value)
 
 

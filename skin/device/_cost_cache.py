@@ -1,0 +1,76 @@
+"""Captures of CoST.csv, read once and kept on disk."""
+
+import hashlib
+import os
+import tempfile
+import warnings
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from skin.device._cost import CHANNELS, SOURCE, Captures, read
+from skin.errors import InputError
+from skin.simulator._operator import cache_folder
+
+__all__ = ["captures"]
+
+# Raise it when the meaning of a stored file changes.
+_FORMAT = 1
+
+
+def captures(path: Path, window: int) -> Captures:
+    """Return the captures of a file from the cache, or read it and keep what was read.
+
+    The cache's key is the file's content, so a changed file is read again. A folder that cannot be written to
+    costs a warning.
+
+    Args:
+        path: of CoST.csv.
+        window: frames per capture.
+
+    Raises:
+        InputError: no such file, or not in the corpus's format.
+    """
+    if not path.is_file():
+        raise InputError(f"no file {path}: download CoST.csv from {SOURCE} and add device.path=FILE")
+    try:
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    key = hashlib.sha256(f"{_FORMAT} {window} {content}".encode()).hexdigest()
+    stored = cache_folder(None) / f"cost-{key}.npz"
+    known = _load(stored, window)
+    if known is not None:
+        return known
+    found = read(path, window)
+    try:
+        _save(stored, found)
+    except OSError as error:
+        warnings.warn(f"captures cannot be kept in {stored.parent}: {error}", RuntimeWarning, stacklevel=2)
+    return found
+
+
+def _load(path: Path, window: int) -> Captures | None:
+    """Return the captures in a cache file, or None if there is none or anything about it is wrong."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = Captures(**{field.name: file[field.name] for field in fields(Captures)})
+    except Exception:  # Whatever a broken archive raises, the answer is the same: read the file anew.
+        return None
+    sound = found.counts.shape[1:] == (window, CHANNELS)
+    return found if sound and all(len(values) == len(found) for values in vars(found).values()) else None
+
+
+def _save(path: Path, found: Captures) -> None:
+    """Write a cache file whole or not at all: others may read or write it at the same time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **vars(found))
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 BUDGET ?= full
 SEEDS ?= 1
+PEERS := .venv-peers
 
 .DEFAULT_GOAL := help
-.PHONY: help install test check bench ui reproduce-table clean
+.PHONY: help install test check bench peers ui reproduce-table clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -31,6 +32,16 @@ check: $(READY)  ## lint, format and types
 bench: $(READY)  ## speed and memory, into results/bench.json
 	$(BIN)/python experiments/bench.py
 
+$(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --upgrade pip
+	$(PEERS)/bin/python -m pip install --constraint experiments/peers/constraints.txt \
+		--requirement experiments/peers/requirements.txt
+	touch $@
+
+peers: $(READY) $(PEERS)/.ready  ## LightGBM and aeon's ROCKETs on the same touches (SEEDS=3)
+	$(BIN)/python experiments/peers.py --seeds $(SEEDS)
+
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
@@ -39,4 +50,4 @@ reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke,
 	$(BIN)/python experiments/reproduce_table.py --budget $(BUDGET) --seeds $(SEEDS)
 
 clean:  ## remove what the targets made, but keep results and runs
-	rm -rf $(VENV) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs
+	rm -rf $(VENV) $(PEERS) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

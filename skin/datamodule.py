@@ -69,12 +69,12 @@ class TouchData(pl.LightningDataModule):
         """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
 
         Raises:
-            InputError: positions that change with time, (B, T, S, 3).
+            InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
         """
         if positions.ndim != 2:
             raise InputError(
-                "representations are built for sensors that stay in place, got positions per frame: "
-                "give one position (x, y, z) per sensor"
+                "representations are built for one layout, got positions per frame: give one position "
+                "(x, y, z) per sensor, and how far it moves as Touches.motion"
             )
         if self._known is None or not torch.equal(self._known[0], positions):
             self._known = (positions, self._make(positions, self.device.size).requires_grad_(False))
@@ -85,7 +85,7 @@ class TouchData(pl.LightningDataModule):
         if touches.labels is None:
             raise InputError("touches without labels cannot be learnt from: record them with labels")
         representation = self.representation_for(touches.positions.cpu()).to(touches.readings.device)
-        return representation(touches.readings, touches.valid), touches.labels
+        return representation.show(touches), touches.labels
 
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""

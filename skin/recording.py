@@ -22,6 +22,8 @@ class Touches:
         positions: (S, 3) or (B, T, S, 3), m: x right and y down from the upper left corner, z depth.
         labels: (B, L), 0 or 1, float; or None.
         rate: frames per second, Hz.
+        motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
+            None where nobody knows.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -32,6 +34,7 @@ class Touches:
     positions: Tensor
     labels: Tensor | None
     rate: float
+    motion: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.readings.ndim != 3 or self.valid.shape != self.readings.shape:
@@ -46,6 +49,8 @@ class Touches:
             raise ValueError(
                 f"positions must be (S, 3) or (B, T, S, 3), S = {sensors}, got {tuple(self.positions.shape)}"
             )
+        if self.motion is not None and tuple(self.motion.shape) != (batch, time, sensors, 3):
+            raise ValueError(f"motion must be (B, T, S, 3), S = {sensors}, got {tuple(self.motion.shape)}")
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
             raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
@@ -60,6 +65,7 @@ class Touches:
             self.positions if self.positions.ndim == 2 else self.positions[index],
             None if self.labels is None else self.labels[index],
             self.rate,
+            None if self.motion is None else self.motion[index],
         )
 
     def to(self, device: torch.device | str) -> "Touches":
@@ -139,6 +145,7 @@ def join(parts: Sequence[Recording]) -> Recording:
         readings=torch.cat([part.touches.readings for part in parts]),
         valid=torch.cat([part.touches.valid for part in parts]),
         labels=together(part.touches.labels for part in parts),
+        motion=together(part.touches.motion for part in parts),
     )
     return replace(
         first,

@@ -108,6 +108,11 @@ class Sheet:
         """Young's modulus of each cell over that of its layer, (layers, H, W), from the table up."""
         return factors(self.variation, self.variation_seed, (len(self.layers), *self.shape))
 
+    @property
+    def tension(self) -> float:
+        """Force along the sheet per width and strain, N/m: the layers' E h together, without variation."""
+        return sum(layer.material.young * layer.thickness for layer in self.layers)
+
     def stiffness(self, first: np.ndarray, second: np.ndarray, width: float) -> np.ndarray:
         """Return how stiff strips of the sheet between places are along themselves, (n,), N/m.
 

@@ -114,7 +114,7 @@ class Network(AbstractLearner):
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
                 part = touches[start : start + CHUNK].to(classifier.device)
-                frames = representation(part.readings, part.valid)
+                frames = representation.show(part)
                 parts.append(function(classifier, frames).cpu())
         return torch.cat(parts)
 

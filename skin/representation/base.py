@@ -5,6 +5,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor, nn
 
+from skin.recording import Touches
+
 __all__ = ["AbstractRepresentation", "Frames"]
 
 
@@ -35,3 +37,7 @@ class AbstractRepresentation(nn.Module, ABC):
     @abstractmethod
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return the frames of readings (B, T, S), N, and valid (B, T, S), bool."""
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches; what a touch tells beyond its readings is left aside."""
+        return self(touches.readings, touches.valid)

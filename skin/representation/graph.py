@@ -1,6 +1,6 @@
 """A graph with a sensor at each node and an edge between neighbours."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import torch
@@ -8,14 +8,17 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
+from skin.body.sheet import Sheet
 from skin.errors import InputError
+from skin.recording import Touches
 from skin.representation._channels import channels
 from skin.representation.base import AbstractRepresentation, Frames
 
-__all__ = ["Graph", "adjacency", "neighbours", "normalised"]
+__all__ = ["Graph", "adjacency", "neighbours", "normalised", "self_share", "typical_distance"]
 
 Edges = Literal["knn", "delaunay"]
-Weight = Literal["exp", "distance", "none"]
+Weight = Literal["exp", "distance", "stiffness", "none"]
+Positions = Literal["layout", "deformed"]
 
 
 def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarray:
@@ -49,22 +52,55 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
     return linked | linked.T
 
 
-def adjacency(positions: np.ndarray, linked: np.ndarray, weight: Weight) -> np.ndarray:
+def typical_distance(positions: np.ndarray) -> float:
+    """Return d0, the median distance from a sensor of (S, 3), m, to its nearest neighbour, m."""
+    distance = cdist(positions, positions)
+    return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
+
+
+def adjacency(
+    positions: np.ndarray, linked: np.ndarray, weight: Weight, body: Sheet | None = None
+) -> np.ndarray:
     """Return the weights (S, S) of the edges ``linked``; 0 where there is none.
 
-    With d the distance and d0 the median distance to the nearest neighbour: ``exp`` is exp(-d / d0),
-    ``distance`` is d / d0 (the report's edge value, free of the unit of length), ``none`` is 1.
+    With d the distance and d0 the typical one (:func:`typical_distance`): ``exp`` is exp(-d / d0),
+    ``distance`` is d / d0 (the report's edge value, free of the unit of length), ``none`` is 1. ``stiffness``
+    is that of the strip of skin between the two sensors, k = E h w / d summed over layers and averaged along
+    the line between them where the modulus varies, over that of a strip of length d0 in a skin without
+    variation ("other physical information", report, 2.2.1): d0 / d in a skin of uniform layers, whatever w.
+
+    Args:
+        positions: (S, 3), m.
+        linked: (S, S), bool, symmetric.
+        weight: see above.
+        body: the sheet; only ``stiffness`` needs it.
 
     Raises:
-        InputError: an unknown weight.
+        InputError: an unknown weight, or stiffness without a body.
     """
-    if weight not in ("exp", "distance", "none"):
-        raise InputError(f"unknown edge weight {weight!r}: set representation.weight=exp, distance or none")
+    if weight not in get_args(Weight):
+        raise InputError(
+            f"unknown edge weight {weight!r}: set representation.weight=exp, distance, stiffness or none"
+        )
     if weight == "none" or not linked.any():
         return linked.astype(float)
+    unit = typical_distance(positions)
+    if weight == "stiffness":
+        return _stiffness(positions, linked, unit, body)
     distance = cdist(positions, positions)
-    unit = np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1))
     return linked * (np.exp(-distance / unit) if weight == "exp" else distance / unit)
+
+
+def _stiffness(positions: np.ndarray, linked: np.ndarray, unit: float, body: Sheet | None) -> np.ndarray:
+    if body is None:
+        raise InputError(
+            "representation.weight=stiffness needs to know the skin: set representation.body=${body}, "
+            "or representation.weight=exp"
+        )
+    first, second = np.nonzero(linked)
+    weights = np.zeros(linked.shape)
+    weights[first, second] = body.stiffness(positions[first], positions[second], width=unit) / body.tension
+    return (weights + weights.T) / 2
 
 
 def normalised(edges: np.ndarray) -> np.ndarray:
@@ -77,20 +113,34 @@ def normalised(edges: np.ndarray) -> np.ndarray:
     return looped / np.outer(root, root)
 
 
+def self_share(adjacency: Tensor) -> float:
+    """Return which share of its row a node of a normalised adjacency (..., S, S) is itself, on average.
+
+    Near 1 the graph hardly mixes neighbours, near 1 / S it mixes all.
+    """
+    return float(adjacency.diagonal(dim1=-2, dim2=-1).mean())
+
+
 class Graph(AbstractRepresentation):
     """Makes a sensor a node and links neighbours (report, section 2.2).
 
-    Needs nothing but positions, so it carries to any layout and any number of sensors. The layout is the same
-    for a whole batch, so the graph is one dense matrix, normalised once.
+    Needs nothing but positions, so it carries to any layout and any number of sensors. The graph is one dense
+    matrix, normalised once and common to all frames, unless ``positions=deformed`` asks for one per frame
+    (report, section 4.2). Which sensors are linked follows from the layout in any case: neighbours in the
+    material stay neighbours, and an edge that came and went would be a jump. So does the unit d0.
 
     Args:
-        positions: (S, 3), m.
-        size: extent (x, y) of the sheet, m; not used.
+        layout: (S, 3), m; by position.
+        size: extent (x, y) of the sheet, m; by position.
         edges: ``knn`` or ``delaunay``; see :func:`neighbours`.
         count: number of nearest neighbours under ``knn``.
-        weight: ``exp``, ``distance`` or ``none``; see :func:`adjacency`.
+        weight: ``exp``, ``distance``, ``stiffness`` or ``none``; see :func:`adjacency`.
+        positions: from where distances are taken: ``layout``, or ``deformed``, where the skin has taken the
+            sensors in each frame. That needs touches that tell it, and a fusion that takes a graph per frame.
+        coordinates: append x / size_x and y / size_y as the last two node features of every frame.
         scale: N; readings are divided by it.
         mask: append a node feature that tells whether the reading is valid.
+        body: the sheet as it is believed to be; only ``weight=stiffness`` needs it.
 
     Raises:
         InputError: an unknown option, or sensors of which the graph cannot be made.
@@ -98,23 +148,92 @@ class Graph(AbstractRepresentation):
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "graph"
     adjacency: Tensor
+    layout: Tensor
+    size: Tensor
+    pairs: Tensor
+    at_rest: Tensor
 
     def __init__(
         self,
-        positions: Tensor,
+        layout: Tensor,
         size: tuple[float, float],
+        /,
         edges: Edges = "knn",
         count: int = 6,
         weight: Weight = "exp",
+        positions: Positions = "layout",
+        coordinates: bool = False,
         scale: float = 10.0,
         mask: bool = False,
+        body: Sheet | None = None,
     ) -> None:
         super().__init__()
-        self.scale, self.mask = scale, mask
-        places = positions.cpu().numpy().astype(float)
-        matrix = normalised(adjacency(places, neighbours(places, edges, count), weight))
-        self.register_buffer("adjacency", torch.from_numpy(matrix).to(torch.float32))
+        self.scale, self.mask, self.coordinates = scale, mask, coordinates
+        self.weight, self.positions = weight, _checked(positions, weight, coordinates)
+        places = layout.cpu().numpy().astype(float)
+        weights = adjacency(places, neighbours(places, edges, count), weight, body)
+        first, second = np.nonzero(np.triu(weights))
+        # Without a second sensor there is no distance, and no edge that would need one.
+        self.unit = typical_distance(places) if len(places) > 1 else 1.0
+        self.register_buffer("adjacency", torch.from_numpy(normalised(weights)).to(torch.float32))
+        self.register_buffer("layout", torch.from_numpy(places).to(torch.float32))
+        self.register_buffer("size", torch.tensor(size, dtype=torch.float32))
+        self.register_buffer("pairs", torch.from_numpy(np.stack([first, second])))
+        distance = np.linalg.norm(places[first] - places[second], axis=1)
+        self.register_buffer("at_rest", torch.from_numpy(weights[first, second] * distance).float())
 
-    def forward(self, readings: Tensor, valid: Tensor) -> Frames:
-        """Return frames (B, T, S, C) and the adjacency (S, S) of readings (B, T, S), N."""
-        return Frames(channels(readings, valid, self.scale, self.mask), self.adjacency)
+    def forward(self, readings: Tensor, valid: Tensor, motion: Tensor | None = None) -> Frames:
+        """Return frames (B, T, S, F) and the adjacency (S, S) or (B, T, S, S) of readings (B, T, S), N.
+
+        Args:
+            readings: (B, T, S), N.
+            valid: (B, T, S), bool.
+            motion: (B, T, S, 3), m, how far each sensor is from its place in the layout; only
+                ``positions=deformed`` needs it.
+
+        Raises:
+            InputError: the motion is needed and nobody knows it.
+        """
+        places, matrix = self.layout, self.adjacency
+        if self.positions == "deformed":
+            if motion is None:
+                raise InputError(
+                    "representation.positions=deformed needs touches that tell where the sensors go: add "
+                    "device.track=true simulator.constraint=free, or set representation.positions=layout"
+                )
+            places = self.layout + motion
+            matrix = self.adjacency if self.weight == "none" else self._adjacency_at(places)
+        x = channels(readings, valid, self.scale, self.mask)
+        if self.coordinates:
+            where = (places[..., :2] / self.size).to(x.dtype).expand(*x.shape[:-1], 2)
+            x = torch.cat([x, where], dim=-1)
+        return Frames(x, matrix)
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches, with the sensors where the touches say that they are."""
+        return self(touches.readings, touches.valid, touches.motion)
+
+    def _adjacency_at(self, places: Tensor) -> Tensor:
+        """Return the normalised adjacency (B, T, S, S) of sensors at places (B, T, S, 3), m."""
+        first, second = self.pairs
+        distance = (places.index_select(-2, first) - places.index_select(-2, second)).norm(dim=-1)
+        if self.weight == "stiffness":
+            weights = self.at_rest / distance
+        else:
+            share = distance / self.unit
+            weights = (-share).exp() if self.weight == "exp" else share
+        looped = torch.eye(places.shape[-2], device=places.device).expand(*places.shape[:-1], -1).clone()
+        looped[..., first, second] = looped[..., second, first] = weights
+        root = looped.sum(dim=-1).sqrt()
+        return looped / (root[..., :, None] * root[..., None, :])
+
+
+def _checked(positions: Positions, weight: Weight, coordinates: bool) -> Positions:
+    if positions not in get_args(Positions):
+        raise InputError(f"unknown positions {positions!r}: set representation.positions=layout or deformed")
+    if positions == "deformed" and weight == "none" and not coordinates:
+        raise InputError(
+            "representation.positions=deformed changes nothing at representation.weight=none: set "
+            "representation.weight=exp, or representation.positions=layout"
+        )
+    return positions

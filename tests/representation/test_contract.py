@@ -9,15 +9,19 @@ from omegaconf import OmegaConf
 
 from skin.errors import InputError
 
-OPTIONS = sorted((Path(__file__).parents[2] / "conf" / "representation").glob("*.yaml"))
+CONF = Path(__file__).parents[2] / "conf"
+OPTIONS = sorted((CONF / "representation").glob("*.yaml"))
 VARIANTS = [
     (path, extra)
     for path in OPTIONS
     for extra in (
         {},
-        *({"interp": [{"method": "nearest"}, {"method": "cubic"}], "graph": [{"edges": "delaunay"}]}).get(
-            path.stem, []
-        ),
+        *(
+            {
+                "interp": [{"method": "nearest"}, {"method": "cubic"}],
+                "graph": [{"edges": "delaunay"}, {"weight": "stiffness"}],
+            }
+        ).get(path.stem, []),
     )
 ]
 
@@ -25,7 +29,9 @@ VARIANTS = [
 @pytest.fixture(params=VARIANTS, ids=lambda v: "-".join([v[0].stem, *v[1].values()]))
 def make(request):
     path, extra = request.param
-    return lambda *args, **changes: instantiate(OmegaConf.load(path), **extra)(*args, **changes)
+    around = {"body": OmegaConf.load(CONF / "body" / "sheet.yaml"), "option": OmegaConf.load(path)}
+    option = OmegaConf.to_container(OmegaConf.create(around), resolve=True)["option"]
+    return lambda *args, **changes: instantiate(option, **extra)(*args, **changes)
 
 
 @pytest.fixture

@@ -40,6 +40,7 @@ class Data:
     padded: bool
     fresh: bool
     batch_size: int
+    stream: bool = False  # runs of old have none
 
 
 @dataclass
@@ -88,6 +89,7 @@ class Config:
     run: str | None = None
     n: int | None = None
     out: str | None = field(default=None)
+    embeddings: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

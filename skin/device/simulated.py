@@ -1,8 +1,6 @@
 """A simulated skin: sampled gestures, a simulator, and the imperfections of a device."""
 
-import math
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,17 +9,19 @@ import torch
 
 from skin import __version__
 from skin.body.sheet import Sheet
+from skin.device._threads import in_threads
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.imperfection import Imperfection
-from skin.labels import TOUCH
+from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout, Sensors
 from skin.recording import Recording, Touches, join
 from skin.simulator.base import AbstractSimulator
 from skin.streams import Stream, generator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
-from skin.touch.sampler import TouchSampler, balanced
+from skin.touch.sampler import Movie, TouchSampler, balanced
+from skin.touch.stream import Strip, draw_timeline
 
 __all__ = ["Simulated"]
 
@@ -44,6 +44,9 @@ class Simulated(AbstractDevice):
         test_gestures: how many gestures ``test`` has.
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
+        stream: touches are windows, cut at random strides from streams of gestures with idle gaps between
+            them: a window shows part of a gesture, a whole one or none, and has the label ``touch`` too.
+            ``gestures`` and ``test_gestures`` then count windows. Every split has streams of its own.
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
         gain_spread, offset, noise, clip, dead, tare: as in :class:`skin.imperfection.Imperfection`.
@@ -64,6 +67,7 @@ class Simulated(AbstractDevice):
     test_gestures: int = 4000
     padded: bool = True
     fresh: bool = False
+    stream: bool = False
     data_seed: int = 0
     seed: int = 0
     gain_spread: float = 0.05
@@ -82,7 +86,7 @@ class Simulated(AbstractDevice):
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not self.rate > 0:
             raise InputError(f"device.rate must be above 0 Hz, got {self.rate}: as in device.rate=10")
-        self.task, self.size = TOUCH, self.body.size
+        self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         true = self._true_sensors()
         self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded)
@@ -126,6 +130,8 @@ class Simulated(AbstractDevice):
         training = round(0.8 * self.gestures)
         if split == "train" and self.fresh:
             return self._draw(complete, Stream.FRESH, training, self.data_seed, epoch)
+        if self.stream:
+            return self._streams(split, complete)
         budget = self._keep("budget", complete, Stream.BUDGET, self.gestures, self.data_seed)
         if split is None:
             return budget
@@ -133,6 +139,17 @@ class Simulated(AbstractDevice):
         bounds = {"train": (0, training), "validation": (training, middle), "holdout": (middle, None)}
         order = generator(Stream.SPLIT, self.data_seed).permutation(self.gestures)
         return budget[torch.from_numpy(order[slice(*bounds[split])])]
+
+    def _streams(self, split: Split | None, complete: bool) -> Recording:
+        """Return the windows of a split of the budget: they overlap, so no stream is split."""
+        training = round(0.8 * self.gestures)
+        middle = (self.gestures - training) // 2
+        counts: dict[Split, int] = {"train": training, "validation": middle}
+        counts["holdout"] = self.gestures - training - middle
+        if split is None:
+            return join([self._streams(name, complete) for name in counts])
+        number = list(counts).index(split)
+        return self._keep(split, complete, Stream.BUDGET, counts[split], self.data_seed, number)
 
     def _keep(self, name: str, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
         if complete:
@@ -142,30 +159,74 @@ class Simulated(AbstractDevice):
         return self._kept[name]
 
     def _draw(self, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
-        """Draw gestures in batches; ``complete`` adds the displacements."""
+        """Draw gestures or windows in batches; ``complete`` adds the displacements."""
+        parts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
+        if self.stream:
+            return join(
+                in_threads(lambda n: self._windows(parts[n], complete, stream, (*key, n)), len(parts))
+            )
         wanted = balanced(count, generator(stream, *key, 0))
-        parts = _in_threads(
-            lambda number: self._batch(
-                wanted[number * _BATCH : (number + 1) * _BATCH], complete, stream, (*key, 1 + number)
-            ),
-            math.ceil(count / _BATCH),
+        return join(
+            in_threads(lambda n: self._batch(wanted[parts[n]], complete, stream, (*key, 1 + n)), len(parts))
         )
-        return join(parts)
 
     @torch.no_grad()
     def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
         movie = self.sampler.sample(len(wanted), generator(stream, *key), wanted)
-        true, displacement = movie.respond(self.model, displacement=complete)
-        noise = generator(Stream.NOISE, self.seed, stream, *key)
-        constants = self.constants
+        return self._felt(self._true(movie, complete), generator(Stream.NOISE, self.seed, stream, *key))
+
+    @torch.no_grad()
+    def _windows(self, part: slice, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
+        """Cut as many windows from a stream as ``part`` is long."""
+        draw, noise = generator(stream, *key), generator(Stream.NOISE, self.seed, stream, *key)
+        settings, count = self.sampler.settings, part.stop - part.start
+        starts = np.cumsum(draw.integers(*settings.stride, count, endpoint=True)) - settings.stride[0]
+        length = int(starts[-1]) + self.window
+        timeline = draw_timeline(self.sampler, length, settings.gap, draw)
+        true = Strip.of(timeline, self._true(timeline.movie, complete), self.task)
         if self.randomise:
-            constants = self.imperfection.constants(len(self.sensors), noise, len(wanted))
-        readings, valid = self.imperfection.apply(true, constants, noise)
-        parameters = movie.parameters | {"clipped": self.imperfection.clipped(true, constants).float()}
+            return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
+        return self._felt_strip(true, noise).cut(torch.from_numpy(starts), self.window)
+
+    @torch.no_grad()
+    def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Strip:
+        """Return a test stream in one piece, to be cut as one likes; one device feels all of it.
+
+        Args:
+            frames: its length.
+            gap: [least, most] idle frames between two touches; None: as ``touch.gap``.
+            number: of the stream: another number, other gestures.
+        """
+        if self.randomise:
+            return self.replace(randomise=False).strip(frames, gap, number)
+        key = Stream.TEST, 1, number
+        timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
+        true = Strip.of(timeline, self._true(timeline.movie, complete=False), TOUCH_OR_NOT)
+        return self._felt_strip(true, generator(Stream.NOISE, self.seed, *key))
+
+    def _felt_strip(self, true: Strip, noise: np.random.Generator) -> Strip:
+        frames = true.whole.touches.readings[0, :, None]
+        clipped = self.imperfection.clipped(frames, self.constants)
+        return Strip(true.timeline, self._felt(true.whole, noise), clipped)
+
+    def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
+        """Return true readings as the device tells them."""
+        force, constants = true.touches.readings, self.constants
+        if self.randomise:
+            constants = self.imperfection.constants(len(self.sensors), noise, len(true))
+        readings, valid = self.imperfection.apply(force, constants, noise)
+        clipped = {"clipped": self.imperfection.clipped(force, constants).float()}
+        touches = replace(true.touches, readings=readings, valid=valid)
+        return replace(true, touches=touches, parameters=true.parameters | clipped)
+
+    def _true(self, movie: Movie, complete: bool) -> Recording:
+        """Return the readings of gestures before any imperfection."""
+        readings, displacement = movie.respond(self.model, displacement=complete)
         positions = torch.from_numpy(self.sensors.positions).float()
+        valid = torch.ones_like(readings, dtype=torch.bool)
         touches = Touches(readings, valid, positions, movie.labels, float(self.rate))
         about = self.task, self.size, self.sensors.footprint
-        return Recording(touches, *about, movie.force, displacement, parameters)
+        return Recording(touches, *about, movie.force, displacement, movie.parameters)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
         return {
@@ -176,21 +237,14 @@ class Simulated(AbstractDevice):
             "device_seed": self.seed,
             "data_seed": self.data_seed,
             "shapes": list(self.sampler.shapes.names),
-            "summary": summarise(recording, self.body),
+            "summary": summarise(_touched(recording), self.body),
             "versions": {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__},
         }
 
 
-def _in_threads(work: Callable[[int], Any], count: int) -> list[Any]:
-    """Return what ``work`` makes of 0, 1, ... count - 1, on as many threads as torch has.
-
-    Each works alone: batches share nothing, and their many small products lose more by waiting for each
-    other than they gain by being split. So the result is the same to the last bit on any number of threads.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(work, range(count)))
-    finally:
-        torch.set_num_threads(threads)
+def _touched(recording: Recording) -> Recording:
+    """Return what shows a touch: all, unless the labels say otherwise."""
+    labels, gate = recording.touches.labels, recording.task.gate
+    if labels is None or gate is None:
+        return recording
+    return recording[labels[:, recording.task.names.index(gate)] > 0.5]

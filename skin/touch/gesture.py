@@ -42,6 +42,8 @@ class GestureSettings:
     spare: float = 0.010
     ramp: int = 3
     redraws: int = 30
+    gap: tuple[int, int] = (10, 60)
+    stride: tuple[int, int] = (15, 45)
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     @classmethod
@@ -80,6 +82,16 @@ class GestureSettings:
         for name, low in (("path", 0), ("spare", 0), ("ramp", 2), ("redraws", 1)):
             if getattr(self, name) < low:
                 raise InputError(f"touch.{name} must be at least {low}, got {getattr(self, name)}")
+        for name in ("gap", "stride"):
+            given = getattr(self, name)
+            if (
+                len(given) != 2
+                or any(value != int(value) for value in given)
+                or not 1 <= given[0] <= given[1]
+            ):
+                raise InputError(
+                    f"touch.{name} must be a range [least, most] of whole frames from 1 up, got {list(given)}"
+                )
         if self.tap[1] < 2:
             raise InputError(
                 f"a touch slides over at least 2 frames, got touch.tap={list(self.tap)}: use [1,3]"

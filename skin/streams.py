@@ -20,6 +20,7 @@ class Stream(IntEnum):
     NOISE = 6
     POSITION = 7
     MODULUS = 8
+    TRACKING = 9
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

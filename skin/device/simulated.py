@@ -10,6 +10,7 @@ import torch
 from skin import __version__
 from skin.body.sheet import Sheet
 from skin.device._threads import in_threads
+from skin.device._tracking import tracker
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.imperfection import Imperfection
@@ -54,6 +55,8 @@ class Simulated(AbstractDevice):
         position_error: standard deviation of the true sensors' places about the layout along x and y, m; the
             touches report the layout.
         rate: frames per second, Hz.
+        track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``true`` (an oracle)
+            or ``estimated`` from their readings. The last two need sensors that move along the sheet.
 
     Raises:
         InputError: settings that cannot be used.
@@ -79,6 +82,7 @@ class Simulated(AbstractDevice):
     tare: bool = False
     randomise: bool = False
     rate: float = 10.0
+    track: str = "none"
 
     def __post_init__(self) -> None:
         for name, least in (("gestures", 10), ("test_gestures", 1), ("position_error", 0)):
@@ -98,6 +102,7 @@ class Simulated(AbstractDevice):
         self.constants = self.imperfection.constants(
             len(self.sensors), generator(Stream.CONSTANTS, self.seed)
         )
+        self.tracker = tracker(self.track, self)
         self._kept: dict[str, Recording] = {}
 
     def _true_sensors(self) -> Sensors:
@@ -217,14 +222,15 @@ class Simulated(AbstractDevice):
         readings, valid = self.imperfection.apply(force, constants, noise)
         clipped = {"clipped": self.imperfection.clipped(force, constants).float()}
         touches = replace(true.touches, readings=readings, valid=valid)
-        return replace(true, touches=touches, parameters=true.parameters | clipped)
+        return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
 
     def _true(self, movie: Movie, complete: bool) -> Recording:
         """Return the readings of gestures before any imperfection."""
         readings, displacement = movie.respond(self.model, displacement=complete)
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
-        touches = Touches(readings, valid, positions, movie.labels, float(self.rate))
+        motion = self.tracker.known(movie)
+        touches = Touches(readings, valid, positions, movie.labels, float(self.rate), motion)
         about = self.task, self.size, self.sensors.footprint
         return Recording(touches, *about, movie.force, displacement, movie.parameters)
 

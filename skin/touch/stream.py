@@ -158,7 +158,13 @@ class Strip:
         valid = torch.ones_like(readings, dtype=torch.bool)
         whole = replace(
             gestures,
-            touches=replace(gestures.touches, readings=readings, valid=valid, labels=None),
+            touches=replace(
+                gestures.touches,
+                readings=readings,
+                valid=valid,
+                labels=None,
+                motion=along(gestures.touches.motion),
+            ),
             task=task,
             force=along(gestures.force),
             displacement=along(gestures.displacement),
@@ -186,7 +192,11 @@ class Strip:
         return replace(
             whole,
             touches=replace(
-                felt, readings=felt.readings[0][frames], valid=felt.valid[0][frames], labels=labels
+                felt,
+                readings=felt.readings[0][frames],
+                valid=felt.valid[0][frames],
+                labels=labels,
+                motion=windows(felt.motion),
             ),
             force=windows(whole.force),
             displacement=windows(whole.displacement),

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
@@ -130,7 +131,7 @@ def _describe(recording: Recording) -> dict[str, Any]:
         "positions": touches.positions.tolist(),
         "footprint": list(recording.footprint),
         "size": list(recording.size),
-        "task": {"names": list(recording.task.names), "kind": recording.task.kind},
+        "task": asdict(recording.task),
         "labelled": touches.labels is not None,
         "force": recording.force is not None,
         "displacement": recording.displacement is not None,
@@ -205,7 +206,7 @@ def _recording(table: pa.Table, about: dict[str, Any], path: Path) -> Recording:
     def columns(name: str) -> Tensor:
         return torch.stack([column(one) for one in _numbered(name, sensors)], dim=-1)
 
-    task = Task(tuple(about["task"]["names"]), about["task"]["kind"])
+    task = Task(**about["task"] | {"names": tuple(about["task"]["names"])})
     present = [table[name].is_valid().to_numpy() for name in _numbered("reading", sensors)]
     touches = Touches(
         columns("reading"),

@@ -188,7 +188,7 @@ class Simulated(AbstractDevice):
         starts = np.cumsum(draw.integers(*settings.stride, count, endpoint=True)) - settings.stride[0]
         length = int(starts[-1]) + self.window
         timeline = draw_timeline(self.sampler, length, settings.gap, draw)
-        true = Strip.of(timeline, self._true(timeline.movie, complete), self.task)
+        true = Strip.of(timeline, self._true(timeline.movie, complete))
         if self.randomise:
             return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
         return self._felt_strip(true, noise).cut(torch.from_numpy(starts), self.window)
@@ -206,7 +206,7 @@ class Simulated(AbstractDevice):
             return self.replace(randomise=False).strip(frames, gap, number)
         key = Stream.TEST, 1, number
         timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
-        true = Strip.of(timeline, self._true(timeline.movie, complete=False), TOUCH_OR_NOT)
+        true = Strip.of(timeline, self._true(timeline.movie, complete=False))
         return self._felt_strip(true, generator(Stream.NOISE, self.seed, *key))
 
     def _felt_strip(self, true: Strip, noise: np.random.Generator) -> Strip:
@@ -231,7 +231,7 @@ class Simulated(AbstractDevice):
         valid = torch.ones_like(readings, dtype=torch.bool)
         motion = self.tracker.known(movie)
         touches = Touches(readings, valid, positions, movie.labels, float(self.rate), motion)
-        about = self.task, self.size, self.sensors.footprint
+        about = TOUCH, self.size, self.sensors.footprint
         return Recording(touches, *about, movie.force, displacement, movie.parameters)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:

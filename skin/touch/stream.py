@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.labels import Task
+from skin.labels import TOUCH_OR_NOT
 from skin.recording import Recording
 from skin.touch.sampler import Movie, TouchSampler, join
 
@@ -133,7 +133,7 @@ class Strip:
 
     Attributes:
         timeline: what touches when.
-        whole: the stream as one touch of F frames, (1, F, ...), without labels.
+        whole: the stream as one touch of F frames, (1, F, ...), whose windows have labels, not itself.
         clipped: (F,), bool, frames in which a reading is clipped.
     """
 
@@ -142,13 +142,12 @@ class Strip:
     clipped: Tensor
 
     @classmethod
-    def of(cls, timeline: Timeline, gestures: Recording, task: Task) -> "Strip":
+    def of(cls, timeline: Timeline, gestures: Recording) -> "Strip":
         """Return the stream of gestures that were felt one by one.
 
         Args:
             timeline: when each of them touches.
             gestures: (G, T, ...), idle where nothing touches, so without noise or offset.
-            task: what the labels of its windows mean.
         """
 
         def along(values: Tensor | None) -> Tensor | None:
@@ -165,7 +164,7 @@ class Strip:
                 labels=None,
                 motion=along(gestures.touches.motion),
             ),
-            task=task,
+            task=TOUCH_OR_NOT,
             force=along(gestures.force),
             displacement=along(gestures.displacement),
             parameters={},

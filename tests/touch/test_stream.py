@@ -1,0 +1,213 @@
+"""Windows of streams against dense movies, frame by frame."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.sheet import Sheet
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.labels import TOUCH_OR_NOT, movie_labels
+from skin.layout.scattered import Scattered
+from skin.simulator.naive import Naive
+from skin.storage import read, write
+from skin.touch.gesture import GestureSettings
+from skin.touch.stream import Timeline
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+PERFECT = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
+
+
+def device(**changes) -> Simulated:
+    settings = {"simulator": Naive, "gestures": 200, "test_gestures": 150, "layout": Scattered(seed=0)}
+    return Simulated(body=BODY, stream=True, **(settings | changes))
+
+
+@pytest.fixture(scope="module")
+def dense():
+    """A strip of a perfect device with touches close together, and its dense movie (F, H, W)."""
+    strip = device(**PERFECT).strip(500, gap=[1, 25])
+    movie = strip.timeline.movie
+    pressure, onset = movie.pressure(), movie.parameters["onset"].long()
+    stream = torch.zeros(500, *BODY.shape)
+    owner = torch.full((500,), -1)
+    for number, (begin, end) in enumerate(zip(strip.timeline.begin, strip.timeline.end, strict=True)):
+        for frame in range(begin, min(end, 500)):
+            stream[frame] = pressure[number, onset[number] + frame - begin]
+            owner[frame] = number
+    return strip, stream, owner
+
+
+def test_a_window_reads_what_the_simulator_answers_to_its_frames(dense):
+    strip, stream, _ = dense
+    starts = torch.tensor([0, 7, 111, 470])
+    windows = strip.cut(starts, 30)
+    sensors = device().sensors
+    for start, readings, force in zip(starts, windows.touches.readings, windows.force, strict=True):
+        frames = stream[start : start + 30]
+        torch.testing.assert_close(readings, Naive(BODY, sensors)(frames).readings, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(force, frames.sum((1, 2)) * BODY.cell[0] * BODY.cell[1])
+
+
+@pytest.mark.parametrize("window", [5, 30, 60])
+def test_labels_and_shares_are_those_of_the_dense_movie(dense, window):
+    """Every window's gesture found by counting its frames; the whole gesture's labels from its own movie."""
+    strip, stream, owner = dense
+    movie = strip.timeline.movie
+    footprints = torch.from_numpy(BODY.footprints(device().sensors)).float()
+    whole = movie_labels(movie.pressure(), footprints, BODY.cell)
+    starts = torch.arange(500 - window + 1)
+    windows = strip.cut(starts, window)
+    touched = stream.flatten(1).amax(1) > 0
+    seen_parts = 0
+    for start, labels, share in zip(starts, windows.touches.labels, windows.parameters["share"], strict=True):
+        shown = owner[start : start + window]
+        if not touched[start : start + window].any():
+            assert labels.tolist() == [0] * 5
+            assert share == 0
+            continue
+        frames = torch.bincount(shown[shown >= 0])
+        most = int(frames.argmax())
+        assert labels.tolist() == [*whole[most].tolist(), 1]
+        duration = int((movie.pressure()[most].flatten(1).amax(1) > 0).sum())
+        assert share.item() == pytest.approx(int(frames[most]) / duration)
+        seen_parts += share < 1
+    assert seen_parts > 20
+
+
+def test_gaps_are_as_long_as_drawn_and_empty(dense):
+    strip, _, owner = dense
+    lengths = strip.timeline.begin[1:] - strip.timeline.end[:-1]
+    assert lengths.min() >= 1
+    assert lengths.max() <= 25
+    assert (strip.whole.touches.readings[0, owner < 0] == 0).all()
+    assert (owner[: int(strip.timeline.begin[0])] == -1).all()
+
+
+def test_what_else_is_known_of_a_window(dense):
+    strip, _, owner = dense
+    windows = strip.cut(torch.arange(0, 470, 7), 30)
+    known, touched = windows.parameters, windows.touches.labels[:, 4] == 1
+    assert windows.task == TOUCH_OR_NOT
+    assert known["peak"][touched].min() > 0
+    assert known["peak"].isnan().equal(~touched)
+    for start, onset, share in zip(range(0, 470, 7), known["onset"], known["share"], strict=True):
+        if share == 1:
+            assert owner[start + int(onset)] >= 0
+            assert owner[start + int(onset) - 1] != owner[start + int(onset)]
+
+
+def test_overlapping_windows_share_their_noise():
+    strip = device().strip(300)
+    one, other = strip.cut(torch.tensor([100, 110]), 30).touches.readings
+    assert torch.equal(one[10:], other[:-10])
+    idle = strip.whole.touches.readings[0][strip.whole.force[0] == 0]
+    assert idle.std(0).mean() == pytest.approx(0.05, rel=0.1)
+
+
+def test_clipped_frames_are_found():
+    plain = device(clip=3.0, noise=0.0, offset=0.0, gain_spread=0.0)
+    recording = plain.recording("test")
+    top = recording.touches.readings.amax((1, 2)) >= 3.0
+    assert torch.equal(recording.parameters["clipped"] == 1, top)
+    assert 0 < top.float().mean() < 1
+
+
+@pytest.fixture(scope="module")
+def plain() -> Simulated:
+    return device()
+
+
+def test_splits_have_their_sizes_and_streams_of_their_own(plain):
+    sizes = {"train": 160, "validation": 20, "holdout": 20, "test": 150}
+    peaks = {}
+    for split, size in sizes.items():
+        recording = plain.recording(split)
+        assert len(recording) == size
+        peaks[split] = set(recording.parameters["peak"].nan_to_num(0).tolist()) - {0.0}
+    for one in sizes:
+        for other in sizes:
+            assert one == other or not peaks[one] & peaks[other]
+    assert len(plain.recording()) == 200
+
+
+def test_no_training_draws_a_gesture_of_a_test_stream(plain):
+    test = set(plain.strip(3000).timeline.movie.parameters["peak"].tolist())
+    test |= set(plain.recording("test").parameters["peak"].tolist())
+    for seed in range(3):
+        assert not test & set(device(data_seed=seed).recording().parameters["peak"].tolist())
+
+
+def test_everything_comes_from_the_seeds(plain):
+    other, elsewhere = device(data_seed=1), device(seed=1)
+    assert torch.equal(plain.touches("test").readings, other.touches("test").readings)
+    assert not torch.equal(plain.touches("train").readings, other.touches("train").readings)
+    assert torch.equal(plain.touches("test").labels, elsewhere.touches("test").labels)
+    assert not torch.equal(plain.touches("test").readings, elsewhere.touches("test").readings)
+
+
+def test_the_number_of_threads_does_not_matter(monkeypatch):
+    monkeypatch.setattr("skin.device.simulated._BATCH", 64)
+    threads, readings = torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            readings.append(device().touches("train").readings)
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*readings)
+
+
+def test_fresh_streams_differ_by_epoch_in_train_alone():
+    fresh = device(fresh=True)
+    assert not torch.equal(fresh.touches("train", 0).readings, fresh.touches("train", 1).readings)
+    assert torch.equal(fresh.touches("test", 0).readings, fresh.touches("test", 1).readings)
+
+
+def test_randomise_gives_every_window_a_device():
+    touches = device(randomise=True, noise=0.0).touches("test")
+    idle = touches.readings[touches.labels[:, 4] == 0]
+    assert (idle.std(dim=1) < 1e-6).all()
+    assert (idle[:, 0].std(dim=0) > 0.02).all()
+    strip = device(randomise=True, noise=0.0).strip(200)
+    assert torch.equal(strip.whole.touches.readings, device(noise=0.0).strip(200).whole.touches.readings)
+
+
+def test_a_short_stream_may_be_all_gap():
+    windows = device().strip(40, gap=[1000, 2000]).cut(torch.arange(10), 30)
+    assert (windows.touches.labels == 0).all()
+
+
+def test_regular_strides():
+    strides = device(touch={"stride": [7, 7], "gap": [5, 9]}, noise=0.0, offset=0.0).recording("test")
+    force = strides.force
+    assert torch.equal(force[:-1, 7:], force[1:, :-7])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"gap": [0, 5]}, {"gap": [9, 5]}, {"stride": [0, 0]}, {"stride": [1.5, 2]}]
+)
+def test_ranges_are_whole_frames(wrong):
+    name = next(iter(wrong))
+    with pytest.raises(InputError, match=rf"touch.{name} must be a range"):
+        GestureSettings.of(wrong)
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_a_file_keeps_windows_and_their_gate(plain, tmp_path, suffix):
+    stored = read(write(plain.recording("holdout"), tmp_path / f"windows.{suffix}"))
+    assert stored.task == TOUCH_OR_NOT
+    assert torch.equal(stored.touches.labels, plain.touches("holdout").labels)
+    torch.testing.assert_close(
+        stored.parameters, plain.recording("holdout").parameters, equal_nan=True, rtol=0, atol=0
+    )
+
+
+def test_gestures_without_a_gap_are_refused(dense):
+    movie = dense[0].timeline.movie
+    with pytest.raises(ValueError, match="one frame apart"):
+        Timeline(movie, torch.from_numpy(np.arange(len(movie))), 500)

@@ -175,7 +175,7 @@ class Strip:
         """Return the windows (W, T, ...) of T = ``window`` frames that begin at ``starts`` (W,).
 
         Labels and ``share`` are as :class:`Look` has them. The other parameters are those of the gesture
-        shown, its onset counted from the window's first frame, and NaN without touch; but ``clipped`` is of
+        shown, its onset counted from the window's first frame, and 0 without touch; but ``clipped`` is of
         the frames of the window.
         """
         frames, gesture, share, labels = self.timeline.look(starts, window)
@@ -186,7 +186,7 @@ class Strip:
         whole, felt = self.whole, self.whole.touches
         known = {name: values[gesture] for name, values in self.timeline.movie.parameters.items()}
         known["onset"] = (self.timeline.begin[gesture] - starts).float()
-        shown = {name: values.where(gesture >= 0, torch.nan) for name, values in known.items()}
+        shown = {name: values.where(gesture >= 0, 0) for name, values in known.items()}
         own = {"clipped": self.clipped[frames].any(1).float(), "share": share.float()}
         return replace(
             whole,

@@ -94,7 +94,7 @@ def test_what_else_is_known_of_a_window(dense):
     known, touched = windows.parameters, windows.touches.labels[:, 4] == 1
     assert windows.task == TOUCH_OR_NOT
     assert known["peak"][touched].min() > 0
-    assert known["peak"].isnan().equal(~touched)
+    assert known["peak"][~touched].eq(0).all()
     for start, onset, share in zip(range(0, 470, 7), known["onset"], known["share"], strict=True):
         if share == 1:
             assert owner[start + int(onset)] >= 0
@@ -128,7 +128,7 @@ def test_splits_have_their_sizes_and_streams_of_their_own(plain):
     for split, size in sizes.items():
         recording = plain.recording(split)
         assert len(recording) == size
-        peaks[split] = set(recording.parameters["peak"].nan_to_num(0).tolist()) - {0.0}
+        peaks[split] = set(recording.parameters["peak"].tolist()) - {0.0}
     for one in sizes:
         for other in sizes:
             assert one == other or not peaks[one] & peaks[other]
@@ -139,7 +139,8 @@ def test_no_training_draws_a_gesture_of_a_test_stream(plain):
     test = set(plain.strip(3000).timeline.movie.parameters["peak"].tolist())
     test |= set(plain.recording("test").parameters["peak"].tolist())
     for seed in range(3):
-        assert not test & set(device(data_seed=seed).recording().parameters["peak"].tolist())
+        budget = set(device(data_seed=seed).recording().parameters["peak"].tolist())
+        assert test & budget <= {0.0}
 
 
 def test_everything_comes_from_the_seeds(plain):
@@ -202,9 +203,7 @@ def test_a_file_keeps_windows_and_their_gate(plain, tmp_path, suffix):
     stored = read(write(plain.recording("holdout"), tmp_path / f"windows.{suffix}"))
     assert stored.task == TOUCH_OR_NOT
     assert torch.equal(stored.touches.labels, plain.touches("holdout").labels)
-    torch.testing.assert_close(
-        stored.parameters, plain.recording("holdout").parameters, equal_nan=True, rtol=0, atol=0
-    )
+    torch.testing.assert_close(stored.parameters, plain.recording("holdout").parameters, rtol=0, atol=0)
 
 
 def test_gestures_without_a_gap_are_refused(dense):

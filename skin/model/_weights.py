@@ -1,0 +1,103 @@
+"""Files of trained weights: where they lie, and whether they fit."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from skin.errors import InputError
+
+__all__ = ["find", "load"]
+
+_ROOT = Path(__file__).parents[2]
+_OFFICIAL = "efficientnet_b0_rwightman-7f5810bc.pth"
+_SOURCE = f"https://download.pytorch.org/models/{_OFFICIAL}"
+_WAYS = "model.weights=random trains from scratch"
+
+
+def find(weights: str) -> Path:
+    """Return the file that ``model.weights`` stands for.
+
+    Args:
+        weights: a path, looked for in the working directory, then in the repository; or ``imagenet``:
+            torchvision's file of EfficientNet-B0 in ``hub/checkpoints`` of ``$TORCH_HOME``, where torchvision
+            itself would keep it.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    if weights == "imagenet":
+        folder = Path(torch.hub.get_dir()).expanduser() / "checkpoints"
+        # the official one first, then older or newer ones
+        named = [folder / _OFFICIAL, *sorted(folder.glob("efficientnet_b0*.pth"))]
+        missing = (
+            f"model.weights=imagenet needs {_OFFICIAL} in {folder}, which is not there: "
+            f"put it there from {_SOURCE}, or give model.weights=FILE.pth; {_WAYS}"
+        )
+    else:
+        path = Path(str(weights)).expanduser()
+        named = [path] if path.is_absolute() else [Path.cwd() / path, _ROOT / path]
+        looked = " and ".join(dict.fromkeys(map(str, named)))
+        missing = (
+            f"no weights file {weights}: looked for {looked}; "
+            f"give model.weights=FILE.pth or model.weights=imagenet; {_WAYS}"
+        )
+    found = next((path for path in named if path.is_file()), None)
+    if found is None:
+        raise InputError(missing)
+    return found
+
+
+def load(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
+    """Give a module the weights of a file, without running code that the file may hold.
+
+    Args:
+        module: takes all of them or none.
+        path: of a state dict.
+        spare: names that the file may hold and the module has no use for.
+
+    Raises:
+        InputError: the file cannot be read, is no state dict, or holds other weights than the module has.
+    """
+    given = {name: value for name, value in _read(path).items() if name not in spare}
+    wanted = module.state_dict()
+    _check(path, given, wanted)
+    module.load_state_dict(wanted | given)
+
+
+def _check(path: Path, given: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    # they count batches for a momentum that is not used; files older than torch 0.4.1 have none
+    missing = [name for name in wanted if name not in given and not name.endswith("num_batches_tracked")]
+    foreign = [name for name in given if name not in wanted]
+    if missing or foreign:
+        wrong = [_listed("lacks", missing), _listed("has the unknown", foreign)]
+        raise InputError(_unfit(path, " and ".join(filter(None, wrong))))
+    for name, value in given.items():
+        if value.shape != wanted[name].shape:
+            shapes = f"{tuple(value.shape)} where {tuple(wanted[name].shape)} is needed"
+            raise InputError(_unfit(path, f"has {name} of shape {shapes}"))
+        if not value.isfinite().all():
+            raise InputError(_unfit(path, f"has numbers in {name} that are not finite"))
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    try:
+        content = torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch raises nearly anything on a file that it cannot read
+        reason = str(error).strip().split("\n")[0] or type(error).__name__
+        raise InputError(f"cannot read the weights file {path}, get it again: {reason}") from error
+    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise InputError(_unfit(path, "is no state dict (names and tensors)"))
+    return content
+
+
+def _listed(verb: str, names: list[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"{verb} {', '.join(names[:3])}{more}" if names else ""
+
+
+def _unfit(path: Path, reason: str) -> str:
+    return (
+        f"the weights file {path} {reason}: model=efficientnet needs the state dict of "
+        f"torchvision's efficientnet_b0; {_WAYS}"
+    )

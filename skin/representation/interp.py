@@ -1,5 +1,6 @@
 """An image interpolated between the sensors."""
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -53,19 +54,19 @@ def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarr
 class Interpolation(AbstractRepresentation):
     """Fills the image between the sensors (report, section 2.2 and figure 4).
 
-    One precomputed matrix of (pixels * pixels, S), applied to whole batches. It guesses values where nothing
-    was measured: pleasant to look at; whether it helps a network is a question for the table.
+    One precomputed matrix of (pixels * pixels, S) per method, applied to whole batches. It guesses values
+    where nothing was measured: pleasant to look at; whether it helps a network is a question for the table.
 
     Args:
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m; the square image covers all of it.
-        method: nearest, linear or cubic; see :func:`weights`.
+        method: nearest, linear or cubic, see :func:`weights`; or several of them, each giving one channel.
         pixels: edge length of the image.
         scale: N; readings are divided by it.
-        mask: append the interpolated validity as a channel.
+        mask: append the interpolated validity, one channel per method.
 
     Raises:
-        InputError: an unknown method, too few sensors for it, or ``pixels`` below 8.
+        InputError: an unknown method, none at all, too few sensors for it, or ``pixels`` below 8.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "image"
@@ -75,17 +76,24 @@ class Interpolation(AbstractRepresentation):
         self,
         positions: Tensor,
         size: tuple[float, float],
-        method: Method = "linear",
+        method: Method | Sequence[Method] = "linear",
         pixels: int = 64,
         scale: float = 10.0,
         mask: bool = False,
     ) -> None:
         super().__init__()
         self.pixels, self.scale, self.mask = check_pixels(pixels), scale, mask
-        matrix = weights(positions[:, :2].cpu().numpy(), centres(size, pixels), method)
+        methods: Sequence = method if isinstance(method, list | tuple) else [method]
+        if not methods:
+            raise InputError("an image needs an interpolation, got none: set representation.method=linear")
+        points, targets = positions[:, :2].cpu().numpy(), centres(size, pixels)
+        matrix = np.concatenate([weights(points, targets, one) for one in methods])
         self.register_buffer("matrix", torch.from_numpy(matrix).to(torch.float32))
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
         values = channels(readings, valid, self.scale, self.mask).mT @ self.matrix.mT
-        return Frames(values.unflatten(-1, (self.pixels, self.pixels)), None)
+        images = values.unflatten(
+            -1, (-1, self.pixels, self.pixels)
+        )  # (B, T, readings or mask, methods, ...)
+        return Frames(images.flatten(2, 3), None)

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
+from hydra.utils import instantiate
 from scipy.spatial import Delaunay
 
 from skin.errors import InputError
 from skin.representation._pixels import centres
-from skin.representation.interp import weights
+from skin.representation.interp import Interpolation, weights
 
 SIZE = (0.16, 0.12)
 
@@ -62,3 +64,53 @@ def test_an_unknown_method_and_sensors_in_a_line_are_refused(points):
         weights(points, points, "quintic")
     with pytest.raises(InputError, match=r"got 3: set representation\.method=nearest"):
         weights(np.array([[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]), points, "linear")
+
+
+METHODS = ["nearest", "linear", "cubic"]
+
+
+@pytest.fixture
+def given(made_up_device):
+    touches = made_up_device.touches("test")[:3]
+    valid = touches.valid.clone()
+    valid[:, 4, 5] = False
+    return touches.positions, touches.readings, valid
+
+
+@pytest.mark.parametrize("pixels", [48, 64, 128])
+def test_several_methods_give_a_channel_each(given, pixels):
+    positions, readings, valid = given
+    together = Interpolation(positions, SIZE, METHODS, pixels)(readings, valid).x
+    assert together.shape == (3, 10, 3, pixels, pixels)
+    for channel, method in enumerate(METHODS):
+        alone = Interpolation(positions, SIZE, method, pixels)(readings, valid).x
+        torch.testing.assert_close(together[:, :, channel : channel + 1], alone)
+
+
+def test_the_mask_of_several_methods_follows_their_values(given):
+    positions, readings, valid = given
+    x = Interpolation(positions, SIZE, METHODS, mask=True)(readings, valid).x
+    plain = Interpolation(positions, SIZE, METHODS)
+    torch.testing.assert_close(x[:, :, :3], plain(readings, valid).x)
+    wanted = plain(10 * valid.float(), torch.ones_like(valid)).x
+    torch.testing.assert_close(x[:, :, 3:], wanted)
+    assert (wanted.amin(dim=(-2, -1)) < 0.5).sum() == 3 * 3  # in frame 4 of each touch, by each method
+
+
+def test_three_interpolations_feed_an_image_model_of_three_channels(configured, given):
+    positions, readings, valid = given
+    config = configured("representation=interp", "representation.method=[nearest,linear,cubic]", "model=cnn")
+    frames = instantiate(config.representation)(positions, SIZE)(readings, valid)
+    model = instantiate(config.model, repeat=1)("image", tuple(frames.x.shape[2:]))
+    assert model.convolutions[0].weight.shape[1] == 3
+    assert model(frames.x.flatten(0, 1), None).shape == (30, model.width)
+
+
+def test_bad_lists_of_methods_are_refused(given):
+    positions, _, _ = given
+    with pytest.raises(InputError, match=r"got none: set representation\.method=linear"):
+        Interpolation(positions, SIZE, [])
+    with pytest.raises(InputError, match="unknown interpolation 'quintic'"):
+        Interpolation(positions, SIZE, ["nearest", "quintic"])
+    with pytest.raises(InputError, match="unknown interpolation 3"):
+        Interpolation(positions, SIZE, 3)

@@ -142,6 +142,8 @@ def _check_header(path: Path) -> None:
     for number, (name, needed) in enumerate(zip(names, COLUMNS, strict=True), start=1):
         if name != needed:
             raise refusal(path, f"column {number} is called {name!r} instead of {needed!r}")
+    if not text.endswith("\n"):
+        raise refusal(path, "it has no rows")
 
 
 def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:

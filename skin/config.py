@@ -90,7 +90,6 @@ class Config:
     n: int | None = None
     out: str | None = field(default=None)
     embeddings: dict[str, Any] | None = None
-    embeddings: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

@@ -89,7 +89,10 @@ class Config:
     run: str | None = None
     n: int | None = None
     out: str | None = field(default=None)
+    rows: Any = None
+    stream: dict[str, Any] | None = None
     embeddings: dict[str, Any] | None = None
+    moving: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:
@@ -154,6 +157,8 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         composed = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(job)
 
         def main() -> None:
+            # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
+            sys.argv[1:] = [value.replace("=~/", f"={Path.home()}/", 1) for value in sys.argv[1:]]
             try:
                 composed()
             except SystemExit as stop:
@@ -213,4 +218,7 @@ def _file(name: str) -> Path | None:
 
 def _digest(name: str) -> str:
     path = _file(name)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path else ""
+    if path is None:
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

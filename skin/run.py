@@ -97,7 +97,11 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
     choices = {group: config[group]["_target_"].split(".")[-2] for group in groups if group in config}
     scalars = {"seed": config.seed, "row": config.row}
     if "simulator" in config.device:
-        scalars |= {"gestures": config.data.gestures, "fresh": config.data.fresh}
+        scalars |= {
+            "gestures": config.data.gestures,
+            "fresh": config.data.fresh,
+            "stream": config.data.stream,
+        }
     else:
         choices.pop("simulator", None)
     for name, value in (choices | scalars).items():

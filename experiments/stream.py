@@ -1,0 +1,36 @@
+"""Try finished runs on windows that slide over streams of touches: python experiments/stream.py run=latest
+
+rows=all takes the newest finished runs of every row on simulator=, on whole touches and on windows of streams
+(train.py data.stream=true) each. What was tried before is brought back from MLflow.
+"""
+
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from skin.config import ROOT, command, plain
+
+
+@command("stream")
+def main(config: DictConfig) -> None:
+    """Slide a window over streams for each run; print a line, write its files, log both beside the run."""
+    from skin.console import quiet
+    from skin.reload import find
+    from skin.results.sliding_runs import newest, try_run
+    from skin.sliding import Course
+    from skin.tracking import Store
+
+    quiet()
+    course = Course(**plain(config)["stream"])
+    store = Store.open(config.tracking)
+    runs = newest(store, config.data.name, config.rows) if config.rows else [find(store, config.run)]
+    overrides = HydraConfig.get().overrides.task
+    for run in runs:
+        print(
+            try_run(store, run, config, course, overrides, ROOT / Path(config.out).expanduser()), flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()

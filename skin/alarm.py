@@ -1,0 +1,59 @@
+"""What comes of saying "dangerous" at every moment: touches found, and false alarms by the hour."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["Alarms", "count_alarms"]
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """The alarms while a window slid over a stream.
+
+    Attributes:
+        idle_hours: time in which the window showed no touch.
+        false: alarms that began in that time; one that lasts counts once.
+        dangerous: dangerous touches of the stream.
+        found: those that raised an alarm while the window showed them.
+        safe: safe touches of the stream.
+        raised: those that raised an alarm.
+    """
+
+    idle_hours: float
+    false: int
+    dangerous: int
+    found: int
+    safe: int
+    raised: int
+
+    @property
+    def per_hour(self) -> float:
+        """False alarms per hour without touch."""
+        return self.false / self.idle_hours if self.idle_hours else float("nan")
+
+
+def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float) -> Alarms:
+    """Count the alarms of W windows, one after another.
+
+    Args:
+        alarm: (W,), bool.
+        gesture: (W,), the touch that each window shows, as a row of ``dangerous``; -1: none.
+        dangerous: (G,), bool, of each touch.
+        hours: from one window to the next.
+    """
+    idle = gesture < 0
+    wrong = alarm & idle
+    began = wrong & ~torch.cat([torch.zeros(1, dtype=torch.bool), wrong[:-1]])
+    shown, raised = torch.zeros(2, len(dangerous), dtype=torch.bool)
+    shown[gesture[~idle]] = True
+    raised[gesture[alarm & ~idle]] = True
+    return Alarms(
+        idle_hours=float(idle.sum()) * hours,
+        false=int(began.sum()),
+        dangerous=int((shown & dangerous).sum()),
+        found=int((raised & dangerous).sum()),
+        safe=int((shown & ~dangerous).sum()),
+        raised=int((raised & ~dangerous).sum()),
+    )

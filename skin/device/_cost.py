@@ -127,7 +127,7 @@ def _words(error: Exception) -> str:
         column, line, value = found.groups()
         return f"line {line} has {value} for {COLUMNS[int(column)]}, not a whole number"
     if found := re.search(r"Row #(\d+): Expected \d+ columns, got (\d+)", text):
-        return f"line {found[1]} has {found[2]} columns, not {len(COLUMNS)}; was it cut off?"
+        return f"line {found[1]} has {found[2]} columns, not {len(COLUMNS)}, as if cut off"
     return text
 
 

@@ -1,45 +1,64 @@
 """Compare two rows over paired seeds: python experiments/paired.py sequence_image:fem temporal_image:fem
 
-Each is ``row:simulator`` or ``row:simulator:column``, with a column of
-the evaluation: same, holdout, device_shift or unseen_layout.
+Each is ``row:simulator`` or ``row:simulator:column``, with a column of the evaluation: same, holdout,
+device_shift or unseen_layout. Runs of the row's present settings count, with the overrides that follow.
 """
 
 import argparse
 import sys
-from statistics import fmean, stdev
+from collections.abc import Sequence
+from statistics import fmean
 
-from benchmarks.setting import configuration
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 
-from skin.tracking import Store
+from skin.config import CONF, checked, fingerprint
+from skin.errors import InputError
+from skin.results.study import FEWEST, paired
 
 
 def main() -> None:
     """Print both means, their difference and its standard error; exit code 2 without paired seeds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("one")
     parser.add_argument("other")
-    arguments = parser.parse_args()
-    store = Store.open(configuration().tracking)
-    one, other = _overall(store, arguments.one), _overall(store, arguments.other)
-    seeds = sorted(one.keys() & other.keys())
-    if len(seeds) < 2:
-        print(f"{len(seeds)} paired seeds: make reproduce-table SEEDS=3 gives three", file=sys.stderr)
+    parser.add_argument("overrides", nargs="*", help="settings of both, as of train.py")
+    arguments = parser.parse_intermixed_args()
+    try:
+        one, other = (_overall(name, arguments.overrides) for name in (arguments.one, arguments.other))
+    except (HydraException, InputError) as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)
-    differences = [100 * (one[seed] - other[seed]) for seed in seeds]
-    mean, error = fmean(differences), stdev(differences) / len(seeds) ** 0.5
-    verdict = "differ" if abs(mean) > 2 * error else "undecided"
-    means = [100 * fmean(values[seed] for seed in seeds) for values in (one, other)]
-    print(
-        f"{means[0]:.1f} {means[1]:.1f} {mean:+.1f} ± {error:.2f} points over {len(seeds)} seeds: {verdict}"
-    )
+    found = paired(one, other)
+    if found is None or found.seeds < 2:
+        seeds = found.seeds if found else 0
+        print(f"{seeds} paired seeds: make reproduce-table SEEDS=3 gives three", file=sys.stderr)
+        sys.exit(2)
+    differ = found.seeds >= FEWEST and abs(found.mean) > 2 * found.error
+    means = [fmean(values[seed] for seed in one.keys() & other.keys()) for values in (one, other)]
+    figures = f"{means[0]:.1f} {means[1]:.1f} {found.mean:+.1f} ± {found.error:.2f} points"
+    print(f"{figures} over {found.seeds} seeds: {'differ' if differ else 'undecided'}")
 
 
-def _overall(store: Store, name: str) -> dict[str, float]:
-    """Return the overall accuracy by seed of the newest finished runs."""
+def _overall(name: str, overrides: Sequence[str]) -> dict[str, float]:
+    """Return the overall accuracy in per cent, by seed, of finished runs with the row's present settings."""
+    from skin.tracking import Store
+
     row, simulator, column = (name.split(":") + ["fem", "same"][name.count(":") :])[:3]
-    runs = reversed(store.find("FINISHED", row=row, simulator=simulator))
-    metric = f"{column}/overall/accuracy"
-    return {run.data.tags["seed"]: run.data.metrics[metric] for run in runs if metric in run.data.metrics}
+    settings, metric = (
+        [f"experiment={row}", f"simulator={simulator}", *overrides],
+        f"{column}/overall/accuracy",
+    )
+    found: dict[str, float] = {}
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = checked(compose("train", settings))
+        for run in Store.open(config.tracking).find("FINISHED", row=config.row):
+            seed = run.data.tags["seed"]
+            same = fingerprint(checked(compose("train", [*settings, f"seed={seed}"])))
+            if run.data.tags.get("fingerprint") == same and metric in run.data.metrics:
+                # Newest first: that one counts.
+                found.setdefault(seed, 100 * run.data.metrics[metric])
+    return found
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, help="folder of the results; default: results/")
     parser.add_argument("--config-dir", type=Path, help="folder of configuration of your own, as of train.py")
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()
     if arguments.seeds < 1:
         parser.error(f"{arguments.seeds} is no number of seeds: give --seeds 1 or more")
     return arguments

@@ -16,8 +16,10 @@ from skin.representation.fourier import Fourier
 from skin.representation.image import Image
 from skin.representation.interp import Interpolation
 from skin.results import figures
+from skin.results.surface import deflection, surface
 from skin.results.table import Cell
 from skin.simulator.naive import Naive
+from skin.touch.sampler import Movie
 from skin.tracking import Store
 
 __all__ = ["draw_runs", "draw_skin"]
@@ -47,7 +49,7 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
 
 
 def draw_skin(device: Simulated, folder: Path) -> list[Path]:
-    """Draw figures 4, 10 and 11 from the gestures of a finite-element skin."""
+    """Draw figures 2, 3, 4, 10 and 11 from the gestures of a finite-element skin."""
     recording = device.recording("test")
     touches, drawn = recording.touches, recording.parameters
     assert touches.labels is not None
@@ -68,6 +70,7 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
     four = presses[torch.linspace(0, len(presses) - 1, 4).round().long()]
     return [
         _overview(device, folder),
+        *_hand(device, folder),
         figures.save(image, folder / "figure04_interpolations.png"),
         figures.save(figures.traces(readings, device.rate), folder / "figure10_naive_fem.png"),
         figures.save(
@@ -77,13 +80,33 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
     ]
 
 
-def _overview(device: Simulated, folder: Path) -> Path:
-    """Draw a big, sliding, dangerous press of the hand, or of whatever presses where there is no hand."""
-    labels = np.ones((64, 4), dtype=bool)
-    movie = device.sampler.sample(len(labels), np.random.default_rng(0), labels)
+def _hand(device: Simulated, folder: Path) -> list[Path]:
+    """Draw both faces of the top layer under a big press of the hand, or of whatever presses without one."""
+    movie, chosen = _press(device, [True, False, True, False])
+    frame = movie.index[chosen, int(movie.scale[chosen].argmax())]
+    moved = deflection(device.body, movie.frames[frame : frame + 1])[0]
+    name, size = device.sampler.shapes.names[int(movie.parameters["shape"][chosen])], device.size
+    faces = {"figure02_hand_top": -1, "figure03_hand_bottom": max(-2, -len(moved))}
+    paths = []
+    for file, level in faces.items():
+        depth = device.body.interfaces[level]
+        where = f"{1e3 * depth:g} mm below the surface" if depth else "the surface"
+        drawn = surface(moved[level], depth, size, f"finite elements, {name}: {where}")
+        paths.append(figures.save(drawn, folder / f"{file}.png"))
+    return paths
+
+
+def _press(device: Simulated, labels: Sequence[bool]) -> tuple[Movie, int]:
+    """Return 64 gestures with given labels, and which of them is a hand's, or the first without a hand."""
+    movie = device.sampler.sample(64, np.random.default_rng(0), np.tile(labels, (64, 1)))
     names = device.sampler.shapes.names
     shape = names.index("hand") if "hand" in names else 0
-    chosen = int((movie.parameters["shape"] == shape).int().argmax())
+    return movie, int((movie.parameters["shape"] == shape).int().argmax())
+
+
+def _overview(device: Simulated, folder: Path) -> Path:
+    """Draw a big, sliding, dangerous press of the hand, or of whatever presses where there is no hand."""
+    movie, chosen = _press(device, [True] * 4)
     readings = movie.respond(device.model).readings[chosen]
     frame = int(readings.sum(1).argmax())
     positions = torch.from_numpy(device.sensors.positions).float()

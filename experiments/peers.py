@@ -50,7 +50,9 @@ def main() -> None:
                 progress.update(task, description=f"{name}: {doing}")
 
             try:
-                progress.console.print(f"{name}: {_compare(config, chosen.python, say)}", highlight=False)
+                progress.console.print(
+                    f"{name}: {_compare(config, chosen.python, say)}", highlight=False, soft_wrap=True
+                )
             except subprocess.CalledProcessError as error:
                 failed += 1
                 progress.console.print(f"{name} failed: {error}")

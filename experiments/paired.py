@@ -42,8 +42,6 @@ def main() -> None:
 
 def _overall(name: str, overrides: Sequence[str]) -> dict[str, float]:
     """Return the overall accuracy in per cent, by seed, of finished runs with the row's present settings."""
-    from skin.tracking import Store
-
     row, simulator, column = (name.split(":") + ["fem", "same"][name.count(":") :])[:3]
     settings, metric = (
         [f"experiment={row}", f"simulator={simulator}", *overrides],
@@ -52,6 +50,9 @@ def _overall(name: str, overrides: Sequence[str]) -> dict[str, float]:
     found: dict[str, float] = {}
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = checked(compose("train", settings))
+
+        from skin.tracking import Store  # after the door: it is heavy
+
         for run in Store.open(config.tracking).find("FINISHED", row=config.row):
             seed = run.data.tags["seed"]
             same = fingerprint(checked(compose("train", [*settings, f"seed={seed}"])))

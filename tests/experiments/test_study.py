@@ -86,15 +86,13 @@ def test_the_list_names_studies_and_statements_at_once(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_missing_is_trained_once_and_a_failure_is_told(folder):
+def test_what_is_missing_is_trained_and_a_failure_is_told(folder):
     one = ["activation", "--smoke", "--seeds", "1"]
-    first = study(folder, *one)
-    assert first.returncode == 0, first.stderr
-    assert first.stdout.count("took") == 3
-    assert all(setting in first.stdout.replace("\n", "") for setting in SMOKE[:2])
-    again = study(folder, *one)
-    assert (again.returncode, again.stdout.count("took")) == (0, 0)
+    done = study(folder, *one)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("took") == 3
+    assert all(setting in done.stdout.replace("\n", "") for setting in SMOKE[:2])
     failed = study(folder, *one, "device.offset=-1")
     assert failed.returncode == 1
     assert failed.stdout.count("(1 failed)") == 3
-    assert "Traceback" not in failed.stderr
+    assert failed.stderr.count("offset") >= 3

@@ -86,9 +86,7 @@ def _read(path: Path) -> dict[str, Tensor]:
     except Exception as error:  # torch raises nearly anything on a file that it cannot read
         # torch's own words would advise to run the code in the file
         reason = error.strerror if isinstance(error, OSError) else "it is damaged, or holds more than tensors"
-        raise InputError(
-            f"cannot read the weights file {path}: {reason}; get it again; {_WAYS}"
-        ) from error
+        raise InputError(f"cannot read the weights file {path}: {reason}; get it again; {_WAYS}") from error
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         raise InputError(_unfit(path, "is no state dict (names and tensors)"))
     return content

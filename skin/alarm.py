@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from scipy.stats import chi2
 from torch import Tensor
 
 __all__ = ["Alarms", "count_alarms"]
@@ -32,6 +33,14 @@ class Alarms:
     def per_hour(self) -> float:
         """False alarms per hour without touch."""
         return self.false / self.idle_hours if self.idle_hours else float("nan")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Rates per hour within 95 % confidence: exact for independent events (Garwood, 1936)."""
+        if not self.idle_hours:
+            return float("nan"), float("nan")
+        low = chi2.ppf(0.025, 2 * self.false) / 2 if self.false else 0.0
+        return float(low) / self.idle_hours, float(chi2.ppf(0.975, 2 * self.false + 2)) / 2 / self.idle_hours
 
 
 def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float) -> Alarms:

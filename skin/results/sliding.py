@@ -59,7 +59,7 @@ def _tables(found: Sliding) -> dict[str, list[list[str]]]:
         [
             gate,
             str(heard.false),
-            f"{heard.per_hour:.1f} ± {heard.false**0.5 / max(heard.idle_hours, 1e-9):.1f}",
+            f"{heard.per_hour:.1f} ({heard.range[0]:.1f} to {heard.range[1]:.1f})",
             f"{heard.found} of {heard.dangerous}",
             f"{heard.raised} of {heard.safe}",
         ]
@@ -74,7 +74,7 @@ def _tables(found: Sliding) -> dict[str, list[list[str]]]:
         ],
         f"Touch or none, truth: said (threshold {found.threshold:.3f} N)": [head, *told],
         f"Alarms in a stream of {found.hours:g} h, {_idle(found.alarms):.2f} h of it without touch": [
-            ["gate", "false", "false per hour", "dangerous found", "safe that raised one"],
+            ["gate", "false", "false per hour (95 %)", "dangerous found", "safe that raised one"],
             *alarms,
         ],
         "Windows of other lengths": [
@@ -123,13 +123,19 @@ def _figure(found: Sliding, title: str) -> Figure:
     left.legend(fontsize=8)
     left.set_title(title, fontsize=10)
     spots = range(len(found.alarms))
-    right.bar(spots, [alarms.per_hour for alarms in found.alarms.values()], color=_COLOURS[1], width=0.6)
+    rates = [heard.per_hour for heard in found.alarms.values()]
+    spread = [
+        [rate - heard.range[0] for rate, heard in zip(rates, found.alarms.values(), strict=True)],
+        [heard.range[1] - rate for rate, heard in zip(rates, found.alarms.values(), strict=True)],
+    ]
+    right.bar(spots, rates, yerr=spread, color=_COLOURS[1], width=0.6, capsize=4)
+    right.set_ylim(bottom=0)
     labels = [
         f"{gate}\n{heard.found}/{heard.dangerous} found\n{heard.raised}/{heard.safe} safe raised"
         for gate, heard in found.alarms.items()
     ]
     right.set_xticks(spots, labels, fontsize=8)
-    right.set_ylabel("false alarms per hour")
+    right.set_ylabel("false alarms per hour, 95 %")
     right.set_title(f"{_idle(found.alarms):.2f} h without touch", fontsize=10)
     return figure
 

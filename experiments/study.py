@@ -54,7 +54,8 @@ def run(study: Study, variants: Sequence[Variant], overrides: list[str], folder:
                 train.main()
     findings = collect(store, variants, study.self_share)
     outcomes = conclusions(study.statements, findings)
-    title = ", ".join([f"{study.name}: {study.about}", *overrides[1:]])
+    settings = [word for word in overrides[1:] if not word.startswith("tracking.")]
+    title = ", ".join([f"{study.name}: {study.about}", *settings])
     publish(folder / f"study_{study.name}", title, findings, outcomes)
     return sum(finding.missing for finding in findings)
 

@@ -54,11 +54,13 @@ def tracker(track: str, device: "Simulated") -> Tracker:
         InputError: an unknown choice, or a skin whose sensors do not move along it.
     """
     if track not in TRACKERS:
-        raise InputError(f"device.track must be {', '.join(TRACKERS)}, got {track}: as in device.track=true")
+        raise InputError(
+            f"device.track must be {', '.join(TRACKERS)}, got {track}: as in device.track=oracle"
+        )
     return TRACKERS[track](device)
 
 
-def _true(device: "Simulated") -> Tracker:
+def _oracle(device: "Simulated") -> Tracker:
     device.model.motion(torch.zeros(device.body.shape))  # refused at the door rather than in the first batch
     return Tracker(simulator=device.model)
 
@@ -98,7 +100,7 @@ def _motion(simulator: AbstractSimulator, movie: Movie) -> Tensor:
 
 TRACKERS: dict[str, Callable[["Simulated"], Tracker]] = {
     "none": lambda device: Tracker(),
-    "true": _true,
+    "oracle": _oracle,
     "estimated": _estimated,
 }
-"""``none`` tells nothing, ``true`` is the simulator's own answer, ``estimated`` what readings tell of it."""
+"""``none`` tells nothing, ``oracle`` what the simulator knows, ``estimated`` what readings tell of it."""

@@ -55,8 +55,8 @@ class Simulated(AbstractDevice):
         position_error: standard deviation of the true sensors' places about the layout along x and y, m; the
             touches report the layout.
         rate: frames per second, Hz.
-        track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``true`` (an oracle)
-            or ``estimated`` from their readings. The last two need sensors that move along the sheet.
+        track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``oracle`` (what the
+            simulator knows) or ``estimated`` from their readings; both need sensors that move along the sheet.
 
     Raises:
         InputError: settings that cannot be used.

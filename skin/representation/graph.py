@@ -199,7 +199,7 @@ class Graph(AbstractRepresentation):
             if motion is None:
                 raise InputError(
                     "representation.positions=deformed needs touches that tell where the sensors go: add "
-                    "device.track=true simulator.constraint=free, or set representation.positions=layout"
+                    "device.track=oracle simulator.constraint=free, or set representation.positions=layout"
                 )
             places = self.layout + motion
             matrix = self.adjacency if self.weight == "none" else self._adjacency_at(places)

@@ -35,7 +35,7 @@ def device(**changes) -> Simulated:
 
 @pytest.fixture(scope="module")
 def oracle():
-    return device(track="true")
+    return device(track="oracle")
 
 
 def test_without_tracking_nothing_changes(oracle):
@@ -92,7 +92,7 @@ def test_another_layout_is_tracked_as_itself(oracle):
 
 def test_windows_of_a_stream_are_tracked_too():
     """Where a window shows no touch nothing has moved; elsewhere sensors sink as far as D_s says."""
-    recording = device(track="true", stream=True).recording("train")
+    recording = device(track="oracle", stream=True).recording("train")
     motion = recording.touches.motion
     torch.testing.assert_close(motion[..., 2], recording.displacement[..., 0])
     idle = recording.force == 0
@@ -100,7 +100,7 @@ def test_windows_of_a_stream_are_tracked_too():
     assert not motion[idle].any()
 
 
-@pytest.mark.parametrize("track", ["true", "estimated"])
+@pytest.mark.parametrize("track", ["oracle", "estimated"])
 @pytest.mark.parametrize(("simulator", "says"), [(PlatesAndBeams, "constraint=vertical"), (Naive, "=naive")])
 def test_sensors_that_cannot_move_are_refused_with_what_mends_it(track, simulator, says):
     with pytest.raises(InputError, match=rf"{says}: set .*simulator\.constraint=free"):
@@ -108,5 +108,5 @@ def test_sensors_that_cannot_move_are_refused_with_what_mends_it(track, simulato
 
 
 def test_an_unknown_choice_is_refused():
-    with pytest.raises(InputError, match=r"none, true, estimated, got camera"):
+    with pytest.raises(InputError, match=r"none, oracle, estimated, got camera"):
         device(track="camera")

@@ -1,0 +1,69 @@
+"""What moving and misplaced sensors cost: python experiments/moving.py n=1000 moving.rows=all
+
+moving.train=true also trains sequence_graph on the layout, on true and on estimated positions of the sensors.
+"""
+
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from skin.config import ROOT, command, plain
+from skin.errors import InputError
+
+if TYPE_CHECKING:
+    from skin.results.moving_runs import Settings, Trial
+
+
+@command("moving")
+def main(config: DictConfig) -> None:
+    """Measure motion, try finished runs, train if asked to; print and write moving.md and moving.csv."""
+    from skin.build import build_device
+    from skin.console import quiet
+    from skin.device.simulated import Simulated
+    from skin.results.moving import change
+    from skin.results.moving_runs import Settings, train_lines
+    from skin.results.moving_table import comparison, publish
+
+    quiet()
+    settings = Settings(**plain(config)["moving"])
+    device = build_device(_free(config))
+    if not isinstance(device, Simulated):
+        raise InputError("how sensors move is known in simulation only: leave out device=")
+    moves = change(device, config.n)
+    print(moves.sentence, flush=True)
+    overrides = HydraConfig.get().overrides.task
+    trained = train_lines(overrides, settings.seeds) if settings.train else []
+    lines = comparison([*_tried(config, settings), *trained])
+    folder = Path(config.out).expanduser() if config.out else ROOT / "results"
+    publish(folder, moves, config.n, lines)
+
+
+def _free(config: DictConfig) -> DictConfig:
+    """Return a configuration of the same skin, in which sensors may move along it."""
+    free = deepcopy(config)
+    OmegaConf.set_readonly(free, False)
+    if "constraint" in free.simulator:
+        free.simulator.constraint = "free"
+    return free
+
+
+def _tried(config: DictConfig, settings: "Settings") -> Iterator["Trial"]:
+    """Yield finished runs on misplaced sensors and on skins whose modulus varies."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from skin.results.moving_runs import latest, try_run
+    from skin.tracking import Store
+
+    store = Store.open(config.tracking)
+    runs = latest(store, config.data.name, settings.rows)
+    for run in track(runs, "trying finished runs", console=Console(stderr=True), disable=not runs):
+        yield from try_run(store, run, config, settings)
+
+
+if __name__ == "__main__":
+    main()

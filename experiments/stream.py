@@ -10,19 +10,20 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from skin.config import ROOT, command, plain
+from skin.course import Course
 
 
 @command("stream")
 def main(config: DictConfig) -> None:
     """Slide a window over streams for each run; print a line, write its files, log both beside the run."""
+    course = Course(**plain(config)["stream"])
+
     from skin.console import quiet
     from skin.reload import find
     from skin.results.sliding_runs import newest, try_run
-    from skin.sliding import Course
     from skin.tracking import Store
 
     quiet()
-    course = Course(**plain(config)["stream"])
     store = Store.open(config.tracking)
     runs = newest(store, config.data.name, config.rows) if config.rows else [find(store, config.run)]
     overrides = HydraConfig.get().overrides.task

@@ -1,6 +1,6 @@
 """How good a learner is on windows that slide over a stream: part of a touch, a whole one, or none."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -10,6 +10,7 @@ from torch import Tensor
 from torchmetrics.functional.classification import binary_confusion_matrix
 
 from skin.alarm import Alarms, count_alarms
+from skin.course import Course
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
@@ -18,40 +19,11 @@ from skin.gate import Gate, Threshold, gates, rise
 from skin.labels import TOUCH_OR_NOT, Task
 from skin.metrics import metrics
 
-__all__ = ["Bin", "Course", "Sliding", "bins", "slide"]
+__all__ = ["Bin", "Sliding", "bins", "slide"]
 
 _CHUNK = 1024
 _EDGES = (0.2, 0.4, 0.6, 0.8)
 _RATE = 0.02  # of no consequence: metrics want one, and none of theirs is used that depends on it
-
-
-@dataclass(frozen=True)
-class Course:
-    """The stream on which alarms are counted, and what else is tried.
-
-    Attributes:
-        hours: length of the stream.
-        gap: [least, most] idle frames between two of its touches.
-        stride: frames from one verdict to the next.
-        windows: lengths of window on which the learner is tried, frames.
-
-    Raises:
-        InputError: no stream, or no range.
-    """
-
-    hours: float = 1.0
-    gap: Sequence[int] = (50, 1150)
-    stride: int = 1
-    windows: Sequence[int] = (20, 30, 60)
-
-    def __post_init__(self) -> None:
-        if not self.hours > 0 or self.stride < 1:
-            raise InputError(
-                "a stream needs hours above 0 and a stride from 1 up, got "
-                f"stream.hours={self.hours} stream.stride={self.stride}"
-            )
-        if len(self.gap) != 2 or not 1 <= self.gap[0] <= self.gap[1]:
-            raise InputError(f"stream.gap must be [least, most] frames from 1 up, got {list(self.gap)}")
 
 
 @dataclass(frozen=True)

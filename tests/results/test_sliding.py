@@ -32,9 +32,9 @@ def test_the_line_says_what_matters():
     )
 
 
-@pytest.fixture
-def files(tmp_path):
-    return publish(FOUND, "rules fem 0", tmp_path / "stream_rules")
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return publish(FOUND, "rules fem 0", tmp_path_factory.mktemp("results") / "stream_rules")
 
 
 def test_a_person_reads_the_same(files):

@@ -56,7 +56,7 @@ class Simulated(AbstractDevice):
             touches report the layout.
         rate: frames per second, Hz.
         track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``oracle`` (what the
-            simulator knows) or ``estimated`` from their readings; both need sensors that move along the sheet.
+            simulator knows) or ``estimated`` from readings; both need sensors that move along the sheet.
 
     Raises:
         InputError: settings that cannot be used.

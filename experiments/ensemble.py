@@ -19,7 +19,7 @@ def main() -> None:
     """Evaluate the ensembles that are missing and print them beside their members."""
     arguments = parser(__doc__)
     arguments.add_argument("--rows", type=names, default=ROWS, help="the report's networks if left out")
-    chosen = arguments.parse_args()
+    chosen = arguments.parse_intermixed_args()
     for row in chosen.rows:
         if not (CONF / "experiment" / f"{row}.yaml").is_file():
             known = ", ".join(sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))

@@ -8,6 +8,7 @@ What is finished is skipped.
 
 import subprocess
 import sys
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,8 +28,9 @@ def main() -> None:
     """Train the peers that are missing and log what their answers are worth; exit code 1 if one failed."""
     arguments = parser(__doc__)
     arguments.add_argument("--peers", type=names, default=PEERS[:3], metavar=",".join(PEERS))
+    arguments.add_argument("--folder", type=Path, default=ROOT / "results" / "peers", help="for the files")
     arguments.add_argument("--python", type=Path, default=PYTHON, help="of their environment")
-    chosen = arguments.parse_args()
+    chosen = arguments.parse_intermixed_args()
     if unknown := [peer for peer in chosen.peers if peer not in PEERS]:
         raise InputError(f"there is no peer {unknown[0]}: choose from {', '.join(PEERS)}")
     if not chosen.python.is_file():
@@ -50,17 +52,16 @@ def main() -> None:
                 progress.update(task, description=f"{name}: {doing}")
 
             try:
-                progress.console.print(
-                    f"{name}: {_compare(config, chosen.python, say)}", highlight=False, soft_wrap=True
-                )
+                found = _compare(config, chosen, say)
+                progress.console.print(f"{name}: {found}", highlight=False, soft_wrap=True)
             except subprocess.CalledProcessError as error:
                 failed += 1
-                progress.console.print(f"{name} failed: {error}")
+                progress.console.print(f"{name} failed: {error}", soft_wrap=True)
             progress.advance(task)
     sys.exit(1 if failed else 0)
 
 
-def _compare(config: DictConfig, python: Path, say: Callable[[str], None]) -> str:
+def _compare(config: DictConfig, chosen: Namespace, say: Callable[[str], None]) -> str:
     """Train one peer unless a finished run holds its results already; return what came out."""
     from skin.peers import learn
     from skin.run import tags
@@ -70,7 +71,7 @@ def _compare(config: DictConfig, python: Path, say: Callable[[str], None]) -> st
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
         return f"run {finished[0].info.run_id} did this before"
-    found = learn(store, config, [str(python), str(SCRIPT)], say)
+    found = learn(store, config, chosen.folder.resolve(), [str(chosen.python), str(SCRIPT)], say)
     return ", ".join(f"{name} {100 * value:.1f}" for name, value in found.items())
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from itertools import count
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation import columns
 from skin.labels import Task
-from skin.learner._measurements import measurements
+from skin.measurements import measurements
 from skin.recording import Recording, Touches
 from skin.results.table import write as write_text
 from skin.storage import write
@@ -27,12 +28,12 @@ ABOUT = "about.json"
 
 
 def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
-    """Write every set of touches that learning and evaluating needs, unless they lie there whole.
+    """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
     ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
     engineered measurements, one row per touch. Sets: ``train``, ``validation``, then
     ``<column>_<number>`` for the sets of :func:`skin.evaluation.columns`. ``sets.json``, written last,
-    names the content of each set: set -> digest.
+    names the content of each set: set -> digest. A folder with other touches is emptied, answers and all.
 
     Args:
         device: whose touches.
@@ -40,7 +41,9 @@ def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
         folder: made if it is missing.
     """
     if (folder / SETS).is_file():
-        return
+        if json.loads((folder / SETS).read_text())["train"] == digest(device.touches("train")):
+            return
+        shutil.rmtree(folder)
     known = {}
     for name in ("train", "validation"):
         known[name] = _export(device.touches(name), device, folder, name)

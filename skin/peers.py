@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from skin.build import build_device
-from skin.config import ROOT, fingerprint, plain
+from skin.config import fingerprint, plain
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation import evaluate
@@ -16,25 +16,20 @@ from skin.exchange import ABOUT, Foreign, export
 from skin.run import conclude, describe, tags
 from skin.tracking import Store
 
-__all__ = ["folder", "learn"]
+__all__ = ["learn"]
 
 _SOURCES = ("seed", "touch", "body", "layout", "simulator", "device", "data", "evaluation")
 
 
-def folder(config: DictConfig) -> Path:
-    """Return where the touches of a configuration are exchanged; peers share it."""
-    source = _source(config)
-    return ROOT / "results" / "peers" / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
-
-
 def learn(
-    store: Store, config: DictConfig, command: Sequence[str], say: Callable[[str], None]
+    store: Store, config: DictConfig, folder: Path, command: Sequence[str], say: Callable[[str], None]
 ) -> dict[str, float]:
     """Let the peer ``config.row`` learn and log its run; return its overall accuracy in every column.
 
     Args:
         store: where to log.
         config: its ``row`` names the peer; seed, device, data and evaluation hold, the rest means nothing.
+        folder: where files are exchanged, each configuration of touches in a folder of its own.
         command: that runs the peers' script; the peer's name, the folder, ``--seed`` and ``--jobs`` follow.
         say: is told what happens.
 
@@ -42,13 +37,14 @@ def learn(
         InputError: the device has no unseen devices and layouts: it is not simulated.
         subprocess.CalledProcessError: the peer failed.
     """
-    device, where = build_device(config), folder(config)
+    device, source = build_device(config), _source(config)
+    where = folder / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
     if not isinstance(device, Simulated):
         raise InputError("peers are compared on simulated touches: leave device=simulated")
     with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config)) as run:
-        source = OmegaConf.merge(_source(config), {"row": config.row})
-        assert isinstance(source, DictConfig)
-        describe(store, run.info.run_id, source, device.touches("train"))
+        describe(
+            store, run.info.run_id, OmegaConf.create({"row": config.row, **source}), device.touches("train")
+        )
         say("writing touches")
         export(device, config.evaluation, where)
         if not (config.tracking.resume and (where / config.row / ABOUT).is_file()):

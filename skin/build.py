@@ -1,5 +1,6 @@
 """From a configuration to the objects it names, group by group."""
 
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from hydra.utils import instantiate
@@ -7,6 +8,7 @@ from omegaconf import DictConfig
 
 from skin.config import plain
 from skin.device.base import AbstractDevice
+from skin.errors import InputError
 from skin.learner.base import AbstractLearner
 
 if TYPE_CHECKING:
@@ -26,11 +28,17 @@ def build_device(config: DictConfig) -> AbstractDevice:
 def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
     """Return the batches of a device's touches, shown as the representation does."""
     # Here, because it brings Lightning, which takes seconds and which commands without training do not need.
+    from skin.augmentation import Augmentation
     from skin.datamodule import TouchData
 
-    return TouchData(
-        device, instantiate(plain(config)["representation"]), config.data.batch_size, config.seed
-    )
+    groups = plain(config)
+    try:
+        augmentation = Augmentation(**groups["data"]["augment"])
+    except TypeError as error:
+        known = ", ".join(entry.name for entry in fields(Augmentation))
+        raise InputError(f"data.augment takes {known}: {error}") from error
+    representation = instantiate(groups["representation"])
+    return TouchData(device, representation, config.data.batch_size, config.seed, augmentation)
 
 
 def build_learner(config: DictConfig) -> AbstractLearner:

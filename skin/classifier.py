@@ -8,6 +8,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.optim.lr_scheduler import OneCycleLR
 
 from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
@@ -32,12 +33,19 @@ class TouchClassifier(pl.LightningModule):
     Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
     per epoch. Labels that mean nothing because the task's gate is shut count in neither.
 
+    Numbers about the whole window, where the representation gives such (``Frames.summary``), pass two dense
+    layers of their own and join the embedding.
+
     Args:
         fusion: makes the embedding (B, E) of frames.
         task: what the labels mean: its length is the number of logits, its kind decides the loss.
         hidden: widths of the dense layers before the last one.
         activation: relu, elu or silu, after each of them.
         optimizer: short of the parameters.
+        warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to nothing
+            along a cosine (Smith and Topin, 2018). None keeps it constant.
+        dropout: share of the embedding and of the first dense layer that is dropped in training.
+        summary: how many numbers about the whole window there are; 0: none.
 
     Raises:
         InputError: the task is of a kind that has no loss here.
@@ -50,22 +58,33 @@ class TouchClassifier(pl.LightningModule):
         hidden: Sequence[int],
         activation: str,
         optimizer: MakeOptimizer,
+        warmup: float | None = None,
+        dropout: float = 0.0,
+        summary: int = 0,
     ) -> None:
         super().__init__()
         if task.kind not in ("binary", "exclusive"):
             raise InputError(f"networks learn binary and exclusive labels, got a task of kind {task.kind}")
-        widths = [fusion.width, *hidden]
+        self.fusion = fusion
+        self.summary = _Summary(summary, fusion.width, activation) if summary else None
+        widths = [fusion.width * (2 if summary else 1), *hidden]
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
-            layers += [nn.Linear(before, after), activation_of(activation)]
-        self.fusion = fusion
+            layers += [*_dropped(dropout), nn.Linear(before, after), activation_of(activation)]
         self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
         self.task = task
-        self._make_optimizer = optimizer
+        self._make_optimizer, self._warmup = optimizer, warmup
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the logits (B, L) of frames."""
-        return self.head(self.fusion(frames))
+        return self.head(self.embed(frames))
+
+    def embed(self, frames: Frames) -> Tensor:
+        """Return what the dense layers are given: the embedding (B, E), beside the summary's where it is."""
+        embedding = self.fusion(frames)
+        if self.summary is None:
+            return embedding
+        return torch.cat([embedding, self.summary(frames.summary)], dim=1)
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1.
@@ -109,5 +128,36 @@ class TouchClassifier(pl.LightningModule):
         self._step(batch, "val")
 
     def configure_optimizers(self) -> Any:
-        """Return the optimizer over all parameters."""
-        return self._make_optimizer(self.parameters())
+        """Return the optimizer over all parameters, and how its learning rate changes from step to step."""
+        optimizer = self._make_optimizer(self.parameters())
+        if self._warmup is None:
+            return optimizer
+        steps = int(self.trainer.estimated_stepping_batches)
+        rate = optimizer.defaults["lr"]
+        schedule = OneCycleLR(optimizer, rate, steps, pct_start=self._warmup, cycle_momentum=False)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def _dropped(share: float) -> list[nn.Module]:
+    """Return a dropout as a list; none where nothing is dropped, so that weights of old keep their names."""
+    return [nn.Dropout(share)] if share else []
+
+
+class _Summary(nn.Module):
+    """Two dense layers on numbers of any unit, each brought to mean 0 and deviation 1 first."""
+
+    def __init__(self, numbers: int, width: int, activation: str) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.BatchNorm1d(numbers, affine=False, momentum=0.01),
+            nn.Linear(numbers, width),
+            activation_of(activation),
+            nn.Linear(width, width),
+            activation_of(activation),
+        )
+
+    def forward(self, summary: Tensor | None) -> Tensor:
+        """Return (B, width) of numbers (B, D)."""
+        if summary is None:
+            raise ValueError("the classifier was built for frames with a summary, got frames without")
+        return self.layers(summary)

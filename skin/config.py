@@ -40,7 +40,9 @@ class Data:
     padded: bool
     fresh: bool
     batch_size: int
-    stream: bool = False  # runs of old have none
+    # Runs of old have none of these.
+    stream: bool = False
+    augment: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -89,6 +91,10 @@ class Config:
     run: str | None = None
     n: int | None = None
     out: str | None = field(default=None)
+    view: str | None = None
+    labels: list[str] | None = None
+    shape: str | None = None
+    index: int | None = None
     rows: Any = None
     stream: dict[str, Any] | None = None
     embeddings: dict[str, Any] | None = None

@@ -6,6 +6,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
+from skin.augmentation import Augmentation
 from skin.classifier import Batch
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
@@ -28,7 +29,8 @@ class TouchData(pl.LightningDataModule):
         device: source of touches.
         representation: short of positions (S, 3), m, and size (x, y), m.
         batch_size: gestures per batch.
-        seed: of the order of gestures; epoch e uses (seed, e).
+        seed: of the order of gestures and of their augmentation; epoch e uses (seed, e).
+        augmentation: changes the touches of training batches; None leaves them.
 
     Attributes:
         device: as given.
@@ -37,13 +39,20 @@ class TouchData(pl.LightningDataModule):
     """
 
     def __init__(
-        self, device: AbstractDevice, representation: MakeRepresentation, batch_size: int = 64, seed: int = 0
+        self,
+        device: AbstractDevice,
+        representation: MakeRepresentation,
+        batch_size: int = 64,
+        seed: int = 0,
+        augmentation: Augmentation | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1:
             raise InputError(f"a batch needs at least one gesture, got {batch_size}: set data.batch_size=64")
         self.device, self.batch_size, self.seed = device, batch_size, seed
         self._make = representation
+        # One that changes nothing is none: it draws nothing.
+        self.augmentation = None if augmentation == Augmentation() else augmentation
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}
 
@@ -119,7 +128,8 @@ class _Batches:
         # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
         for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
-            yield touches[index]
+            batch = touches[index]
+            yield data.augmentation(batch, generator) if data.augmentation else batch
 
     def _slices(self) -> Iterator[slice]:
         size = self.data.batch_size

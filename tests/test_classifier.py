@@ -139,3 +139,35 @@ def test_exclusive_accuracy_counts_the_largest(monkeypatch):
 def test_a_direction_is_refused():
     with pytest.raises(InputError, match="direction"):
         classifier(Task(("x", "y"), "direction"))
+
+
+def test_a_summary_joins_the_embedding():
+    torch.manual_seed(0)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3).eval()
+    x, summary = torch.randn(2, 3, 2), torch.randn(2, 3)
+    assert network.embed(Frames(x, None, summary)).shape == (2, 12)
+    before = network(Frames(x, None, summary))
+    assert not torch.equal(network(Frames(x, None, summary + 1)), before)
+    with pytest.raises(ValueError, match="without"):
+        network(Frames(x, None))
+
+
+def test_numbers_of_any_unit_are_standardised():
+    torch.manual_seed(0)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    x, summary = torch.randn(64, 3, 2), torch.randn(64, 3)
+    scaled = network(Frames(x, None, 1e4 * summary + 7))
+    torch.testing.assert_close(scaled, network(Frames(x, None, summary)), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("step", "share"), [(0, 0.04), (19, 1.0), (99, 0.0)])
+def test_the_learning_rate_rises_and_falls(step, share):
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, warmup=0.2)
+    network._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()
+    chosen = network.configure_optimizers()
+    assert chosen["lr_scheduler"]["interval"] == "step"
+    for _ in range(step):
+        chosen["optimizer"].step()
+        chosen["lr_scheduler"]["scheduler"].step()
+    # it begins at a 25th of the optimizer's own rate
+    assert chosen["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-3 * share, abs=1e-6)

@@ -102,6 +102,29 @@ class Transformer(nn.Module):
         return self.encoder(self.tokens(x) + positions(x.shape[1], self.width).to(x)).mean(dim=1)
 
 
+class Residual(nn.Module):
+    """Four residual convolutions over five frames each; the mean and the maximum over time.
+
+    Takes its time to see 19 frames around every frame, and forgets when in the window they were.
+    """
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.first = nn.Conv1d(width, hidden, 3, padding=1)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(nn.GroupNorm(1, hidden), nn.GELU(), nn.Conv1d(hidden, hidden, 5, padding=2))
+            for _ in range(4)
+        )
+        self.width = 2 * hidden
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (B, 2 hidden) of x (B, T, E)."""
+        states = self.first(x.mT)
+        for block in self.blocks:
+            states = states + block(states)
+        return torch.cat([states.amax(dim=-1), states.mean(dim=-1)], dim=1)
+
+
 HEADS: dict[str, Callable[[int, int], nn.Module]] = {
     "mean": Mean,
     "max": Max,
@@ -109,6 +132,7 @@ HEADS: dict[str, Callable[[int, int], nn.Module]] = {
     "lstm": lambda width, hidden: Recurrent(nn.LSTM(width, hidden, batch_first=True)),
     "gru": lambda width, hidden: Recurrent(nn.GRU(width, hidden, batch_first=True)),
     "attention+gru": AttentionGru,
+    "residual": Residual,
     "transformer": Transformer,
 }
 """Each makes a module (B, T, E) -> (B, ``module.width``) from E and the width of its hidden layer."""

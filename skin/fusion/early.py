@@ -34,7 +34,7 @@ class Early(AbstractFusion):
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the embeddings (B, E) of windows of the length that was built for."""
-        x, adjacency = frames
+        x, adjacency = frames.x, frames.adjacency
         if x.shape[1] != self.window:
             raise InputError(
                 f"fusion=early is made for windows of {self.window} frames, got {x.shape[1]}: "

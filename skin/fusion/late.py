@@ -50,7 +50,7 @@ class Late(AbstractFusion):
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the embeddings (B, E) of windows of any length."""
-        x, adjacency = frames
+        x, adjacency = frames.x, frames.adjacency
         if adjacency is not None and adjacency.ndim > 2:
             adjacency = adjacency.flatten(0, 1)
         embeddings = self.model(x.flatten(0, 1), adjacency)

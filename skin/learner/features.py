@@ -12,8 +12,8 @@ from torch import Tensor
 
 from skin.errors import InputError
 from skin.labels import Task
-from skin.learner._measurements import measurements
 from skin.learner.base import AbstractLearner
+from skin.measurements import measurements
 from skin.recording import Touches
 
 if TYPE_CHECKING:

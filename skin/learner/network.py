@@ -37,6 +37,9 @@ class Network(AbstractLearner):
         trainer: settings of pytorch_lightning.Trainer: max_epochs, accelerator, ...
         hidden: widths of the dense layers between embedding and labels.
         activation: relu, elu or silu, after each of them.
+        warmup: share of the training in which the learning rate rises to the optimizer's; it then falls to
+            nothing along a cosine. None keeps it constant.
+        dropout: share of the embedding and of the dense layers that is dropped in training.
         seed: of weights, dropout and nothing else; the caller's random state is left as it was.
     """
 
@@ -48,11 +51,14 @@ class Network(AbstractLearner):
         trainer: dict[str, Any],
         hidden: Sequence[int] = (32,),
         activation: str = "relu",
+        warmup: float | None = None,
+        dropout: float = 0.0,
         seed: int = 0,
     ) -> None:
         self._fusion = partial(fusion, model)
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
+        self._warmup, self._dropout = warmup, dropout
         self._data: TouchData | None = None
         self._classifier: TouchClassifier | None = None
 
@@ -141,7 +147,16 @@ class Network(AbstractLearner):
         frames, _ = data.frames(data.touches("train")[:1])
         kind = data.representation_for(data.touches("train").positions).kind
         fusion = self._fusion(kind, tuple(frames.x.shape[2:]), frames.x.shape[1])
-        classifier = TouchClassifier(fusion, data.task, self._hidden, self._activation, self._optimizer)
+        classifier = TouchClassifier(
+            fusion,
+            data.task,
+            self._hidden,
+            self._activation,
+            self._optimizer,
+            self._warmup,
+            self._dropout,
+            0 if frames.summary is None else frames.summary.shape[1],
+        )
         self._data, self._classifier = data, classifier
         self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
         return classifier

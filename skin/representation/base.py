@@ -16,10 +16,13 @@ class Frames(NamedTuple):
     Attributes:
         x: images (B, T, C, H, W), graphs (B, T, S, F), plain readings (B, T, F).
         adjacency: (S, S) or (B, T, S, S), dense, normalised; None where there is no graph.
+        summary: (B, D), numbers about the whole window, which go to the dense layers; None where the
+            representation gives none.
     """
 
     x: Tensor
     adjacency: Tensor | None
+    summary: Tensor | None = None
 
 
 class AbstractRepresentation(nn.Module, ABC):
@@ -30,9 +33,11 @@ class AbstractRepresentation(nn.Module, ABC):
 
     Attributes:
         kind: what a model must take: images, graphs or plain readings.
+        windowed: whether what a frame shows depends on the other frames of its window.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]]
+    windowed: ClassVar[bool] = False
 
     @abstractmethod
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:

@@ -67,7 +67,7 @@ def test_a_gradient_reaches_every_parameter(given):
 
 def test_windows_do_not_see_each_other(given):
     make, kind = given
-    fusion, (x, adjacency) = make().eval(), windows(kind)
+    fusion, (x, adjacency, _) = make().eval(), windows(kind)
     together = fusion(Frames(x, adjacency))
     assert torch.equal(fusion(Frames(x, adjacency)), together)
     torch.testing.assert_close(fusion(Frames(x[1:3], adjacency)), together[1:3])
@@ -91,7 +91,7 @@ def test_late_fusion_trained_on_30_frames_takes_20_and_60(kind, head):
     fusion(windows(kind, 30)).square().sum().backward()
     optimizer.step()
     fusion.eval()
-    x, adjacency = windows(kind, 60)
+    x, adjacency, _ = windows(kind, 60)
     short, long = fusion(Frames(x[:, :20], adjacency)), fusion(Frames(x, adjacency))
     assert short.shape == long.shape == (5, fusion.width)
     assert torch.isfinite(short).all()

@@ -33,7 +33,7 @@ def test_a_graph_per_frame_is_taken():
 
 
 def test_an_unknown_head_is_refused():
-    names = r"mean, max, conv, lstm, gru, attention\+gru, transformer"
+    names = r"mean, max, conv, lstm, gru, attention\+gru, residual, transformer"
     with pytest.raises(InputError, match=rf"unknown head 'tcn': set fusion\.head to one of {names}"):
         Late(MODEL, "readings", (4,), 6, head="tcn")
 

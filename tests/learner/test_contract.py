@@ -19,6 +19,15 @@ CHEAP = {
         "trainer.max_epochs=15",
     ],
     "features": ["learner.rounds=20"],
+    "ensemble": [
+        "representation=readings",
+        "model=mlp",
+        "fusion=early",
+        "optimizer.lr=0.01",
+        "trainer.max_epochs=15",
+        "learner.members.features.rounds=20",
+        "learner.copies.network=2",
+    ],
 }
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from skin.learner._measurements import measurements
+from skin.measurements import measurements
 from skin.recording import Touches
 
 PLACES = torch.tensor([[0.02, 0.02, 0.0], [0.06, 0.02, 0.0], [0.10, 0.02, 0.0], [0.06, 0.08, 0.0]])

@@ -1,0 +1,77 @@
+"""More touches from the same ones: changes of a recorded touch that leave its labels true."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.recording import Touches
+
+__all__ = ["Augmentation"]
+
+_IDLE = 8
+_MARGIN = 2  # frames that a touch may last beyond what stands out
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Shifts, reverses, scales and blurs touches of a training batch.
+
+    None of it needs a simulator, so it serves recordings of a real skin too. It presumes that a window holds
+    a touch whole, with idle frames around it.
+
+    Args:
+        shift: move the touch in its window, as far as it stays whole; idle frames go round.
+        reverse: let time run backwards, for every second touch.
+        gain: standard deviation of the logarithm of a factor per sensor and touch.
+        noise: standard deviation of what is added to every reading, N.
+
+    Raises:
+        InputError: a negative number.
+    """
+
+    shift: bool = False
+    reverse: bool = False
+    gain: float = 0.0
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "noise"):
+            if getattr(self, name) < 0:
+                raise InputError(f"data.augment.{name} must be at least 0, got {getattr(self, name)}")
+
+    def __call__(self, touches: Touches, generator: torch.Generator) -> Touches:
+        """Return changed touches; ``generator`` is where all randomness comes from.
+
+        Raises:
+            InputError: touches whose sensors move: what they do under a shift is not known.
+        """
+        if touches.motion is not None:
+            raise InputError("data.augment knows nothing of sensors that move: set device.track=none")
+        count, time, sensors = touches.readings.shape
+        order = torch.arange(time).expand(count, time)
+        if self.shift:
+            order = (order - self._shifts(touches, generator)[:, None]) % time
+        if self.reverse:
+            turned = torch.rand(count, generator=generator) < 0.5
+            order = torch.where(turned[:, None], order.flip(1), order)
+        order = order[..., None].expand(-1, -1, sensors)
+        readings, valid = touches.readings.gather(1, order), touches.valid.gather(1, order)
+        if self.gain:
+            readings = readings * (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
+        if self.noise:
+            readings = readings + self.noise * torch.randn(readings.shape, generator=generator)
+        return Touches(readings, valid, touches.positions, touches.labels, touches.rate)
+
+    def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
+        """Draw by how many frames each touch moves, (B,), so that none is torn apart."""
+        raw = touches.readings * touches.valid
+        idle = raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
+        force = (raw - idle).clamp(min=0).sum(dim=2)
+        touched = (force > 0.12 * force.amax(dim=1, keepdim=True)).int()
+        first = touched.argmax(dim=1) - _MARGIN
+        last = raw.shape[1] - touched.flip(1).argmax(dim=1) - 1 + _MARGIN
+        early, late = first.clamp(min=0), (raw.shape[1] - 1 - last).clamp(min=0)
+        chance = torch.rand(len(raw), generator=generator)
+        return (chance * (early + late + 1)).floor().long() - early

@@ -1,0 +1,32 @@
+"""Animate a touch: python experiments/animate.py out=x.gif labels=[big,dynamic,press] shape=hand seed=3"""
+
+from omegaconf import DictConfig
+
+from skin.config import command
+from skin.errors import InputError
+
+
+@command("animate")
+def main(config: DictConfig) -> None:
+    """Write a GIF of a simulated touch, or of one that a recording holds."""
+    if config.out is None or not config.out.endswith(".gif"):
+        raise InputError(f"an animation is a .gif file, got out={config.out}: add out=touch.gif")
+
+    from pathlib import Path
+
+    from skin.build import build_device
+    from skin.device.simulated import Simulated
+    from skin.results.animation import write
+    from skin.results.scene import recorded, simulated
+
+    device = build_device(config)
+    if isinstance(device, Simulated):
+        scene = simulated(device, list(config.labels), config.shape, config.seed, config.view == "skin3d")
+    else:
+        scene = recorded(device, config.index)
+    path = write(scene, config.view, Path(config.out).expanduser())
+    print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""experiments/animate.py as a person runs it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from skin.build import build_device
+from skin.storage import write
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, str(ROOT / "experiments" / "animate.py"), "simulator=naive", *overrides]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
+
+
+@pytest.mark.slow
+def test_a_drawn_touch_and_a_recorded_one(tmp_path, configured):
+    done = run(tmp_path, "out=hand.gif", "labels=[big,dynamic]", "shape=hand", "seed=3")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "hand.gif: hand: big, dynamic, 30 frames at 10 Hz\n"
+    write(build_device(configured("simulator=naive", "data.gestures=16")).recording(), tmp_path / "x.parquet")
+    recording = ["device=recording", "device.path=x.parquet", "index=5", "out=five.gif"]
+    done = run(tmp_path, *recording)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("five.gif: touch 5: ")
+    for name in ("hand.gif", "five.gif"):
+        assert (tmp_path / name).stat().st_size < 1e6
+        with Image.open(tmp_path / name) as file:
+            assert file.n_frames == 30
+    assert sorted(path.name for path in tmp_path.glob("*.gif")) == ["five.gif", "hand.gif"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [([], "add out=touch.gif"), (["out=x.mp4"], "got out=x.mp4"), (["vieww=flat"], "vieww")],
+)
+def test_bad_input_ends_with_a_sentence(tmp_path, overrides, words):
+    done = run(tmp_path, *overrides)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.glob("x.*"))

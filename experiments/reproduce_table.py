@@ -5,17 +5,14 @@ import sys
 from pathlib import Path
 
 import train
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from skin.config import CONF, ROOT, checked
-from skin.sweep import jobs
+from skin.config import ROOT
 
 BUDGETS = {"full": "table", "smoke": "smoke"}
 
 
 def main() -> None:
-    """Run the sweep, then write table and figures to ``results/``; exit code 1 if a run failed."""
+    """Run the sweep, let its rows vote, then write table and figures to ``results/``; 1 if a run failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--budget", choices=BUDGETS, default="full")
     parser.add_argument("--seeds", type=_count, default=1, help="runs per row: seeds 0, 1, ...")
@@ -28,25 +25,26 @@ def main() -> None:
 
 def report(overrides: list[str], folder: Path) -> int:
     """Write and print what finished runs say; return how many are missing."""
+    from entries import Entries
+
     from skin.build import build_device
     from skin.results.gallery import draw_runs, draw_skin
     from skin.results.show import results
     from skin.results.table import as_csv, collect, grid, markdown, report_values, rows, write
     from skin.tracking import Store
 
-    parameters = OmegaConf.load(CONF / "sweep" / "table.yaml").hydra.sweeper.params
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        configs = [
-            checked(compose("train", [f"{key}={value}" for key, value in job.items()]))
-            for job in jobs(overrides, parameters)
-        ]
-    store = Store.open(configs[0].tracking)
-    cells = collect(store, ((config.row, config.data.name, config) for config in configs))
+    entries = Entries(overrides)
+    store = Store.open(entries.rows[0].tracking)
+    entries.vote(store)
+    cells = collect(store, entries.named(entries.rows))
+    cells += [cell for cell in collect(store, entries.named(entries.others)) if cell.runs]
+    simulators = list(dict.fromkeys(config.data.name for config in entries.rows))
+    cells.sort(key=lambda cell: simulators.index(cell.simulator))
     lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"))
     write(as_csv(lines), folder / "table.csv")
     title = "Accuracy on the test gestures in per cent (the report's in brackets)"
     write(markdown(grid(lines), title), folder / "table.md")
-    skin = next(config for config in configs if config.data.name == "fem")
+    skin = next(config for config in entries.rows if config.data.name == "fem")
     pictures = [*draw_runs(cells, store, folder), *draw_skin(build_device(skin), folder)]
     results(lines, title)
     print(f"{folder / 'table.md'}, {folder / 'table.csv'} and {len(pictures)} figures beside them")

@@ -171,3 +171,10 @@ def test_the_learning_rate_rises_and_falls(step, share):
         chosen["lr_scheduler"]["scheduler"].step()
     # it begins at a 25th of the optimizer's own rate
     assert chosen["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-3 * share, abs=1e-6)
+
+
+def test_a_batch_of_one_touch_can_be_learnt_from():
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))
+    network.loss(logits, torch.ones(1, 4)).backward()
+    assert torch.isfinite(logits).all()

@@ -42,8 +42,8 @@ class TouchClassifier(pl.LightningModule):
         hidden: widths of the dense layers before the last one.
         activation: relu, elu or silu, after each of them.
         optimizer: short of the parameters.
-        warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to nothing
-            along a cosine (Smith and Topin, 2018). None keeps it constant.
+        warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to
+            nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
         dropout: share of the embedding and of the first dense layer that is dropped in training.
         summary: how many numbers about the whole window there are; 0: none.
 

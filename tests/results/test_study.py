@@ -131,6 +131,8 @@ def test_every_sweep_composes_and_states_its_budget(configured, sweep):
     job = chosen(sweep)[-1]
     config = checked(configured(f"sweep={sweep}", *(f"{key}={value}" for key, value in job.items())))
     whole = sweep == "late_early"
+    # Hydra lays settings of the command line over this one too, so it must be of the same row.
+    assert whole or configured(f"sweep={sweep}").row == config.row
     assert config.tracking.experiment == ("skin" if whole else "studies")
     assert (config.evaluation.devices, config.evaluation.layouts) == ((5, 5) if whole else (0, 0))
     assert config.trainer.max_epochs < config.epochs["fem"] or whole or config.row == "sensor_transformer"

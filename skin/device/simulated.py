@@ -22,7 +22,7 @@ from skin.streams import Stream, generator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import Movie, TouchSampler, balanced
-from skin.touch.stream import Strip, draw_timeline
+from skin.touch.stream import Strip, draw_timeline, touched
 
 __all__ = ["Simulated"]
 
@@ -243,14 +243,6 @@ class Simulated(AbstractDevice):
             "device_seed": self.seed,
             "data_seed": self.data_seed,
             "shapes": list(self.sampler.shapes.names),
-            "summary": summarise(_touched(recording), self.body),
+            "summary": summarise(touched(recording), self.body),
             "versions": {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__},
         }
-
-
-def _touched(recording: Recording) -> Recording:
-    """Return what shows a touch: all, unless the labels say otherwise."""
-    labels, gate = recording.touches.labels, recording.task.gate
-    if labels is None or gate is None:
-        return recording
-    return recording[labels[:, recording.task.names.index(gate)] > 0.5]

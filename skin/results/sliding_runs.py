@@ -95,7 +95,8 @@ def _try(store: Store, run: Run, own: DictConfig, course: Course, tags: dict[str
         store.log_metrics(logged, found.metrics())
         store.client.set_tag(logged.info.run_id, "outcome", line(found))
         with TemporaryDirectory() as folder:
-            publish(found, f"{run.info.run_name}, run {run.info.run_id[:8]}", Path(folder) / name)
+            title = f"{run.info.run_name}{' on streams' if found.streamed else ''}, run {run.info.run_id[:8]}"
+            publish(found, title, Path(folder) / name)
             store.client.log_artifacts(logged.info.run_id, folder)
 
 

@@ -13,7 +13,7 @@ from skin.labels import TOUCH_OR_NOT
 from skin.recording import Recording
 from skin.touch.sampler import Movie, TouchSampler, join
 
-__all__ = ["Look", "Strip", "Timeline", "draw_timeline"]
+__all__ = ["Look", "Strip", "Timeline", "draw_timeline", "touched"]
 
 _LEAST = 16
 
@@ -201,3 +201,11 @@ class Strip:
             displacement=windows(whole.displacement),
             parameters=shown | own,
         )
+
+
+def touched(recording: Recording) -> Recording:
+    """Return what shows a touch: all, unless the labels say otherwise."""
+    labels, gate = recording.touches.labels, recording.task.gate
+    if labels is None or gate is None:
+        return recording
+    return recording[labels[:, recording.task.names.index(gate)] > 0.5]

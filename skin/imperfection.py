@@ -1,13 +1,15 @@
-"""What a real device does to true readings: gain, clip, noise, offset, dead sensors, tare."""
+"""What a real device does to true readings: lag, gain, clip, noise, offset, rounding, dead sensors, tare."""
 
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from skin.calibration.values import Calibration, read
 from skin.errors import InputError
+from skin.lag import lagged, rounded, unloading
 
 __all__ = ["Constants", "Imperfection"]
 
@@ -21,18 +23,40 @@ class Constants(NamedTuple):
         gain: factor on the true force.
         offset: N.
         baseline: what the device subtracts as its idle reading, N; 0 without tare.
-        dead: bool, sensors that say nothing.
+        dead: bool, sensors whose readings mean nothing: dead, stuck or saturated.
+        noise: standard deviation in every frame, N.
+        clip: largest force that a sensor tells, N.
+        level: what a sensor of ``dead`` says all the time, N.
+        drift: N/s.
+        hysteresis: mean gap between unloading and loading, share of the touch's peak.
+        time_constant: of a first-order lag, s; 0: none.
+        quantum: step of the converter, N; 0: none.
     """
 
     gain: Tensor
     offset: Tensor
     baseline: Tensor
     dead: Tensor
+    noise: Tensor
+    clip: Tensor
+    level: Tensor
+    drift: Tensor
+    hysteresis: Tensor
+    time_constant: Tensor
+    quantum: Tensor
+
+    def to(self, device: torch.device | str) -> "Constants":
+        """Return these constants on ``device``."""
+        return Constants(*(value.to(device) for value in self))
 
 
 @dataclass(frozen=True)
 class Imperfection:
     """A device's imperfections, in the report's order (2.1.4): clip the force, then add noise and offset.
+
+    Before the clip the material answers late (hysteresis, then a lag) and the sensor has its gain; after the
+    noise readings drift and a converter rounds them. All of that is our addition to the report, and neutral
+    unless asked for.
 
     Attributes:
         gain_spread: standard deviation of the logarithm of each sensor's gain. Our choice: the report speaks
@@ -42,9 +66,19 @@ class Imperfection:
         clip: largest force that a sensor tells, N.
         dead: how many sensors are dead: they read 0 and are marked invalid.
         tare: subtract the idle baseline, the mean of 30 idle frames with their noise.
+        stuck: how many more say one force all the time, between 0 and ``clip``; they are invalid too.
+        saturated: how many more say ``clip`` all the time; they are invalid too.
+        drift: standard deviation of each sensor's drift, N/s, from the first frame of a window or stream on.
+        hysteresis: mean gap between unloading and loading, share of the peak. At a force x after a peak P the
+            sensor feels x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
+        time_constant: of a first-order lag behind the force, s.
+        quantum: step of the converter, N.
+        calibration: what was found of a real device; takes the place of everything above but ``tare`` and
+            ``dead``, which breaks further sensors. Constants drawn for ``gestures`` come from its ranges.
+        rate: frames per second, Hz.
 
     Raises:
-        InputError: a negative number, or a clip that is not above 0.
+        InputError: a negative number, or a clip or rate that is not above 0.
     """
 
     gain_spread: float = 0.05
@@ -53,14 +87,30 @@ class Imperfection:
     clip: float = 10.0
     dead: int = 0
     tare: bool = False
+    stuck: int = 0
+    saturated: int = 0
+    drift: float = 0.0
+    hysteresis: float = 0.0
+    time_constant: float = 0.0
+    quantum: float = 0.0
+    calibration: Calibration | None = None
+    rate: float = 10.0
 
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if not value >= 0:
+            if entry.name != "calibration" and not value >= 0:
                 raise InputError(f"device.{entry.name} must be at least 0, got {value}")
-        if self.clip == 0:
-            raise InputError("device.clip must be above 0 N, got 0: as in device.clip=10")
+        for name, unit in (("clip", "N"), ("rate", "Hz")):
+            if getattr(self, name) == 0:
+                raise InputError(f"device.{name} must be above 0 {unit}, got 0: as in device.{name}=10")
+
+    @classmethod
+    def of(cls, settings: Any) -> "Imperfection":
+        """Return what an object asks for by attributes of these names; its ``calibration`` is a file."""
+        given = {entry.name: getattr(settings, entry.name) for entry in fields(cls)}
+        known = None if settings.calibration is None else read(settings.calibration)
+        return cls(**given | {"calibration": known})
 
     def constants(
         self, sensors: int, generator: np.random.Generator, gestures: int | None = None
@@ -68,22 +118,54 @@ class Imperfection:
         """Draw the constants of one device, or of one device per gesture.
 
         Raises:
-            InputError: more dead sensors than would leave one alive.
+            InputError: more broken sensors than would leave one alive, or a calibration of another number.
         """
-        if self.dead >= sensors:
-            raise InputError(f"device.dead={self.dead} of {sensors} sensors leaves none alive: give fewer")
         shape = (sensors,) if gestures is None else (gestures, 1, sensors)
+        if self.calibration is None:
+            values = self._drawn(shape, generator)
+        else:
+            values = self._calibrated(self.calibration, shape, generator)
+        if values["dead"].all(axis=-1).any():
+            raise InputError(
+                f"device.dead={self.dead} of {sensors} sensors leaves none alive (those that are stuck, "
+                "saturated or broken in a calibration count too): give fewer"
+            )
+        idle = values["offset"] + values["noise"] / np.sqrt(_IDLE_FRAMES) * values.pop("idle")
+        values["baseline"] = idle if self.tare else np.zeros(shape)
+        dead = torch.from_numpy(values.pop("dead"))
+        return Constants(
+            dead=dead, **{name: torch.from_numpy(value).float() for name, value in values.items()}
+        )
+
+    def _drawn(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
+        """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
         gain = np.exp(self.gain_spread * generator.standard_normal(shape))
         offset = self.offset * generator.standard_normal(shape)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
-        idle = offset + self.noise / np.sqrt(_IDLE_FRAMES) * generator.standard_normal(shape)
-        baseline = idle if self.tare else np.zeros(shape)
-        return Constants(
-            gain=torch.from_numpy(gain).float(),
-            offset=torch.from_numpy(offset).float(),
-            baseline=torch.from_numpy(baseline).float(),
-            dead=torch.from_numpy(rank < self.dead),
-        )
+        idle = generator.standard_normal(shape)
+        drift = self.drift * generator.standard_normal(shape) if self.drift else np.zeros(shape)
+        level = np.where(rank < self.dead, 0.0, self.clip)
+        if self.stuck:
+            stuck = (rank >= self.dead) & (rank < self.dead + self.stuck)
+            level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
+        same = ("noise", "clip", "hysteresis", "time_constant", "quantum")
+        values = {name: np.asarray(float(getattr(self, name))) for name in same}
+        dead = rank < self.dead + self.stuck + self.saturated
+        return values | {
+            "gain": gain, "offset": offset, "dead": dead, "level": level, "drift": drift, "idle": idle
+        }  # fmt: skip
+
+    def _calibrated(
+        self, calibration: Calibration, shape: tuple[int, ...], generator: np.random.Generator
+    ) -> dict[str, np.ndarray]:
+        """Take the values of a calibration, or, a device per gesture, draw from its ranges."""
+        calibration.fits(shape[-1])
+        values = calibration.values() if len(shape) == 1 else calibration.draw(shape, generator)
+        rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
+        more = rank < self.dead
+        values["level"] = np.where(more, 0.0, values["level"])
+        values["dead"] = values["dead"] | more
+        return values | {"idle": generator.standard_normal(shape)}
 
     def apply(
         self, readings: Tensor, constants: Constants, generator: np.random.Generator
@@ -98,14 +180,54 @@ class Imperfection:
         Returns:
             readings (B, T, S), N, float32, and valid (B, T, S), bool.
         """
-        noise = torch.from_numpy(generator.standard_normal(readings.shape, dtype=np.float32))
-        constants = Constants(*(value.to(readings.device) for value in constants))
-        said = (readings * constants.gain).clamp(-self.clip, self.clip)
-        said += noise.to(readings.device).mul_(self.noise) + (constants.offset - constants.baseline)
+        constants = constants.to(readings.device)
         dead = constants.dead.expand(readings.shape)
-        return said.masked_fill(dead, 0.0), ~dead
+        return self._say(readings, constants, generator).masked_fill(dead, 0.0), ~dead
+
+    def raw(
+        self,
+        readings: Tensor,
+        constants: Constants,
+        generator: np.random.Generator,
+        time: Tensor | None = None,
+    ) -> Tensor:
+        """Return what comes out of the converter, (B, T, S), N: before a tare, broken sensors at their level.
+
+        Args:
+            readings: (B, T, S), true readings, N.
+            constants: of this device.
+            generator: where the noise comes from.
+            time: of every frame, (T,), s; None: at ``rate`` from 0.
+        """
+        constants = constants._replace(baseline=torch.zeros(())).to(readings.device)
+        said = self._say(readings, constants, generator, time)
+        return torch.where(constants.dead, constants.level, said)
+
+    def _say(
+        self,
+        readings: Tensor,
+        constants: Constants,
+        generator: np.random.Generator,
+        time: Tensor | None = None,
+    ) -> Tensor:
+        noise = torch.from_numpy(generator.standard_normal(readings.shape, dtype=np.float32))
+        if time is None:
+            time = torch.arange(readings.shape[1], device=readings.device) / self.rate
+        force = readings
+        if constants.hysteresis.any():
+            force = unloading(force, constants.hysteresis)
+        if constants.time_constant.any():
+            force = lagged(force, constants.time_constant, time)
+        said = (force * constants.gain).clamp(-constants.clip, constants.clip)
+        said += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
+        if constants.drift.any():
+            said += constants.drift * time[:, None]
+        if constants.quantum.any():
+            said = rounded(said + constants.baseline, constants.quantum) - constants.baseline
+        return said
 
     def clipped(self, readings: Tensor, constants: Constants) -> Tensor:
         """Return which gestures have a reading that is clipped, (B,), bool."""
-        force = (readings * constants.gain.to(readings.device)).abs() > self.clip
-        return (force & ~constants.dead.to(readings.device)).flatten(1).any(1)
+        constants = constants.to(readings.device)
+        force = (readings * constants.gain).abs() > constants.clip
+        return (force & ~constants.dead).flatten(1).any(1)

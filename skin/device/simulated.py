@@ -50,10 +50,10 @@ class Simulated(AbstractDevice):
             ``gestures`` and ``test_gestures`` then count windows. Every split has streams of its own.
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
-        gain_spread, offset, noise, clip, dead, tare: as in :class:`skin.imperfection.Imperfection`.
+        gain_spread, offset, noise, ... quantum: as in :class:`skin.imperfection.Imperfection`.
+        calibration: file of experiments/calibrate.py, which takes the place of all these but dead and tare.
         randomise: every gesture is felt by a device of its own.
-        position_error: standard deviation of the true sensors' places about the layout along x and y, m; the
-            touches report the layout.
+        position_error: standard deviation of the true sensors' places about those that touches report, m.
         rate: frames per second, Hz.
         track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``oracle`` (what the
             simulator knows) or ``estimated`` from readings; both need sensors that move along the sheet.
@@ -80,6 +80,13 @@ class Simulated(AbstractDevice):
     dead: int = 0
     position_error: float = 0.0
     tare: bool = False
+    stuck: int = 0
+    saturated: int = 0
+    drift: float = 0.0
+    hysteresis: float = 0.0
+    time_constant: float = 0.0
+    quantum: float = 0.0
+    calibration: str | None = None
     randomise: bool = False
     rate: float = 10.0
     track: str = "none"
@@ -88,20 +95,15 @@ class Simulated(AbstractDevice):
         for name, least in (("gestures", 10), ("test_gestures", 1), ("position_error", 0)):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        if not self.rate > 0:
-            raise InputError(f"device.rate must be above 0 Hz, got {self.rate}: as in device.rate=10")
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         true = self._true_sensors()
         self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded)
         self.window = self.sampler.settings.window
         self.model = self.simulator(self.body, true)
-        self.imperfection = Imperfection(
-            self.gain_spread, self.offset, self.noise, self.clip, self.dead, self.tare
-        )
-        self.constants = self.imperfection.constants(
-            len(self.sensors), generator(Stream.CONSTANTS, self.seed)
-        )
+        self.imperfection = Imperfection.of(self)
+        drawn = generator(Stream.CONSTANTS, self.seed)
+        self.constants = self.imperfection.constants(len(self.sensors), drawn)
         self.tracker = tracker(self.track, self)
         self._kept: dict[str, Recording] = {}
 
@@ -153,8 +155,8 @@ class Simulated(AbstractDevice):
         counts["holdout"] = self.gestures - training - middle
         if split is None:
             return join([self._streams(name, complete) for name in counts])
-        number = list(counts).index(split)
-        return self._keep(split, complete, Stream.BUDGET, counts[split], self.data_seed, number)
+        key = self.data_seed, list(counts).index(split)
+        return self._keep(split, complete, Stream.BUDGET, counts[split], *key)
 
     def _keep(self, name: str, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
         if complete:

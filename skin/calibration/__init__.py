@@ -1,0 +1,1 @@
+"""From a bench session to the constants of a simulated device."""

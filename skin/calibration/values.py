@@ -1,0 +1,193 @@
+"""What was found of a real device: a value per sensor, ranges to draw others from, and its YAML file."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from skin.errors import InputError
+
+__all__ = ["BROKEN", "QUANTITIES", "Calibration", "read", "write"]
+
+FORMAT = 1
+_ROOT = Path(__file__).parents[2]
+QUANTITIES = {
+    "gain": 1.0,
+    "offset": 0.0,
+    "noise": 0.0,
+    "drift": 0.0,
+    "hysteresis": 0.0,
+    "time_constant": 0.0,
+    "clip": math.inf,
+    "quantum": 0.0,
+}
+"""Quantities per sensor, as in :class:`skin.imperfection.Constants`, and what stands for unknown ones."""
+_SIGNED = ("offset", "drift")
+BROKEN = ("dead", "stuck", "saturated")
+"""Why readings mean nothing; ``stuck`` and ``saturated`` sensors say their ``offset`` all the time."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The constants of a device, and the ranges that others of its kind are drawn from.
+
+    Attributes:
+        sensors: quantity -> a number per sensor, None where nothing is known; units as in ``QUANTITIES``.
+        broken: kind of ``BROKEN`` -> numbers of sensors, from 0.
+        ranges: quantity -> (low, high), drawn evenly for every sensor of a device; ``dead`` -> (fewest, most)
+            sensors of a device that are dead.
+        scale: N per raw unit of the session; 1 where that is N.
+        about: whence this is; anything that JSON can hold.
+
+    Raises:
+        InputError: another name, lengths that differ, a number that is out of bounds.
+    """
+
+    sensors: Mapping[str, Sequence[float | None]]
+    broken: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    ranges: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    scale: float = 1.0
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _known(self.sensors, QUANTITIES, "sensors")
+        _known(self.broken, BROKEN, "broken")
+        _known(self.ranges, (*QUANTITIES, "dead"), "ranges")
+        counts = {name: len(values) for name, values in self.sensors.items()}
+        if len(set(counts.values())) != 1:
+            raise InputError(f"a calibration needs as many numbers of every quantity, got {counts or 'none'}")
+        for name, values in self.sensors.items():
+            _check(name, [value for value in values if value is not None])
+        for name, values in self.ranges.items():
+            _check(name, values)
+            if len(values) != 2 or values[0] > values[1] or not math.isfinite(values[1]):
+                raise InputError(f"ranges.{name} must be [low, high], both finite, got {list(values)}")
+        wrong = [number for group in self.broken.values() for number in group if not 0 <= number < len(self)]
+        if wrong or not self.scale > 0:
+            raise InputError(
+                f"a calibration of {len(self)} sensors breaks sensors 0 to {len(self) - 1} and has a scale "
+                f"above 0, got sensors {wrong}, scale {self.scale}"
+            )
+
+    def __len__(self) -> int:
+        return len(next(iter(self.sensors.values())))
+
+    def fits(self, sensors: int) -> None:
+        """Raise InputError where this is not the calibration of so many sensors."""
+        if sensors != len(self):
+            raise InputError(
+                f"the calibration has {len(self)} sensors, the layout {sensors}: give the layout that it was "
+                "made with, as in layout=file layout.path=FILE.csv, or device.calibration=null"
+            )
+
+    def known(self, name: str) -> np.ndarray:
+        """Return a quantity, (S,): the median of the known where one is unknown, neutral where all are."""
+        given = np.array([np.nan if value is None else value for value in self.sensors.get(name, [None])])
+        given = np.broadcast_to(given, (len(self),))
+        spare = QUANTITIES[name]
+        # A sensor that was not driven to its limit has none that matters.
+        if name != "clip" and np.isfinite(given).any():
+            spare = float(np.nanmedian(given))
+        return np.where(np.isnan(given), spare, given)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """Return every quantity, (S,), with ``dead`` and the ``level`` that broken sensors say, N."""
+        found = {name: self.known(name) for name in QUANTITIES}
+        dead = np.zeros(len(self), dtype=bool)
+        dead[[number for group in self.broken.values() for number in group]] = True
+        level = np.array(found["offset"])
+        level[list(self.broken.get("dead", []))] = 0.0
+        return found | {"dead": dead, "level": level}
+
+    def draw(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
+        """Return the same for devices of this kind, (..., S) each, drawn from the ranges.
+
+        What has no range keeps its values. Sensors that are broken here need not be there.
+        """
+        own, found = self.values(), dict[str, np.ndarray]()
+        for name in QUANTITIES:
+            low, high = self.ranges.get(name, (0.0, 0.0))
+            drawn = generator.uniform(low, high, shape)
+            found[name] = drawn if name in self.ranges else np.broadcast_to(own[name], shape).copy()
+        fewest, most = self.ranges.get("dead", (0, 0))
+        count = generator.integers(int(fewest), int(most), (*shape[:-1], 1), endpoint=True)
+        rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
+        return found | {"dead": rank < count, "level": np.zeros(shape)}
+
+
+def read(path: str | Path) -> Calibration:
+    """Read a file that :func:`write` or a person wrote; a single number stands for every sensor.
+
+    Args:
+        path: a relative one is looked for in the working directory, then in the repository.
+
+    Raises:
+        InputError: no such file, unreadable, or contents that cannot be used.
+    """
+    given = Path(path).expanduser()
+    found = next((place for place in (given, _ROOT / given) if place.is_file()), None)
+    if found is None:
+        raise InputError(f"no calibration {path}: experiments/calibrate.py session=FILE out={path} makes one")
+    try:
+        stored: Any = OmegaConf.to_container(OmegaConf.load(found))
+    except (OSError, YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the calibration {found}: {error}") from error
+    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
+        raise InputError(f"{found} is no calibration: it needs format: {FORMAT}, count: and sensors:")
+    try:
+        count = int(stored["count"])
+        sensors = {
+            name: list(value) if isinstance(value, list) else [value] * count
+            for name, value in stored["sensors"].items()
+        }
+        broken = stored.get("broken") or {}
+        return Calibration(
+            sensors, broken, stored.get("ranges") or {}, stored.get("scale", 1.0), stored.get("about") or {}
+        )
+    except InputError as error:
+        raise InputError(f"{found}: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{found} is no calibration: {error}") from error
+
+
+def write(calibration: Calibration, path: str | Path) -> Path:
+    """Write a calibration whole, one quantity a line.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    groups = {"sensors": calibration.sensors, "broken": calibration.broken, "ranges": calibration.ranges}
+    lines = ["# Forces in N, times in s. device.calibration takes this file.", f"format: {FORMAT}"]
+    lines += [f"count: {len(calibration)}", f"scale: {calibration.scale!r}  # N per raw unit"]
+    for group, values in groups.items():
+        lines.append(f"{group}:" + ("" if values else " {}"))
+        lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]
+    lines.append(f"about: {json.dumps(dict(calibration.about))}")
+    path = Path(path).expanduser()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".part")
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error}") from error
+    return path
+
+
+def _known(given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:
+    if unknown := set(given) - set(names):
+        raise InputError(f"{group} takes {', '.join(names)}, got {', '.join(sorted(unknown))}")
+
+
+def _check(name: str, values: Sequence[float]) -> None:
+    numbers = all(isinstance(value, int | float) and not math.isnan(value) for value in values)
+    if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
+        least = "" if name in _SIGNED else " from 0 up"
+        raise InputError(f"{name} must be numbers{least}, got {list(values)}")

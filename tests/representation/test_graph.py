@@ -188,7 +188,7 @@ def test_a_frame_whose_sensors_moved_has_the_graph_of_where_they_are(weight):
     body = replace(BODY, variation=0.2)
     graph = Graph(PLACES, BODY.size, positions="deformed", weight=weight, count=3, body=body)
     motion = moves()
-    x, matrices = graph.show(touches(motion))
+    x, matrices = graph.show(touches(motion))[:2]
     assert x.shape == (2, 5, 9, 1)
     assert matrices.shape == (2, 5, 9, 9)
     rest = PLACES.double().numpy()
@@ -209,7 +209,7 @@ def test_a_frame_whose_sensors_moved_has_the_graph_of_where_they_are(weight):
 def test_sensors_that_stay_have_the_graph_of_the_layout(weight):
     options = {"weight": weight, "body": BODY}
     still = touches(torch.zeros(2, 5, 9, 3))
-    x, matrices = Graph(PLACES, BODY.size, positions="deformed", **options).show(still)
+    x, matrices = Graph(PLACES, BODY.size, positions="deformed", **options).show(still)[:2]
     plain = Graph(PLACES, BODY.size, **options).show(still)
     assert plain.adjacency.shape == (9, 9)
     torch.testing.assert_close(matrices, plain.adjacency.expand_as(matrices))

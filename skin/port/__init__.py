@@ -1,0 +1,1 @@
+"""What is between a wire and its frames: protocol, decoder, reader. No options (docs/adr/0006)."""

@@ -1,0 +1,149 @@
+"""Where frames come from, as the reader's thread asks for them: a wire or a recording."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from time import monotonic, sleep
+from typing import Protocol
+
+import numpy as np
+
+from skin.port.decoder import Decoder
+from skin.port.frame import After, Frame
+from skin.port.health import Health, State
+from skin.port.wire import ByteStream
+
+__all__ = ["Feed", "Player", "Wire"]
+
+_log = logging.getLogger("skin.port")
+
+_WAIT = 0.1  # s
+_AT_ONCE = 256  # frames, where time does not matter
+_WEAK = {
+    "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
+    "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
+}
+
+
+class Feed(Protocol):
+    """Frames one after another.
+
+    Attributes:
+        patient: it can wait, so that no frame needs to be dropped.
+    """
+
+    patient: bool
+
+    def poll(self) -> list[Frame]:
+        """Return what came within about 0.1 s; OSError once it is unplugged, EOFError at its end."""
+
+    def states(self) -> tuple[State, ...]:
+        """Return what is wrong with each channel."""
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+class Wire:
+    """Frames from bytes, their channels judged; says in the log once a second what was wrong."""
+
+    patient = False
+
+    def __init__(
+        self, stream: ByteStream, decoder: Decoder, limits: tuple[float | None, float | None] | None
+    ) -> None:
+        self._stream, self._decoder, self._limits = stream, decoder, limits
+        self._health: Health | None = None
+        self._said = Counter(decoder.counters.bad)
+        self._said_at = monotonic()
+
+    def poll(self) -> list[Frame]:
+        """Return the frames that ended in what came; InputError if nothing can be read at all."""
+        data, now = self._stream.read(), monotonic()
+        frames = self._decoder.feed(data, now) if data else []
+        if frames and self._health is None:
+            self._health = self._first()
+        elif data and not frames and (refusal := self._decoder.refusal()):
+            raise refusal
+        if now - self._said_at >= 1:
+            self._say(now)
+        return [self._judged(frame) for frame in frames]
+
+    def states(self) -> tuple[State, ...]:
+        """Return what is wrong with each channel."""
+        return self._health.states() if self._health else ()
+
+    def close(self) -> None:
+        """Close the port."""
+        self._stream.close()
+
+    def _first(self) -> Health:
+        """Say what protects the frames, and find their limits."""
+        speech, header = self._decoder.speech, self._decoder.header
+        if speech is not None and speech.check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[speech.check])
+        if self._limits is not None:
+            return Health(self._limits)
+        return Health((None, 2**header.bits - 1 if header and header.bits else None))
+
+    def _judged(self, frame: Frame) -> Frame:
+        assert self._health is not None
+        if frame.after not in ("", "gap"):
+            self._health.restart()
+        return frame._replace(valid=self._health.valid(frame.values, frame.t))
+
+    def _say(self, now: float) -> None:
+        fresh = self._decoder.counters.bad - self._said
+        self._said, self._said_at = Counter(self._decoder.counters.bad), now
+        if fresh:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
+            trouble = self._decoder.quality.trouble
+            _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, f"; {trouble}" if trouble else "")
+
+
+class Player:
+    """Frames from memory, in real time or as fast as they are taken.
+
+    Args:
+        pieces: values (F, S) and valid (F, S) of each piece; a window should not span two of them.
+        rate: frames per second, Hz.
+        realtime: False: as fast as they are taken.
+    """
+
+    def __init__(
+        self, pieces: Iterable[tuple[np.ndarray, np.ndarray]], rate: float, realtime: bool = True
+    ) -> None:
+        self.patient = not realtime
+        self._rate, self._start = rate, monotonic()
+        self._frames = enumerate(self._all(pieces))
+        self._next = self._take()
+
+    def _all(self, pieces: Iterable[tuple[np.ndarray, np.ndarray]]) -> Iterator[Frame]:
+        for segment, (values, valid) in enumerate(pieces):
+            for place in range(len(values)):
+                after: After = "cut" if segment and not place else ""
+                yield Frame(None, 0.0, 0.0, values[place], valid[place], segment, 0, after)
+
+    def _take(self) -> Frame | None:
+        number, frame = next(self._frames, (0, None))
+        t = number / self._rate
+        return frame and frame._replace(seq=number, t=t, t_host=self._start + t)
+
+    def poll(self) -> list[Frame]:
+        """Return the frames that are due."""
+        if self._next is None:
+            raise EOFError("the recording has ended")
+        if not self.patient:
+            sleep(min(_WAIT, max(0.0, self._next.t_host - monotonic())))
+        frames, now = list[Frame](), monotonic()
+        while self._next and len(frames) < _AT_ONCE and (self.patient or self._next.t_host <= now):
+            frames.append(self._next)
+            self._next = self._take()
+        return frames
+
+    def states(self) -> tuple[State, ...]:
+        """Return nothing: what a file says is valid is in its frames."""
+        return ()
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -1,0 +1,115 @@
+"""Serial ports and TCP sockets as streams of bytes."""
+
+import errno
+import socket
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from skin.errors import InputError
+
+try:
+    import termios
+except ImportError:  # Windows
+    _Gone: type[Exception] = OSError
+else:
+    _Gone = termios.error
+
+__all__ = ["ByteStream", "open_wire"]
+
+_WAIT = 0.1  # s
+_CONNECT = 5.0  # s
+_MOST = 65536  # bytes at once
+
+
+class ByteStream(Protocol):
+    """Where bytes come from; an opener of one's own returns such an object."""
+
+    def read(self) -> bytes:
+        """Return what came, after 0.1 s at the latest, even if it is nothing; OSError once it is gone."""
+
+    def close(self) -> None:
+        """Let go of the port."""
+
+
+def open_wire(port: str, baudrate: int) -> ByteStream:
+    """Open a serial port, or ``socket://host:number``.
+
+    Raises:
+        InputError: there is no such port, it may not be opened, is in use, or is no port.
+    """
+    return _Socket(port) if port.startswith("socket://") else _Serial(port, baudrate)
+
+
+class _Serial:
+    def __init__(self, port: str, baudrate: int) -> None:
+        import serial
+
+        try:
+            # Exclusive, or two readers would get half the bytes each.
+            self._port = serial.Serial(port, baudrate, timeout=_WAIT, exclusive=True)
+        except (OSError, _Gone, ValueError, OverflowError) as error:
+            raise _refused(port, baudrate, error) from error
+
+    def read(self) -> bytes:
+        try:
+            return self._port.read(max(1, min(self._port.in_waiting, _MOST)))
+        except (OSError, _Gone) as error:
+            raise OSError(str(error)) from error
+
+    def close(self) -> None:
+        self._port.close()
+
+
+class _Socket:
+    def __init__(self, port: str) -> None:
+        try:
+            address = urlsplit(port)
+            host, number = address.hostname, address.port
+        except ValueError:
+            host = number = None
+        if not host or not number:
+            raise InputError(f"{port} is no address: give device.port=socket://HOST:NUMBER")
+        try:
+            self._socket = socket.create_connection((host, number), timeout=_CONNECT)
+        except OSError as error:
+            raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._socket.settimeout(_WAIT)
+
+    def read(self) -> bytes:
+        try:
+            data = self._socket.recv(_MOST)
+        except TimeoutError:
+            return b""
+        if not data:
+            raise ConnectionResetError("the other side closed the connection")
+        return data
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _refused(port: str, baudrate: int, error: Exception) -> InputError:
+    number, text = getattr(error, "errno", None), str(error)
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
+        return InputError(f"no port {port}: {_existing()}")
+    # Windows says "access is denied" of a port that another program holds.
+    if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "PermissionError" in text:
+        return InputError(f"{port} is in use: close the serial monitor, or whatever else reads it")
+    if number in (errno.EACCES, errno.EPERM):
+        return InputError(
+            f"{port} may not be opened: add your user to dialout with "
+            "sudo usermod -a -G dialout $USER, and log in anew"
+        )
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
+        return InputError(f"{port} is no serial port: {_existing()}")
+    return InputError(f"cannot open {port} with device.baudrate={baudrate}: {text}")
+
+
+def _existing() -> str:
+    from serial.tools import list_ports
+
+    ports = ", ".join(sorted(entry.device for entry in list_ports.comports()))
+    return (
+        f"there are {ports}; give device.port=PORT" if ports else "there is no serial port; is it plugged in?"
+    )

@@ -99,6 +99,9 @@ class Config:
     stream: dict[str, Any] | None = None
     embeddings: dict[str, Any] | None = None
     moving: dict[str, Any] | None = None
+    session: str | None = None
+    presses: str | None = None
+    calibrate: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

@@ -44,6 +44,7 @@ class Calibration:
         ranges: quantity -> (low, high), drawn evenly for every sensor of a device; ``dead`` -> (fewest, most)
             sensors of a device that are dead.
         scale: N per raw unit of the session; 1 where that is N.
+        zero: raw units that stand for 0 N before offsets: a raw value is (raw - zero) scale, N.
         about: whence this is; anything that JSON can hold.
 
     Raises:
@@ -54,6 +55,7 @@ class Calibration:
     broken: Mapping[str, Sequence[int]] = field(default_factory=dict)
     ranges: Mapping[str, Sequence[float]] = field(default_factory=dict)
     scale: float = 1.0
+    zero: float = 0.0
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -78,6 +80,16 @@ class Calibration:
 
     def __len__(self) -> int:
         return len(next(iter(self.sensors.values())))
+
+    def newtons(self, raw: np.ndarray) -> np.ndarray:
+        """Return raw values in N, with offsets and gains: what a simulated device of this kind says."""
+        return (raw - self.zero) * self.scale
+
+    def corrected(self, raw: np.ndarray) -> np.ndarray:
+        """Return the true readings behind raw values, (..., S), N: no offset, gain 1; broken ones NaN."""
+        values = self.values()
+        true = (self.newtons(raw) - values["offset"]) / values["gain"]
+        return np.where(values["dead"], np.nan, true)
 
     def fits(self, sensors: int) -> None:
         """Raise InputError where this is not the calibration of so many sensors."""
@@ -148,9 +160,9 @@ def read(path: str | Path) -> Calibration:
             for name, value in stored["sensors"].items()
         }
         broken = stored.get("broken") or {}
-        return Calibration(
-            sensors, broken, stored.get("ranges") or {}, stored.get("scale", 1.0), stored.get("about") or {}
-        )
+        ranges, about = stored.get("ranges") or {}, stored.get("about") or {}
+        scale, zero = float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0))
+        return Calibration(sensors, broken, ranges, scale, zero, about)
     except InputError as error:
         raise InputError(f"{found}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -166,6 +178,7 @@ def write(calibration: Calibration, path: str | Path) -> Path:
     groups = {"sensors": calibration.sensors, "broken": calibration.broken, "ranges": calibration.ranges}
     lines = ["# Forces in N, times in s. device.calibration takes this file.", f"format: {FORMAT}"]
     lines += [f"count: {len(calibration)}", f"scale: {calibration.scale!r}  # N per raw unit"]
+    lines.append(f"zero: {calibration.zero!r}  # raw units at 0 N, before offsets")
     for group, values in groups.items():
         lines.append(f"{group}:" + ("" if values else " {}"))
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]

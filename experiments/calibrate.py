@@ -1,0 +1,83 @@
+"""Fit a simulated device to a real one: python experiments/calibrate.py session=bench.csv presses=gauge.csv
+
+Writes out=, which device.calibration= takes; ends with 1 where it does not simulate held-out presses better.
+calibrate.demo=true writes a session of an emulated device first: no hardware needed.
+"""
+
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig
+
+from skin.config import command, plain
+from skin.errors import InputError
+
+if TYPE_CHECKING:
+    from skin.device.simulated import Simulated
+
+
+@command("calibrate")
+def main(config: DictConfig) -> None:
+    """Read a session and what pressed the skin; judge a calibration on held-out presses, write one of all."""
+    if config.session is None:
+        raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
+
+    from rich.console import Console
+
+    from skin.build import build_device
+    from skin.calibration import gauge, session
+    from skin.calibration.bench import bench
+    from skin.calibration.fit import fit
+    from skin.calibration.outcome import judge
+    from skin.calibration.show import about, show
+    from skin.calibration.values import write
+    from skin.device.simulated import Simulated
+
+    settings = plain(config)["calibrate"]
+    device = build_device(config)
+    if not isinstance(device, Simulated):
+        raise InputError("a calibration fits the simulation to a skin: leave out device=")
+    if settings["demo"]:
+        _demo(device, settings, config.session)
+    shape = settings["indenter"], settings["radius"]
+    said = session.read(config.session, *shape, settings["unit"])
+    rows = None if config.presses is None else gauge.read(config.presses, *shape, settings["delay"])
+    with Console(stderr=True).status("fitting"):
+        found = bench(device, said, rows)
+        outcome, calibration = judge(found, settings["held_out"]), fit(found)
+    show(calibration, outcome)
+    if not outcome.helps:
+        print(
+            f"It does not help, so {config.out} was not written: is the layout, the body or the clock wrong?"
+        )
+        sys.exit(1)
+    about_all = {
+        **calibration.about,
+        **about(outcome),
+        "session": config.session,
+        "presses_file": config.presses,
+    }
+    print(write(replace(calibration, about=about_all), config.out))
+
+
+def _demo(device: "Simulated", settings: dict[str, Any], path: str) -> None:
+    """Write what an emulated device says to the press protocol."""
+    import numpy as np
+
+    from skin.calibration.protocol import Protocol, emulate
+    from skin.calibration.session import write
+
+    try:
+        protocol = Protocol(**settings["protocol"])
+    except TypeError as error:
+        raise InputError(f"calibrate.protocol: {error}") from error
+    randomness = np.random.default_rng(device.seed)
+    rows = protocol.gauge(protocol.places(device, randomness))
+    print(
+        f"{write(emulate(device, rows, protocol, randomness, settings['bits']), path)}: {len(rows)} presses"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""One channel of a session: robust statistics of its idle frames and of its answer to presses."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import theilslopes
+
+__all__ = ["Idle", "clip_and_gain", "decay", "idle", "quantum"]
+
+_BLOCKS = 200
+_POINTS = 400
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class Idle:
+    """What an untouched channel says, in the session's unit.
+
+    Attributes:
+        offset: median, at time 0 where it drifts.
+        drift: per s; 0 where it does not pass its confidence interval of 95 %.
+        noise: 1.4826 times the median absolute deviation.
+    """
+
+    offset: float
+    drift: float
+    noise: float
+
+
+def quantum(values: np.ndarray) -> float:
+    """Return the smallest step between values, 0 where they are as good as continuous.
+
+    Steps are believed where values come back often: with fewer than a fifth of them distinct.
+    """
+    distinct = np.unique(values)
+    if len(distinct) < 2 or len(distinct) > 0.2 * len(values):
+        return 0.0
+    steps = np.diff(distinct)
+    # Single precision splits one step in two that differ in their last digit.
+    return float(steps[steps > 1e-5 * np.abs(distinct).max()].min())
+
+
+def idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
+    """Describe idle frames.
+
+    Args:
+        time: s.
+        values: in the session's unit, steps of ``step`` apart (0: continuous).
+        step: of the converter.
+    """
+    values = _spread(values, step)
+    blocks = np.array_split(np.arange(len(values)), min(_BLOCKS, max(2, len(values) // 10)))
+    middles = np.array([[time[block].mean(), np.median(values[block])] for block in blocks])
+    slope, _, low, high = theilslopes(middles[:, 1], middles[:, 0])
+    drift = 0.0 if low <= 0 <= high else float(slope)
+    rest = values - drift * time
+    offset = float(np.median(rest))
+    spread = _MAD * float(np.median(np.abs(rest - offset)))
+    # Rounding and undoing it evenly add a step's variance each (Sheppard's correction).
+    return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
+
+
+def _spread(values: np.ndarray, step: float) -> np.ndarray:
+    """Spread equal values evenly over the step they were rounded to: a median between steps needs it."""
+    if step == 0:
+        return values
+    _, group, count = np.unique(values, return_inverse=True, return_counts=True)
+    order = np.argsort(group, kind="stable")
+    rank = np.empty(len(values))
+    rank[order] = np.arange(len(values)) - np.repeat(np.cumsum(count) - count, count)
+    # Ranks follow time; a fixed shuffle keeps a drift from being bent by them.
+    place = (rank * 0.6180339887498949) % 1
+    return values + step * (place - 0.5)
+
+
+def decay(time: np.ndarray, values: np.ndarray, floor: float) -> tuple[float, float]:
+    """Return the time constant of a decay to 0, s, and its weight; (0, 0) where fewer than 3 frames show it.
+
+    Args:
+        time: s.
+        values: from the release on, without offset.
+        floor: below this they are noise.
+    """
+    below = np.flatnonzero(values <= floor)
+    count = below[0] if len(below) else len(values)
+    if count < 3:
+        return 0.0, 0.0
+    weights = values[:count]  # of the logarithm, whose error is the noise over the value
+    slope = np.polyfit(time[:count], np.log(values[:count]), 1, w=weights)[0]
+    if slope >= 0:
+        return 0.0, 0.0
+    return float(-1 / slope), float((weights**2).sum())
+
+
+def clip_and_gain(true: np.ndarray, said: np.ndarray, noise: float) -> tuple[float, float, float | None]:
+    """Return the slope of said over true readings, its standard error, and the plateau, None if not reached.
+
+    Args:
+        true: (n,), loading frames.
+        said: (n,), without offset.
+        noise: of a frame.
+    """
+    top = true >= 0.9 * true.max()
+    level = float(np.median(said[top]))
+    slope, error = _slope(true[said < 0.7 * level], said[said < 0.7 * level])
+    if not slope * np.median(true[top]) > level + max(6 * noise, 0.05 * level):
+        return *_slope(true, said), None
+    for _ in range(2):
+        level = float(np.median(said[slope * true > 1.1 * level]))
+        below = slope * true < 0.9 * level
+        slope, error = _slope(true[below], said[below])
+    return slope, error, level
+
+
+def _slope(true: np.ndarray, said: np.ndarray) -> tuple[float, float]:
+    """Return the Theil-Sen slope and its standard error; infinite error where it rests on nothing."""
+    if len(true) < 3 or np.ptp(true) == 0:
+        return math.nan, math.inf
+    some = np.unique(np.linspace(0, len(true) - 1, _POINTS).astype(int))
+    slope, _, low, high = theilslopes(said[some], true[some])
+    return float(slope), float(high - low) / (2 * 1.96)

@@ -1,0 +1,84 @@
+"""Tables of a bench: CSV or Parquet with a header, whatever wrote them."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from skin.errors import InputError
+
+__all__ = ["load", "numbers", "save"]
+
+_KEY = b"skin_session"
+
+
+def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
+    """Return a table and what is known about it: JSON in a Parquet schema, or in ``x.csv.json`` beside it.
+
+    Lines of a CSV that start with ``#`` are comments.
+
+    Raises:
+        InputError: no such file, another ending, unreadable, or no rows.
+    """
+    path = Path(path).expanduser()
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError(f"{what} is a .csv or .parquet file, got {path.name}")
+    if not path.is_file():
+        raise InputError(f"no {what} {path}")
+    try:
+        if path.suffix == ".parquet":
+            table = pa.parquet.read_table(path)
+            about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
+        else:
+            lines = path.read_text(encoding="utf-8-sig").splitlines(keepends=True)
+            text = "".join(line for line in lines if not line.startswith("#"))
+            table = pa.csv.read_csv(pa.py_buffer(text.encode()))
+            sidecar = path.with_name(path.name + ".json")
+            about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise InputError(f"cannot read the {what} {path}: {error}") from error
+    if not len(table):
+        raise InputError(f"the {what} {path} has no rows below its header")
+    return table.rename_columns([name.strip() for name in table.column_names]), about
+
+
+def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
+    """Write what :func:`load` reads, under a temporary name first.
+
+    Raises:
+        InputError: another ending, or the file cannot be written.
+    """
+    path, table = Path(path).expanduser(), pa.table(dict(columns))
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError(f"a session is a .csv or .parquet file, got {path.name}: as in session=bench.csv")
+    partial = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".parquet":
+            pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
+        else:
+            pa.csv.write_csv(table, partial)
+            path.with_name(path.name + ".json").write_text(json.dumps(dict(about)) + "\n", encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error}") from error
+    return path
+
+
+def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
+    """Return a column as float64; empty cells are NaN.
+
+    Raises:
+        InputError: the column is missing or holds something else than numbers.
+    """
+    if name not in table.column_names:
+        raise InputError(f"{where}: no column {name}, found {', '.join(table.column_names)}")
+    try:
+        return table[name].cast(pa.float64()).to_numpy()
+    except pa.ArrowException as error:
+        raise InputError(f"{where}: column {name} must hold numbers: {error}") from error

@@ -144,12 +144,17 @@ def _dropped(share: float) -> list[nn.Module]:
 
 
 class _Standardised(nn.BatchNorm1d):
-    """Batch norm that takes a last batch of one touch too, by what it has seen before."""
+    """Batch norm that takes a last batch of one touch too, by what it has seen before.
+
+    Its statistics are plain means over all batches: a moving average would begin at a variance of 1, which of
+    numbers in metres is wrong for a thousand batches.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
         """Return x (B, D) with mean 0 and deviation 1 in each column."""
-        learning = self.training and len(x) > 1
-        return F.batch_norm(x, self.running_mean, self.running_var, None, None, learning, 0.01, self.eps)
+        if self.training and len(x) == 1:
+            return F.batch_norm(x, self.running_mean, self.running_var, eps=self.eps)
+        return super().forward(x)
 
 
 class _Summary(nn.Module):
@@ -158,7 +163,7 @@ class _Summary(nn.Module):
     def __init__(self, numbers: int, width: int, activation: str) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            _Standardised(numbers, affine=False),
+            _Standardised(numbers, affine=False, momentum=None),
             nn.Linear(numbers, width),
             activation_of(activation),
             nn.Linear(width, width),

@@ -173,6 +173,14 @@ def test_the_learning_rate_rises_and_falls(step, share):
     assert chosen["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-3 * share, abs=1e-6)
 
 
+def test_what_is_learnt_in_few_batches_holds_in_use_whatever_the_unit():
+    torch.manual_seed(0)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    x, summary = torch.randn(512, 3, 2), 1e-3 * torch.randn(512, 3) + 5e-3
+    learning = torch.cat([network(Frames(x[i], None, summary[i])) for i in torch.arange(512).split(128)])
+    torch.testing.assert_close(network.eval()(Frames(x, None, summary)), learning, rtol=0.1, atol=0.1)
+
+
 def test_a_batch_of_one_touch_can_be_learnt_from():
     network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
     logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))

@@ -133,7 +133,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 def fingerprint(config: DictConfig) -> str:
     """Return a hash of what a run's result depends on: configuration, the files it names, version."""
-    content = {key: value for key, value in plain(config).items() if key not in _STEERING}
+    # What is not set belongs to other commands; a new command must not make every finished run look unknown.
+    groups = plain(config).items()
+    content = {key: value for key, value in groups if key not in _STEERING and value is not None}
     files = {value: _digest(value) for value in _strings(content) if _file(value)}
     text = json.dumps([content, files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -88,6 +88,10 @@ def test_keys_that_only_steer_leave_the_fingerprint(configured):
     assert fingerprint(same) == fingerprint(configured())
 
 
+def test_keys_of_other_commands_leave_the_fingerprint(configured):
+    assert fingerprint(checked(configured())) == fingerprint(configured())
+
+
 @pytest.mark.parametrize(
     "override",
     ["seed=1", "simulator=naive", "device.noise=0.06", "trainer.max_epochs=3", "evaluation.gestures=801"],

@@ -81,7 +81,7 @@ def evaluate(learner: Answers, device: AbstractDevice, settings: Evaluation) -> 
             continue
         if each:
             found |= _named(column, {name: fmean(values[name] for values in each) for name in each[0]})
-    table = confusion(chances, _labels(same)) if task.kind == "binary" else None
+    table = confusion(chances, _labels(same), task) if task.kind == "binary" else None
     return Report(found, cannot, table, _predictions(chances, same, task, drawn))
 
 

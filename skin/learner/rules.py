@@ -129,7 +129,9 @@ def _told(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> 
 def _tune(label: str, known: _Split, other: _Split) -> Rule:
     """Return the best rule for one label: measurement and threshold from ``known``, slope from ``other``."""
     values, truth = known
-    allowed = [name for name in values if name.startswith(LOOK_AT[label])]
+    # A blank ends both, so that maximum 1 does not mean maximum 10 too.
+    looked_at = tuple(f"{name} " for name in LOOK_AT[label])
+    allowed = [name for name in values if f"{name} ".startswith(looked_at)]
     _, threshold, name = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
     values, truth = other
     distance = values[name].double().numpy() - threshold

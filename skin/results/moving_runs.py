@@ -97,8 +97,10 @@ def latest(store: Store, simulator: str, rows: str | Sequence[str]) -> list[Run]
     """
     found: dict[str, Run] = {}
     for run in store.find("FINISHED", simulator=simulator):
-        # Runs of this study train on other skins; a peer of another environment cannot be brought back.
-        if "learned" in run.data.tags and not run.data.tags["row"].startswith("moving_"):
+        # Runs of this study train on other skins, those on streams know another task; a peer of another
+        # environment cannot be brought back.
+        other = run.data.tags["row"].startswith("moving_") or run.data.params.get("stream") == "True"
+        if "learned" in run.data.tags and not other:
             found.setdefault(run.data.tags["row"], run)
     if rows == "all":
         return [found[row] for row in sorted(found)]

@@ -22,7 +22,7 @@ $(READY): pyproject.toml constraints.txt
 install: $(READY)  ## build .venv; the other targets call it
 
 test: $(READY)  ## the test suite
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 check: $(READY)  ## lint, format and types
 	$(BIN)/ruff check .

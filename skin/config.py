@@ -102,6 +102,13 @@ class Config:
     session: str | None = None
     presses: str | None = None
     calibrate: dict[str, Any] | None = None
+    port: str | None = None
+    link: str | None = None
+    seconds: float | None = None
+    gestures: int | None = None
+    format: str | None = None
+    emulate: dict[str, Any] | None = None
+    faults: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

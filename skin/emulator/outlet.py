@@ -1,0 +1,170 @@
+"""Where an emulated skin can be plugged in: a pseudo-terminal or a TCP port."""
+
+import os
+import select
+import socket
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic
+
+from skin.errors import InputError
+
+__all__ = ["AbstractOutlet", "outlet"]
+
+_PATIENCE = 1.0  # s that a reader may be late before bytes are lost, as in a device without flow control
+
+
+class AbstractOutlet(ABC):
+    """A port that somebody may be connected to.
+
+    Attributes:
+        address: what ``device.port`` takes.
+    """
+
+    address: str
+
+    @abstractmethod
+    def connected(self) -> bool:
+        """Return whether somebody listens."""
+
+    @abstractmethod
+    def unplug(self) -> None:
+        """Vanish."""
+
+    @abstractmethod
+    def plug(self) -> None:
+        """Appear at the same address."""
+
+    @abstractmethod
+    def _send(self, data: bytes) -> int:
+        """Write some of ``data`` without waiting and return how much."""
+
+    @abstractmethod
+    def _handle(self) -> int:
+        """Return the file descriptor that is written to."""
+
+    def write(self, data: bytes) -> None:
+        """Write; what nobody takes within a second is lost."""
+        deadline = monotonic() + _PATIENCE
+        while data and self.connected() and monotonic() < deadline:
+            try:
+                data = data[self._send(data) :]
+            except BlockingIOError:
+                select.select([], [self._handle()], [], 0.05)
+            except OSError:
+                return
+
+
+def outlet(port: str, link: str | None) -> AbstractOutlet:
+    """Return what ``port`` names: ``pty``, or ``tcp:NUMBER`` (0: any that is free).
+
+    Args:
+        port: as above.
+        link: a path by which the pseudo-terminal can be found, and found again after it was unplugged.
+
+    Raises:
+        InputError: another name, a number in use, or a link that cannot be made.
+    """
+    kind, _, number = port.partition(":")
+    if kind == "pty" and not number:
+        return _Pty(link)
+    if kind == "tcp" and number.isascii() and number.isdigit() and int(number) < 65536:
+        if link is not None:
+            raise InputError("a TCP port needs no link: leave out link=, or give port=pty")
+        return _Tcp(int(number))
+    raise InputError(f"port is pty or tcp:NUMBER, got {port}: as in port=tcp:5555")
+
+
+class _Pty(AbstractOutlet):
+    def __init__(self, link: str | None) -> None:
+        self._link = None if link is None else Path(link).expanduser().absolute()
+        if self._link and self._link.exists() and not self._link.is_symlink():
+            raise InputError(f"link={link} would replace a file: give another name")
+        self.plug()
+
+    def plug(self) -> None:
+        try:
+            import tty
+        except ImportError as error:  # Windows
+            raise InputError("there are no pseudo-terminals here: add port=tcp:5555") from error
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        name = os.ttyname(slave)
+        # Opened and closed once, it tells when somebody opens it.
+        os.close(slave)
+        self.address = name if self._link is None else str(self._link)
+        if self._link is not None:
+            partial = self._link.with_name(self._link.name + ".part")
+            try:
+                partial.unlink(missing_ok=True)
+                partial.symlink_to(name)
+                partial.replace(self._link)
+            except OSError as error:
+                raise InputError(f"cannot make link={self._link}: {error}") from error
+
+    def connected(self) -> bool:
+        watch = select.poll()
+        watch.register(self._master, 0)
+        return not any(event & select.POLLHUP for _, event in watch.poll(0))
+
+    def unplug(self) -> None:
+        if self._master >= 0:
+            os.close(self._master)
+            self._master = -1
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+    def _send(self, data: bytes) -> int:
+        return os.write(self._master, data)
+
+    def _handle(self) -> int:
+        return self._master
+
+
+class _Tcp(AbstractOutlet):
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self.plug()
+
+    def plug(self) -> None:
+        try:
+            self._server = socket.create_server(("127.0.0.1", self._number))
+        except OSError as error:
+            raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
+        self._server.setblocking(False)
+        self._number = self._server.getsockname()[1]
+        self.address = f"socket://127.0.0.1:{self._number}"
+        self._client: socket.socket | None = None
+
+    def connected(self) -> bool:
+        if self._client is not None and self._left(self._client):
+            self._client.close()
+            self._client = None
+        if self._client is None:
+            with suppress(BlockingIOError):
+                self._client, _ = self._server.accept()
+                self._client.setblocking(False)
+        return self._client is not None
+
+    def unplug(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+        self._server.close()
+
+    @staticmethod
+    def _left(client: socket.socket) -> bool:
+        try:
+            return not client.recv(4096)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def _send(self, data: bytes) -> int:
+        return self._client.send(data) if self._client else len(data)
+
+    def _handle(self) -> int:
+        return self._client.fileno() if self._client else -1

@@ -69,7 +69,7 @@ def _encoder(config: DictConfig) -> tuple[DictConfig, "Network"]:
     learner = build_learner(config)
     if not isinstance(learner, Network):
         raise InputError(
-            f"{config.run} is a run of {config.row}, which has no encoder: give a run of a network"
+            f"run {run.info.run_id} is of {config.row}, which has no encoder: give a run of a network"
         )
     restore(store, run, learner, build_data(config, build_device(config)))
     return config, learner

@@ -6,15 +6,12 @@ calibrate.demo=true writes a session of an emulated device first: no hardware ne
 
 import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 from omegaconf import DictConfig
 
 from skin.config import command, plain
 from skin.errors import InputError
-
-if TYPE_CHECKING:
-    from skin.device.simulated import Simulated
 
 
 @command("calibrate")
@@ -22,6 +19,9 @@ def main(config: DictConfig) -> None:
     """Read a session and what pressed the skin; judge a calibration on held-out presses, write one of all."""
     if config.session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
+    files = [config.presses, None if config.calibrate.demo else config.session]
+    if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
+        raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
 
     from rich.console import Console
 
@@ -30,6 +30,7 @@ def main(config: DictConfig) -> None:
     from skin.calibration.bench import bench
     from skin.calibration.fit import fit
     from skin.calibration.outcome import judge
+    from skin.calibration.protocol import demo
     from skin.calibration.show import about, show
     from skin.calibration.values import write
     from skin.device.simulated import Simulated
@@ -39,7 +40,7 @@ def main(config: DictConfig) -> None:
     if not isinstance(device, Simulated):
         raise InputError("a calibration fits the simulation to a skin: leave out device=")
     if settings["demo"]:
-        _demo(device, settings, config.session)
+        print(demo(device, settings, config.session))
     shape = settings["indenter"], settings["radius"]
     said = session.read(config.session, *shape, settings["unit"])
     rows = None if config.presses is None else gauge.read(config.presses, *shape, settings["delay"])
@@ -59,24 +60,6 @@ def main(config: DictConfig) -> None:
         "presses_file": config.presses,
     }
     print(write(replace(calibration, about=about_all), config.out))
-
-
-def _demo(device: "Simulated", settings: dict[str, Any], path: str) -> None:
-    """Write what an emulated device says to the press protocol."""
-    import numpy as np
-
-    from skin.calibration.protocol import Protocol, emulate
-    from skin.calibration.session import write
-
-    try:
-        protocol = Protocol(**settings["protocol"])
-    except TypeError as error:
-        raise InputError(f"calibrate.protocol: {error}") from error
-    randomness = np.random.default_rng(device.seed)
-    rows = protocol.gauge(protocol.places(device, randomness))
-    print(
-        f"{write(emulate(device, rows, protocol, randomness, settings['bits']), path)}: {len(rows)} presses"
-    )
 
 
 if __name__ == "__main__":

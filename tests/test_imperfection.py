@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from skin.calibration.values import Calibration
 from skin.errors import InputError
 from skin.imperfection import Imperfection
 
@@ -93,3 +94,85 @@ def test_bad_settings_are_refused():
         Imperfection(clip=0)
     with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
         Imperfection(dead=25).constants(25, generator())
+
+
+def test_the_default_device_is_what_it_was():
+    """Written down again: clip the force, add noise and offset; the order of the draws is part of it."""
+    true = 8 * torch.randn(40, 30, 25, generator=torch.Generator().manual_seed(0)).abs()
+    imperfection, draws, again = Imperfection(dead=2), generator(5), generator(5)
+    constants = imperfection.constants(25, draws)
+    said, valid = imperfection.apply(true, constants, draws)
+    gain = torch.from_numpy(np.exp(0.05 * again.standard_normal(25))).float()
+    offset = torch.from_numpy(0.1 * again.standard_normal(25)).float()
+    dead = torch.from_numpy(again.random(25).argsort().argsort() < 2)
+    again.standard_normal(25)
+    noise = torch.from_numpy(again.standard_normal(true.shape, dtype=np.float32))
+    expected = (true * gain).clamp(-10, 10) + (0.05 * noise + offset)
+    assert torch.equal(said, torch.where(dead, 0, expected))
+    assert torch.equal(valid, (~dead).expand(true.shape))
+
+
+def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
+    imperfection = Imperfection(dead=1, stuck=2, saturated=3)
+    constants = imperfection.constants(25, generator())
+    readings = torch.rand(2, 30, 25)
+    said, valid = imperfection.apply(readings, constants, generator(1))
+    assert (~valid).sum(-1).eq(6).all()
+    assert (said[~valid] == 0).all()
+    raw = imperfection.raw(readings, constants, generator(1))
+    levels = raw[0, 0, ~valid[0, 0]]
+    assert (raw[..., ~valid[0, 0]] == levels).all()
+    assert (levels == 0).sum() == 1
+    assert (levels == 10).sum() == 3
+    assert ((levels > 0) & (levels < 10)).sum() == 2
+
+
+def test_drift_grows_with_time():
+    said, _ = apply(torch.zeros(1, 301, 1000), drift=0.02)
+    assert (said[0, 0] == 0).all()
+    assert float(said[0, 300].std()) == pytest.approx(0.02 * 30, rel=0.1)
+    torch.testing.assert_close(said[0, 100] * 3, said[0, 300])
+
+
+def test_a_tare_is_taken_after_the_converter():
+    said, _ = apply(torch.zeros(1, 50, 200), quantum=0.5, offset=2.0, tare=True, noise=0.01)
+    steps = (said - said[:, :1]) / 0.5
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-4)
+
+
+CALIBRATION = Calibration(
+    {"gain": [0.8, 1.2, None], "offset": [0.1, -0.2, 0.3], "clip": [9.0, 5.0, None]},
+    {"stuck": [2]},
+    {"gain": [0.5, 1.5], "dead": [0, 2]},
+)
+
+
+def test_a_calibrated_device_is_the_real_one_whatever_the_seed():
+    imperfection = Imperfection(gain_spread=3, noise=3, offset=3, dead=0, calibration=CALIBRATION)
+    for seed in (0, 1):
+        said, valid = imperfection.apply(
+            torch.full((1, 2, 3), 10.0), imperfection.constants(3, generator(seed)), generator()
+        )
+        torch.testing.assert_close(said[0, 0], torch.tensor([8.1, 4.8, 0]))
+        assert valid[0, 0].tolist() == [True, True, False]
+
+
+def test_ranges_give_every_gesture_another_device():
+    constants = Imperfection(calibration=CALIBRATION).constants(3, generator(), gestures=3000)
+    assert constants.gain.min() >= 0.5
+    assert constants.gain.max() <= 1.5
+    assert abs(float(constants.gain.mean()) - 1) < 0.02
+    assert torch.equal(constants.offset[7], torch.tensor([[0.1, -0.2, 0.3]]))
+    counts = constants.dead.sum(-1).flatten().bincount(minlength=4)
+    assert counts[3] == 0
+    assert (counts[:3] > 900).all()
+
+
+def test_further_sensors_of_a_calibrated_device_may_die():
+    imperfection = Imperfection(dead=1, calibration=CALIBRATION)
+    alive = {int((~imperfection.constants(3, generator(seed)).dead).sum()) for seed in range(20)}
+    assert alive == {1, 2}
+    with pytest.raises(InputError, match=r"device.dead=3 of 3 sensors leaves none alive"):
+        Imperfection(dead=3, calibration=CALIBRATION).constants(3, generator())
+    with pytest.raises(InputError, match=r"the calibration has 3 sensors, the layout 25"):
+        imperfection.constants(25, generator())

@@ -20,7 +20,8 @@ class Idle:
     Attributes:
         offset: median, at time 0 where it drifts.
         drift: per s; 0 where it does not pass its confidence interval of 95 %.
-        noise: 1.4826 times the median absolute deviation.
+        noise: 1.4826 times the median absolute deviation; under steps about as large as it, the standard
+            deviation without outliers.
     """
 
     offset: float
@@ -57,7 +58,10 @@ def idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
     rest = values - drift * time
     offset = float(np.median(rest))
     spread = _MAD * float(np.median(np.abs(rest - offset)))
-    # Rounding and undoing it evenly add a step's variance each (Sheppard's correction).
+    if step > 0.8 * spread:
+        # Too coarse for a median: the deviation of what is no outlier.
+        spread = float(np.std(rest[np.abs(rest - offset) <= 3 * max(spread, step)]))
+    # Rounding and undoing it evenly add the variance of a step each (Sheppard's correction).
     return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
 
 
@@ -103,14 +107,13 @@ def clip_and_gain(true: np.ndarray, said: np.ndarray, noise: float) -> tuple[flo
     """
     top = true >= 0.9 * true.max()
     level = float(np.median(said[top]))
-    slope, error = _slope(true[said < 0.7 * level], said[said < 0.7 * level])
-    if not slope * np.median(true[top]) > level + max(6 * noise, 0.05 * level):
+    slope, _ = _slope(true[said < 0.7 * level], said[said < 0.7 * level])
+    margin = max(2 * noise, 0.02 * level)
+    if not slope * np.median(true[top]) > level + margin:
         return *_slope(true, said), None
-    for _ in range(2):
-        level = float(np.median(said[slope * true > 1.1 * level]))
-        below = slope * true < 0.9 * level
-        slope, error = _slope(true[below], said[below])
-    return slope, error, level
+    level = float(np.median(said[slope * true > level + margin]))
+    below = slope * true < level - margin
+    return *_slope(true[below], said[below]), level
 
 
 def _slope(true: np.ndarray, said: np.ndarray) -> tuple[float, float]:

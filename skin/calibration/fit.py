@@ -16,6 +16,7 @@ from skin.lag import lagged, peaks
 __all__ = ["fit"]
 
 _PRESSED = 0.05  # of the largest true reading: less tells no gain
+_SURE = 6.0  # standard errors above 0: less is no answer either
 _LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated
 _DEAD = 0.05  # of the median gain: less is no answer
 
@@ -57,9 +58,9 @@ def fit(bench: Bench, presses: Collection[int] | None = None) -> Calibration:
     felt, bends = _regressors(bench.true, [channel.time_constant for channel in channels], bench.session.time)
     for number in answering:
         _answer(bench, used, number, channels[number], felt[:, number], bends[:, number])
-    gains = [channels[n].gain or 0.0 for n in answering]
+    gains = [gain for n in answering if (gain := channels[n].gain)]
     typical = float(np.median(gains)) if gains else 0.0
-    if typical <= 0:
+    if not gains:
         raise InputError("no channel answers to a press: check layout, indenter and the session's clock")
     for number in answering:
         if (channels[number].gain or 0.0) < _DEAD * typical:
@@ -129,11 +130,12 @@ def _answer(
     if up.sum() < 10:
         return
     gain, channel.error, channel.clip = _channel.clip_and_gain(felt[up], said[up], channel.idle.noise)
-    channel.gain = gain if np.isfinite(gain) else None
+    # A slope within its error is that of noise.
+    channel.gain = gain if gain > _SURE * channel.error else 0.0
     limit = np.inf if channel.clip is None else 0.9 * channel.clip
     # A gap no larger than the noise tells nothing.
     down = there & bench.unloading & (said < limit) & (bend > 0.05 * felt.max())
-    if down.sum() < 10 or not gain > 0:
+    if down.sum() < 10 or not channel.gain:
         return
     rest, lever = said[down] - gain * felt[down], gain * bend[down]
     keep = np.abs(rest - np.median(rest)) <= 6 * np.median(np.abs(rest - np.median(rest)))

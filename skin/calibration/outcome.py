@@ -11,6 +11,7 @@ from skin.calibration.fit import fit
 from skin.calibration.values import Calibration
 from skin.errors import InputError
 from skin.imperfection import Imperfection
+from skin.lag import lagged
 
 __all__ = ["Outcome", "estimate", "hold_out", "judge", "predicted"]
 
@@ -118,11 +119,16 @@ def estimate(raw: np.ndarray, each: np.ndarray, calibration: Calibration) -> np.
 
 
 def _forces(bench: Bench, presses: Sequence[int], calibration: Calibration) -> np.ndarray:
+    """Return the estimated force over the gauge's, which sensors feel behind their lag, of each press."""
     force, press = bench.applied
-    shares = []
+    lag = torch.tensor([float(np.median(calibration.known("time_constant")))]).double()
+    late = lagged(torch.from_numpy(force)[None, :, None], lag, torch.from_numpy(bench.session.time))
+    late_force = late[0, :, 0].numpy()
+    drift = calibration.known("drift") / calibration.scale * bench.session.time[:, None]
+    raw, shares = bench.session.raw - drift, []
     for number in presses:
         mine = bench.loading & (press == number)
         mine &= force > _LOADED * force[press == number].max()
-        shares.append(estimate(bench.session.raw[mine], bench.each[number], calibration) / force[mine])
+        shares.append(estimate(raw[mine], bench.each[number], calibration) / late_force[mine])
     known = [each[np.isfinite(each)] for each in shares]
     return np.array([np.median(each) for each in known if len(each)])

@@ -1,17 +1,18 @@
 """The press protocol of a bench, and what an emulated device says to it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from skin.calibration.gauge import Gauge, per_newton
-from skin.calibration.session import Session
+from skin.calibration.session import Session, write
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 
-__all__ = ["Protocol", "emulate"]
+__all__ = ["Protocol", "demo", "emulate", "true_readings"]
 
 
 @dataclass(frozen=True)
@@ -106,3 +107,24 @@ def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarra
     """Return true readings (T, S), N, of presses that give ``each`` (P, S) per N; 0 outside of them."""
     force, press = gauge.at(time)
     return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
+
+
+def demo(device: Simulated, settings: Mapping[str, Any], path: str) -> str:
+    """Write what an emulated device says to the protocol, and return a line about it.
+
+    Args:
+        device: whose constants are to be found.
+        settings: ``conf/calibrate.yaml`` under ``calibrate``.
+        path: .csv or .parquet.
+
+    Raises:
+        InputError: a protocol that cannot be used.
+    """
+    try:
+        protocol = Protocol(**settings["protocol"])
+    except TypeError as error:
+        raise InputError(f"calibrate.protocol: {error}") from error
+    randomness = np.random.default_rng(device.seed)
+    rows = protocol.gauge(protocol.places(device, randomness))
+    session = emulate(device, rows, protocol, randomness, settings["bits"])
+    return f"{write(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"

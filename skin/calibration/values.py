@@ -100,12 +100,14 @@ class Calibration:
             )
 
     def known(self, name: str) -> np.ndarray:
-        """Return a quantity, (S,): the median of the known where one is unknown, neutral where all are."""
+        """Return a quantity, (S,): the median of the known where one is unknown, neutral where all are.
+
+        So a sensor that was never driven to its limit clips where the others do: channels share a converter.
+        """
         given = np.array([np.nan if value is None else value for value in self.sensors.get(name, [None])])
         given = np.broadcast_to(given, (len(self),))
         spare = QUANTITIES[name]
-        # A sensor that was not driven to its limit has none that matters.
-        if name != "clip" and np.isfinite(given).any():
+        if np.isfinite(given).any():
             spare = float(np.nanmedian(given))
         return np.where(np.isnan(given), spare, given)
 

@@ -1,0 +1,75 @@
+"""The command that calibrates: from an emulated bench to a device that trains."""
+
+import subprocess
+import sys
+
+import pytest
+
+from skin.calibration.values import read
+from skin.config import ROOT
+
+SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
+
+
+def run(script: str, *arguments: object) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, ROOT / "experiments" / script, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=300,
+    )
+
+
+@pytest.mark.slow
+def test_from_a_bench_to_touches_of_the_calibrated_device(tmp_path):
+    session, out = tmp_path / "bench.parquet", tmp_path / "mine.yaml"
+    done = run(
+        "calibrate.py",
+        *SMALL,
+        f"session={session}",
+        f"out={out}",
+        "calibrate.demo=true",
+        "device.gain_spread=0.2",
+    )
+    assert done.returncode == 0, done.stderr
+    assert "8 presses" in done.stdout
+    assert "RMSE on 2 held-out presses" in done.stdout
+    assert len(read(out)) == 4
+    touches = tmp_path / "touches.csv"
+    made = run(
+        "generate.py",
+        *SMALL[:3],
+        "n=16",
+        f"out={touches}",
+        f"device.calibration={out}",
+        "device.randomise=true",
+    )
+    assert made.returncode == 0, made.stderr
+    assert touches.is_file()
+
+
+@pytest.mark.slow
+def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(tmp_path):
+    """A skin that is what the simulation says cannot gain from a fit to its noise."""
+    perfect = ["device.gain_spread=0", "device.offset=0", "device.clip=1000"]
+    session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
+    done = run("calibrate.py", *SMALL, *perfect, f"session={session}", f"out={out}", "calibrate.demo=true")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "It does not help" in done.stdout
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ((), "which session?"),
+        (("session=none.csv",), "no session none.csv"),
+        (("session=x.csv", "device=cost"), ""),
+    ],
+)
+def test_bad_input_ends_with_2_and_one_sentence(arguments, reason):
+    done = run("calibrate.py", *arguments)
+    assert done.returncode == 2
+    assert reason in done.stderr
+    assert "Traceback" not in done.stderr

@@ -4,7 +4,7 @@ import numpy as np
 
 from skin.errors import InputError
 
-__all__ = ["rest"]
+__all__ = ["median", "rest"]
 
 _FEWEST = 10  # frames
 # As multiples of the noise and of the smallest step seen.
@@ -29,9 +29,7 @@ def rest(
     Raises:
         InputError: too few frames, or the skin was touched.
     """
-    if len(values) < _FEWEST:
-        raise InputError(f"a baseline needs {_FEWEST} frames, got {len(values)}: give more seconds")
-    middle: np.ndarray = np.median(values, axis=0)
+    middle = median(values)
     asked = np.asarray(valid.any(axis=0))
     steps = np.abs(np.diff(values, axis=0))
     # From differences, because a touch that lasts half the time would pass for noise otherwise.
@@ -44,6 +42,17 @@ def rest(
         limit = np.maximum(np.maximum(_SHIFTED[0] * noise, _SHIFTED[1] * smallest), touch)
         _refuse("rests away from its old baseline by", np.abs(middle - before), limit, asked)
     return middle
+
+
+def median(values: np.ndarray) -> np.ndarray:
+    """Return the median of each channel (S,) over frames (F, S), touched or not.
+
+    Raises:
+        InputError: too few frames.
+    """
+    if len(values) < _FEWEST:
+        raise InputError(f"a baseline needs {_FEWEST} frames, got {len(values)}: give more seconds")
+    return np.asarray(np.median(values, axis=0))
 
 
 def _refuse(what: str, found: np.ndarray, limit: np.ndarray, asked: np.ndarray) -> None:

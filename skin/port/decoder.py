@@ -77,17 +77,22 @@ class Decoder:
 
     def refusal(self) -> InputError | None:
         """Return why nothing can be read, once 2 s of receiving or 4 kB (or four frames) show no format."""
-        enough = max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
-        if self.speech or (self._receiving < _PATIENCE and len(self._buffer) < enough):
+        if self.speech or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
             return None
         return refusal(self._buffer, self._found, self.sensors)
+
+    @property
+    def _enough(self) -> int:
+        """Bytes in which the format must show: 4 kB, or four frames."""
+        return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
 
     def _recognise(self, data: bytes, now: float) -> bool:
         """Keep the beginning until it shows its format; it is decoded again from its first byte then."""
         passed = now - self._fed_at
         self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
         self._fed_at = now
-        self._buffer = self._buffer[-_LONGEST:]
+        # Where nothing was recognised for long, only the latest is searched.
+        self._buffer = self._buffer[-2 * self._enough :]
         if b"\n" not in data and b"\0" not in data:
             return False
         self._found = detect(self._buffer, self.sensors, self.format)

@@ -171,12 +171,12 @@ def _detect_text(data: bytes, sensors: int | None, other: int | None) -> Found:
             continue
         if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
             run = []
-        run = [*run, read] if read.fields else []
+        run = [*run[1 - _LINES_UNKNOWN :], read] if read.fields else []
         expected = sensors or (header.n if header else None)
         if speech := _judge(run, expected, learn=sensors is None):
             return Found(speech, None, header)
         if len(run) >= _LINES:
-            other = len(run[0].fields) - 2 * _all_count(run)
+            other = len(read.fields) - 2 * _all_count(run[-_LINES:])
     return Found(None, other, header)
 
 
@@ -192,7 +192,7 @@ def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> Text | None
         return Text(sensors, True, check)
     if not learn or len(run) < _LINES_UNKNOWN:
         return None
-    counting = _all_count(run[-_LINES_UNKNOWN:])
+    counting = _all_count(run)
     return Text(count - 2 * counting, counting, check)
 
 

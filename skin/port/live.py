@@ -7,7 +7,7 @@ from time import monotonic
 import numpy as np
 
 from skin.errors import InputError
-from skin.port.baseline import rest
+from skin.port.baseline import median, rest
 from skin.port.decoder import Decoder
 from skin.port.errors import SkinDisconnected, SkinTimeout
 from skin.port.frame import Counters, Frame
@@ -125,7 +125,8 @@ class Skin:
                 of the range, where the device tells its bits.
 
         Raises:
-            InputError: the skin is touched or started anew meanwhile; the old baseline is kept.
+            InputError: the skin is touched or started anew meanwhile, or too few frames came; the old
+                baseline is kept.
         """
         frames, start = list[Frame](), monotonic()
         while not frames or frames[-1].t_host < start + seconds:
@@ -137,7 +138,7 @@ class Skin:
         if touch is None:
             touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
-        self.baseline = np.median(values, axis=0) if force else rest(values, valid, self.baseline, touch)
+        self.baseline = median(values) if force else rest(values, valid, self.baseline, touch)
         return self.baseline
 
     @property

@@ -102,9 +102,12 @@ class Config:
     session: str | None = None
     presses: str | None = None
     calibrate: dict[str, Any] | None = None
+    dead: dict[str, Any] | None = None
     port: str | None = None
     link: str | None = None
     seconds: float | None = None
+    web: bool | None = None
+    live: dict[str, Any] | None = None
     gestures: int | None = None
     format: str | None = None
     emulate: dict[str, Any] | None = None

@@ -1,0 +1,1 @@
+"""What happens to a stream between the port and a person: window, verdict, terminal, page. No options."""

@@ -1,0 +1,94 @@
+"""From a finished run to an engine that knows what it learned."""
+
+from dataclasses import dataclass
+
+import torch
+from mlflow.entities import Run
+from omegaconf import DictConfig, OmegaConf
+
+from skin.build import build_data, build_device, build_learner
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.evaluation import Answers
+from skin.gate import Threshold, gates, rise
+from skin.live.engine import Engine
+from skin.live.verdict import Patience
+from skin.reload import restore
+from skin.tracking import Store
+
+__all__ = ["Trained", "engine", "trained"]
+
+_FEW = 10  # gestures, where only their shape matters
+_MANY = 4000  # windows of streams, a tenth of which tunes what touch is
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A run brought back.
+
+    Attributes:
+        device: that it was trained on, with few gestures.
+        learner: trained.
+        window: T, frames.
+        positions: (S, 3), m.
+        rate: Hz.
+    """
+
+    device: AbstractDevice
+    learner: Answers
+    window: int
+    positions: torch.Tensor
+    rate: float
+
+
+def trained(store: Store, run: Run, config: DictConfig) -> Trained:
+    """Return a run with what it learned.
+
+    Args:
+        store: where it is.
+        run: a finished training.
+        config: its configuration, changed as :func:`skin.reload.changed` does.
+
+    Raises:
+        InputError: what it learned does not fit the configuration.
+    """
+    own = OmegaConf.create(OmegaConf.to_container(config))
+    assert isinstance(own, DictConfig)
+    if "gestures" in own.device:
+        own.device.gestures = _FEW
+        own.device.fresh = False
+    device, learner = build_device(own), build_learner(own)
+    data = build_data(own, device)
+    restore(store, run, learner, data)
+    known = data.touches("train")
+    return Trained(device, learner, known.readings.shape[1], known.positions, known.rate)
+
+
+def engine(of: Trained, patience: Patience, touch: float | None = None) -> Engine:
+    """Return the engine of a run.
+
+    Args:
+        of: the run.
+        patience: how long answers must hold.
+        touch: N above its baseline from which on a reading is a touch; None: as the run learned it, or else
+            tuned on simulated streams of its device.
+
+    Raises:
+        InputError: neither learned nor given, and no device that has streams.
+    """
+    task = of.device.task
+    least = touch if touch is not None else 0.0 if task.gate else _tuned(of.device)
+    gate = gates(Threshold(least), task)
+    chosen = gate["learned"] if touch is None and task.gate else gate["threshold"]
+    return Engine(of.learner, task, of.positions, of.window, of.rate, chosen, patience)
+
+
+def _tuned(device: AbstractDevice) -> float:
+    if not isinstance(device, Simulated):
+        raise InputError(
+            "this run does not know what no touch is: give live.touch=0.3 (N), or train on streams"
+        )
+    known = device.replace(stream=True, gestures=_MANY).touches("validation")
+    assert known.labels is not None
+    return Threshold.tuned(rise(known), known.labels[:, -1] > 0.5).least

@@ -1,0 +1,100 @@
+"""What is said of a window, and for how long it must hold before it is said."""
+
+from dataclasses import dataclass, field
+
+from skin.errors import InputError
+
+__all__ = ["OPPOSITE", "Debounce", "Patience", "Verdict"]
+
+OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
+"""Label -> what a touch is without it."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a window is said to show.
+
+    Attributes:
+        t: s, the device's clock at the latest frame.
+        t_host: s, the host's clock at that frame.
+        chances: label -> its probability in this window.
+        touched: debounced; False: nothing touches the skin, and the labels mean nothing.
+        said: label -> debounced answer; empty without touch.
+        dangerous: what alarms; never without touch.
+        gap: frames are missing in the window.
+        masked: sensors that say nothing in the whole window.
+    """
+
+    t: float
+    t_host: float
+    chances: dict[str, float]
+    touched: bool
+    said: dict[str, bool]
+    dangerous: bool
+    gap: bool
+    masked: tuple[int, ...] = ()
+
+    def words(self) -> list[tuple[str, float]]:
+        """Return what is said in words, each with its probability in this window; nothing without touch."""
+        pairs = [
+            (name, self.chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - self.chances[name])
+            for name, yes in self.said.items()
+        ]
+        return [(word, chance) for word, chance in pairs if word]
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long an answer must hold before it is said, and be gone before it is taken back, s.
+
+    Attributes:
+        label: of any label but ``dangerous``, and of touch.
+        alarm: of ``dangerous`` before it is said: 50 ms after the frame that shows it are too late.
+        calm: before it is taken back.
+        above: probability from which on a touch is said to be dangerous.
+
+    Raises:
+        InputError: a negative time, an alarm that would come too late, or no probability.
+    """
+
+    label: float = 0.15
+    alarm: float = 0.02
+    calm: float = 0.5
+    above: float = 0.5
+
+    def __post_init__(self) -> None:
+        if min(self.label, self.alarm, self.calm) < 0 or not 0 < self.above < 1:
+            raise InputError(f"live.patience takes times from 0 s up and above= between 0 and 1, got {self}")
+        if self.alarm > 0.03:
+            raise InputError(
+                f"live.patience.alarm={self.alarm:g} would say danger later than 50 ms: give 0.03 s at most"
+            )
+
+
+@dataclass
+class Debounce:
+    """Says yes once that was the answer for ``rise`` seconds, and no after ``fall`` seconds of no.
+
+    Where frames come less often than that, one frame is enough.
+
+    Attributes:
+        rise: s.
+        fall: s.
+        state: what is said.
+    """
+
+    rise: float
+    fall: float
+    state: bool = False
+    _since: float | None = field(default=None, repr=False)
+
+    def __call__(self, answer: bool, t: float, period: float) -> bool:
+        """Return what is said after an answer at ``t`` that holds for ``period``, s."""
+        if answer == self.state:
+            self._since = None
+            return self.state
+        self._since = t if self._since is None else self._since
+        # Rounding of the clock must not cost a frame.
+        if t - self._since + period >= (self.rise if answer else self.fall) - 1e-6:
+            self.state, self._since = answer, None
+        return self.state

@@ -1,0 +1,37 @@
+"""What dead sensors cost finished runs: python experiments/dead.py rows=all
+
+Each run keeps the mask it was trained with. To compare masks, train pairs on devices that have dead sensors:
+python experiments/train.py -m experiment=temporal_graph row=dead representation.mask=true,false
+    device.dead=3 device.randomise=true seed=0,1,2
+"""
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from skin.config import ROOT, command, plain
+
+
+@command("dead")
+def main(config: DictConfig) -> None:
+    """Try finished runs on devices with dead sensors; print and write dead.md and dead.csv."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from skin.console import quiet
+    from skin.results.dead import Settings, newest, publish, try_run
+    from skin.tracking import Store
+
+    quiet()
+    settings = Settings(**plain(config)["dead"])
+    store = Store.open(config.tracking)
+    found = newest(store, config, plain(config)["rows"])
+    runs = [(line, run) for line, seeds in found.items() for run in seeds.values()]
+    shown = track(runs, "trying finished runs", console=Console(stderr=True), disable=not runs)
+    trials = [trial for line, run in shown for trial in try_run(store, line, run, config, settings)]
+    folder = Path(config.out).expanduser() if config.out else ROOT / "results"
+    publish(folder, trials)
+
+
+if __name__ == "__main__":
+    main()

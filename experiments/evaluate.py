@@ -1,9 +1,15 @@
-"""Try a trained run on other touches: python experiments/evaluate.py run=latest device.seed=7"""
+"""Try a trained run on other touches: python experiments/evaluate.py run=latest device.seed=7
+
+On a skin, gesture by gesture: run=latest device=serial device.port=/dev/ttyACM0; see conf/device/serial.yaml.
+Writes evaluation_<device>.md and .png into out=, and an MLflow run of its own.
+"""
+
+from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from skin.config import command
+from skin.config import ROOT, command
 
 
 @command("evaluate")
@@ -11,24 +17,40 @@ def main(config: DictConfig) -> None:
     """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
     from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
+    from skin.device.serial import Serial
     from skin.evaluation import evaluate
     from skin.reload import changed, configuration, find, restore
     from skin.results.show import report
+    from skin.results.verdicts import publish, verdicts
+    from skin.run import conclude
     from skin.tracking import Store
 
     quiet()
-    store = Store.open(config.tracking)
+    store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
     run = find(store, config.run)
     overrides = list(HydraConfig.get().overrides.task)
     config = changed(configuration(store, run), config, overrides)
-    device = build_device(config)
-    learner = build_learner(config)
-    restore(store, run, learner, build_data(config, device))
-    found = evaluate(learner, device, config.evaluation)
+    device, learner = build_device(config), build_learner(config)
+    shapes = device.blank() if isinstance(device, Serial) else device
+    restore(store, run, learner, build_data(config, shapes))
+    name = f"evaluation_{config.device['_target_'].split('.')[-2]}"
+    title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(overrides)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
-        store.log_metrics(evaluation, found.metrics)
-    report(found, f"{run.info.run_name} ({run.info.run_id})")
+        if isinstance(device, Serial) and device.touches("test").labels is None:
+            chances = learner.probabilities(device.touches("test"))
+            said, path = verdicts(chances, device.task, folder / f"{name}.csv")
+            store.client.log_artifact(evaluation.info.run_id, str(path))
+            print(f"{title}\n{said}\n{path}")
+            return
+        found = evaluate(learner, device, config.evaluation)
+        conclude(store, evaluation, found, device.task, {})
+        about = f"Run {title}, evaluated with `{' '.join(overrides)}`, {len(found.predictions)} gestures."
+        written = publish(folder / f"{name}.md", found, device.task, run.info.run_name, about)
+        for path in written:
+            store.client.log_artifact(evaluation.info.run_id, str(path))
+    report(found, title)
+    print(*written, sep="\n")
 
 
 if __name__ == "__main__":

@@ -82,6 +82,9 @@ def changed(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) 
         source = OmegaConf.select(composed, parent) if parent else composed
         # As it stands there, unresolved: a device follows the simulator of this run, not of a default one.
         OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+    if "rate" in whole.device and whole.device.rate is None:
+        # A live device is reduced to the frames that the run has learnt from.
+        whole.device.rate = stored.device.get("rate")
     whole.tracking = composed.tracking
     return checked(whole)
 

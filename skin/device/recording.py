@@ -1,5 +1,7 @@
 """Touches from a file."""
 
+from typing import Literal
+
 import numpy as np
 import torch
 
@@ -24,6 +26,7 @@ class Recorded(AbstractDevice):
         body: the sheet, to be compared with the file's.
         layout: where the sensors are, to be compared with the file's.
         split_seed: what the split is drawn from.
+        test: ``holdout``, or ``all`` touches, for a run that learnt from others.
 
     Attributes:
         sensors: as ``layout`` gives them.
@@ -36,13 +39,24 @@ class Recorded(AbstractDevice):
     """
 
     def __init__(
-        self, body: Sheet, layout: AbstractLayout, path: str | None = None, split_seed: int = 0
+        self,
+        body: Sheet,
+        layout: AbstractLayout,
+        path: str | None = None,
+        split_seed: int = 0,
+        test: Literal["holdout", "all"] = "holdout",
     ) -> None:
         if path is None:
             raise InputError("device=recording needs a file: add device.path=x.parquet")
         self._recording = read(path)
-        if len(self._recording) < 10:
-            raise InputError(f"{path} has {len(self._recording)} touches: 80/10/10 needs at least 10")
+        if test not in ("holdout", "all"):
+            raise InputError(f"device.test must be holdout or all, got {test}")
+        self._test = test
+        if len(self._recording) < 10 and test == "holdout":
+            raise InputError(
+                f"{path} has {len(self._recording)} touches: 80/10/10 needs at least 10, or a "
+                "run that learnt from others and device.test=all"
+            )
         self.path, self.split_seed = path, split_seed
         self.sensors = layout.sensors(body)
         self._compare(body)
@@ -77,7 +91,7 @@ class Recorded(AbstractDevice):
 
     def recording(self, split: Split | None = None, epoch: int = 0) -> Recording:
         """Return all that the file holds of a split; None takes the whole file."""
-        if split is None:
+        if split is None or (split == "test" and self._test == "all"):
             return self._recording
         count = len(self._recording)
         training = round(0.8 * count)

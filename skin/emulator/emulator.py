@@ -22,7 +22,7 @@ from skin.streams import Stream, generator
 
 __all__ = ["Emulator", "Settings"]
 
-_HEADER = 5.0  # s from one header to the next
+_HEADER = 1.0  # s from one header to the next
 _LOOK = 0.05  # s between two looks whether somebody came
 
 

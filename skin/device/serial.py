@@ -1,0 +1,236 @@
+"""Touches from a real skin, or an emulated one, gesture by gesture."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from skin.body.sheet import Sheet
+from skin.calibration.values import read
+from skin.device.base import AbstractDevice, Split
+from skin.errors import InputError
+from skin.labels import TOUCH, TOUCH_OR_NOT, Task
+from skin.layout.base import AbstractLayout
+from skin.port.baseline import rest
+from skin.port.detect import Format
+from skin.port.errors import SkinDisconnected, SkinTimeout
+from skin.port.frame import Frame
+from skin.port.live import Skin
+from skin.port.opening import open_skin
+from skin.port.wire import open_wire
+from skin.recording import Recording, Touches
+from skin.session.newtons import Newtons, newtons
+from skin.session.reduction import check_rate, rate_of, reduced
+from skin.session.takes import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
+from skin.session.tap import Tap
+
+__all__ = ["Serial"]
+
+_LABELS = ("announced", "prompted", "none")
+_SETTLE = 1.0  # s in which the rate shows
+
+
+@dataclass(kw_only=True, eq=False)
+class Serial(AbstractDevice):
+    """Yields the gestures that somebody, or the emulator, does on a skin: its only split is ``test``.
+
+    Readings are N without offset: the baseline is taken off, of values that are already reduced, because the
+    maximum of noise is not 0.
+
+    Args:
+        body: the sheet of the model.
+        layout: where its sensors are; the device must send as many values.
+        port, baudrate, format, limits, timeout: as in :func:`skin.port.opening.open_skin`.
+        labels: ``announced``, ``prompted`` or ``none``.
+        gestures: how many.
+        seed: of the order of prompts.
+        tare: s.
+        trigger: N.
+        scale: N per unit.
+        calibration: file.
+        window: T, frames of the model.
+        rate: of the model, Hz; None: 10.
+        stream: the labels have ``touch`` too.
+
+    Attributes:
+        recording: what was read, once it was; it can be stored.
+
+    Raises:
+        InputError: settings that cannot be used, or a device that does not fit the model.
+    """
+
+    body: Sheet
+    layout: AbstractLayout
+    port: str | None = None
+    baudrate: int = 115200
+    format: Format = "auto"
+    labels: str = "announced"
+    gestures: int = 16
+    seed: int = 0
+    tare: float = 2.0
+    trigger: float = 0.3
+    scale: float | None = None
+    calibration: str | None = None
+    limits: Sequence[float | None] | None = None
+    timeout: float = 10.0
+    window: int = 30
+    rate: float | None = None
+    stream: bool = False
+
+    def __post_init__(self) -> None:
+        if self.port is None:
+            raise InputError(
+                "device=serial needs a port: add device.port=/dev/ttyACM0; experiments/emulate.py makes one"
+            )
+        if self.labels not in _LABELS:
+            raise InputError(f"device.labels must be one of {', '.join(_LABELS)}, got {self.labels}")
+        if self.gestures < 1 or not self.tare >= 0:
+            raise InputError(
+                f"device.gestures={self.gestures} must be 1 or more, tare={self.tare} not negative"
+            )
+        if self.labels == "none" and self.stream:
+            raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
+        self.rate = 10.0 if self.rate is None else float(self.rate)
+        self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
+        self.sensors = self.layout.sensors(self.body)
+        self.recording: Recording | None = None
+        self._known = None if self.calibration is None else read(self.calibration)
+        if self._known is not None:
+            self._known.fits(len(self.sensors))
+
+    @property
+    def length(self) -> float:
+        """Duration of a window, s."""
+        assert self.rate is not None
+        return self.window / self.rate
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
+        """Return the gestures, read when first asked for; labels are None where nobody knows them."""
+        if split != "test":
+            raise InputError(
+                f"device=serial has no {split} split: record a session with experiments/record.py, then take "
+                "device=recording"
+            )
+        if self.recording is None:
+            self.recording = self._record()
+        return self.recording.touches
+
+    def blank(self) -> AbstractDevice:
+        """Return a device of the same shapes whose touches are 0: a run is brought back without a touch."""
+        return _Blank(self.task, self.size, self._touches([], count=1))
+
+    def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
+        """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
+        assert self.port is not None
+        tap = Tap(partial(open_wire, self.port, self.baudrate))
+        limits = None if self.limits is None else (self.limits[0], self.limits[1])
+        settings: dict[str, Any] = {"format": self.format, "limits": limits, "timeout": self.timeout}
+        return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **settings), tap
+
+    def settle(self, skin: Skin) -> tuple[list[Frame], np.ndarray | None, Newtons]:
+        """Read the beginning: is it fast enough, and what does it say untouched?
+
+        Returns:
+            its frames, the baseline (S,) in the device's unit, None without tare, and what values mean.
+        """
+        assert self.rate is not None
+        _say("reading the untouched skin: keep off" if self.tare else "reading the rate")
+        frames = [skin.read(1)[0]]
+        while len(frames) < 3 or frames[-1].t - frames[0].t < max(self.tare, _SETTLE):
+            frames += skin.read(1)
+            if frames[-1].segment != frames[0].segment:
+                frames = frames[-1:]
+        check_rate(rate_of(frames), self.rate)
+        baseline = None
+        if self.tare:
+            baseline = rest(*reduced(frames, frames[0].t, self.rate, int(self.tare * self.rate + 1e-6)))
+        return frames, baseline, newtons(len(self.sensors), baseline, self.scale, self._known, skin.header)
+
+    def director(self, tap: Tap, meaning: Newtons, done: int = 0) -> AbstractDirector:
+        """Return who says what a gesture is; ``done`` gestures are there already."""
+        if self.labels == "announced":
+            return Announced(self.length, tap, self.task)
+        if self.labels == "none":
+            touched = np.ones(len(self.sensors), dtype=bool)
+            return Continuous(
+                self.length, done, lambda values: bool((meaning(values, touched)[0] > self.trigger).any())
+            )
+        wanted = enumerate(plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
+        return Prompted(self.length, (one for one in wanted if done <= one[0] < self.gestures), _say)
+
+    def stored(self, takes: Sequence[Take], meaning: Newtons) -> Recording:
+        """Return gestures as a recording."""
+        touches = self._touches([self._shown(take, meaning) for take in takes])
+        if takes and takes[0].labels is not None:
+            rows = [[float(value) for value in take.labels.values()] for take in takes if take.labels]
+            touches = Touches(
+                touches.readings, touches.valid, touches.positions, torch.tensor(rows), touches.rate
+            )
+        about = {"source": "serial", "lost": [take.lost for take in takes]}
+        return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
+
+    def _shown(self, take: Take, meaning: Newtons) -> tuple[np.ndarray, np.ndarray]:
+        assert self.rate is not None
+        return meaning(*reduced(take.frames, take.begin, self.rate, self.window))
+
+    def _touches(self, windows: Sequence[tuple[np.ndarray, np.ndarray]], count: int = 0) -> Touches:
+        """Return windows (readings, valid) as touches, or ``count`` of zeros where there are none."""
+        assert self.rate is not None
+        shape, positions = (count, self.window, len(self.sensors)), torch.from_numpy(self.sensors.positions)
+        readings = torch.zeros(shape) if not windows else torch.from_numpy(np.stack([w[0] for w in windows]))
+        valid = torch.ones(shape, dtype=torch.bool)
+        valid = valid if not windows else torch.from_numpy(np.stack([w[1] for w in windows]))
+        labels = torch.zeros(count, len(self.task)) if count else None
+        return Touches(readings, valid, positions.float(), labels, self.rate)
+
+    def _record(self) -> Recording:
+        """Read gestures until there are enough, the skin falls silent, or a person ends it."""
+        takes: list[Take] = []
+        skin, tap = self.open()
+        with skin:
+            _, _, meaning = self.settle(skin)
+            director = self.director(tap, meaning)
+            _say(f"waiting for {self.gestures} gestures, labels {self.labels}")
+            for take in self._takes(skin, director):
+                takes.append(take)
+                words = "" if take.labels is None else f": {sentence(take.labels)}"
+                _say(
+                    f"{len(takes)}/{self.gestures}{words}" + (f" ({take.lost} frames lost)" * bool(take.lost))
+                )
+                if len(takes) == self.gestures:
+                    break
+        if not takes:
+            raise InputError("no gesture came: does the emulator announce, does something touch the skin?")
+        return self.stored(takes, meaning)
+
+    def _takes(self, skin: Skin, director: AbstractDirector) -> Iterator[Take]:
+        try:
+            for frame in skin:
+                take = director.show(frame)
+                if take is not None and take.broken:
+                    _say(f"gesture {take.number} broke off: the device started anew")
+                elif take is not None:
+                    yield take
+                if director.over:
+                    return
+        except (SkinTimeout, SkinDisconnected) as end:
+            _say(str(end))
+
+
+@dataclass
+class _Blank(AbstractDevice):
+    task: Task
+    size: tuple[float, float]
+    zeros: Touches
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
+        return self.zeros
+
+
+def _say(text: str) -> None:
+    """Tell the person at the skin; results go to standard output."""
+    print(text, file=sys.stderr, flush=True)

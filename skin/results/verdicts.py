@@ -1,0 +1,87 @@
+"""What an evaluation found, as a page and its matrices; verdicts where nobody knows the truth."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+from torch import Tensor
+
+from skin.evaluation import Report
+from skin.labels import Task
+from skin.results.figures import confusions, save
+
+__all__ = ["page", "publish", "verdicts"]
+
+
+def page(found: Report, task: Task, title: str, about: str) -> str:
+    """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.
+
+    Args:
+        found: what an evaluation found.
+        task: the labels.
+        title: of the page.
+        about: a sentence on where the touches came from.
+    """
+    columns = list(dict.fromkeys(name.split("/")[0] for name in found.metrics))
+    lines = [f"# {title}", "", about, "", "Per cent:", "", f"| | {' | '.join(columns)} |"]
+    lines.append("|---" * (len(columns) + 1) + "|")
+    rows = dict.fromkeys(name.split("/", 1)[1] for name in found.metrics)
+    for row in rows:
+        if row.endswith(("/accuracy", "/recall")):
+            shares = (found.metrics.get(f"{column}/{row}") for column in columns)
+            lines.append(f"| {row} | {' | '.join('' if x is None else f'{100 * x:.1f}' for x in shares)} |")
+    lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
+    if found.confusion is not None:
+        lines += [
+            "",
+            "| label | no, said no | no, said yes | yes, said no | yes, said yes |",
+            "|---" * 5 + "|",
+        ]
+        for name, counts in zip(task.names, found.confusion.numpy().astype(int), strict=True):
+            lines.append(f"| {name} | {' | '.join(map(str, counts.ravel().tolist()))} |")
+    return "\n".join(lines) + "\n"
+
+
+def publish(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
+    """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
+    written = [_write(page(found, task, title, about), path)]
+    if found.confusion is not None:
+        named = dict(zip(task.names, found.confusion.numpy(), strict=True))
+        written.append(save(confusions(named, ("no", "yes")), path.with_suffix(".png")))
+    return written
+
+
+def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
+    """Write the probability of each label, gesture by gesture, where nobody knows the truth.
+
+    Args:
+        chances: (B, L).
+        task: the labels.
+        path: x.csv.
+
+    Returns:
+        lines for a person, and the path.
+    """
+    columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
+    table = pa.table({"gesture": np.arange(len(chances)), **columns})
+    partial = path.with_name(path.name + ".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pa.csv.write_csv(table, partial)
+    partial.replace(path)
+    said = [
+        f"gesture {number}: "
+        + ", ".join(
+            f"{'' if chance > 0.5 else 'not '}{name} ({chance:.2f})"
+            for name, chance in zip(task.names, row, strict=True)
+        )
+        for number, row in enumerate(chances.tolist())
+    ]
+    return "\n".join(said), path
+
+
+def _write(text: str, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(text, encoding="utf-8")
+    return partial.replace(path)

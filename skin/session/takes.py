@@ -1,0 +1,209 @@
+"""Which frames are a gesture, and what its labels are: announced, prompted, or unknown."""
+
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
+from threading import Thread
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.labels import Task
+from skin.port.frame import Frame
+from skin.session.tap import Tap
+from skin.streams import Stream, generator
+
+__all__ = ["AbstractDirector", "Announced", "Continuous", "Prompted", "Take", "plan", "sentence"]
+
+Labels = Mapping[str, int]
+
+
+@dataclass
+class Take:
+    """The frames of one gesture.
+
+    Attributes:
+        number: of the gesture.
+        labels: name -> 0 or 1; None where nobody knows.
+        begin: of the window, s, the device's clock.
+        segment: of the device's clock.
+        frames: of the window.
+        lost: frames that are known to be missing in it.
+        broken: the device started anew within it: it cannot be used.
+    """
+
+    number: int
+    labels: Labels | None
+    begin: float
+    segment: int
+    frames: list[Frame] = field(default_factory=list)
+    lost: int = 0
+    broken: bool = False
+
+
+def plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
+    """Yield every combination of the labels, in another random order each repetition."""
+    for repetition in range(repetitions):
+        order = generator(Stream.SPLIT, 2, seed, repetition).permutation(2 ** len(names))
+        for code in order:
+            yield {name: int(code) >> place & 1 for place, name in enumerate(names)}
+
+
+def sentence(labels: Labels) -> str:
+    """Return labels in words."""
+    return ", ".join(name if on else f"not {name}" for name, on in labels.items())
+
+
+class AbstractDirector(ABC):
+    """Is shown every frame and says which make a gesture.
+
+    Args:
+        length: of a window, s.
+        take: the window that is being filled; None between two.
+        over: nothing more will come.
+    """
+
+    def __init__(self, length: float) -> None:
+        self._length = length
+        self.take: Take | None = None
+        self.over = False
+
+    def show(self, frame: Frame) -> Take | None:
+        """Take a frame; return the gesture whose window ended before it, or one that broke off."""
+        done = self._close(frame)
+        if self.take is None:
+            self.take = self._begin(frame)
+        if self.take is not None:
+            # The first frame's loss lies before the window.
+            self.take.lost += frame.lost if self.take.frames else 0
+            self.take.frames.append(frame)
+        return done
+
+    def _close(self, frame: Frame) -> Take | None:
+        take = self.take
+        if take is None:
+            return None
+        take.broken = frame.segment != take.segment
+        if not take.broken and frame.t < take.begin + self._length - 1e-7:
+            return None
+        self.take = None
+        return take
+
+    @abstractmethod
+    def _begin(self, frame: Frame) -> Take | None:
+        """Return a window that begins with this frame, if one does."""
+
+
+class Announced(AbstractDirector):
+    """Takes the windows and labels that an emulated skin announces.
+
+    Args:
+        length: of a window, s.
+        tap: what hears the announcements.
+        task: the labels that are wanted; ``touch`` is always true.
+
+    Raises:
+        InputError: on a frame without a number, or an announcement without a label.
+    """
+
+    def __init__(self, length: float, tap: Tap, task: Task) -> None:
+        super().__init__(length)
+        self._heard, self._task = tap.heard, task
+
+    def _begin(self, frame: Frame) -> Take | None:
+        if frame.seq is None:
+            raise InputError("announcements need frames with numbers: give device.labels=prompted")
+        while self._heard:
+            said = self._heard[0]
+            if frame.seq < said.seq:
+                return None
+            self._heard.popleft()
+            if frame.seq < said.seq + said.frames:
+                begin = frame.t - (frame.seq - said.seq) * self._length / said.frames
+                labels = {"touch": 1} | dict(said.labels)
+                if missing := [name for name in self._task.names if name not in labels]:
+                    raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
+                known = {name: labels[name] for name in self._task.names}
+                return Take(said.number, known, begin, frame.segment, lost=frame.seq - said.seq)
+        return None
+
+
+class Prompted(AbstractDirector):
+    """Asks a person for each gesture and begins when Enter is pressed: s skips one, q ends.
+
+    Args:
+        length: of a window, s.
+        wanted: (number, labels) of the gestures.
+        tell: says a sentence to the person.
+        lines: what the person types; None: standard input.
+    """
+
+    def __init__(
+        self,
+        length: float,
+        wanted: Iterator[tuple[int, Labels]],
+        tell: Callable[[str], None],
+        lines: Iterator[str] | None = None,
+    ) -> None:
+        super().__init__(length)
+        self._wanted, self._tell = wanted, tell
+        self._typed: SimpleQueue[str] = SimpleQueue()
+        self._asked: tuple[int, Labels] | None = None
+        # A thread, because frames come while a person thinks.
+        Thread(target=self._listen, args=(lines or sys.stdin,), daemon=True).start()
+
+    def _listen(self, lines: Iterator[str]) -> None:
+        for line in lines:
+            self._typed.put(line.strip().lower())
+        self._typed.put("q")
+
+    def show(self, frame: Frame) -> Take | None:
+        """As above; a gesture that broke off is asked for again."""
+        done = super().show(frame)
+        if done is not None and done.broken and done.labels is not None:
+            self._ask((done.number, done.labels))
+        return done
+
+    def _begin(self, frame: Frame) -> Take | None:
+        if self._asked is None:
+            following = next(self._wanted, None)
+            if following is None:
+                self.over = True
+                return None
+            self._ask(following)
+        try:
+            said = self._typed.get_nowait()
+        except Empty:
+            return None
+        number, labels = self._asked or (0, {})
+        self._asked = None
+        self.over = said == "q"
+        return None if said in ("q", "s") else Take(number, labels, frame.t, frame.segment)
+
+    def _ask(self, asked: tuple[int, Labels]) -> None:
+        self._asked = asked
+        self._tell(f"gesture {asked[0]}: {sentence(asked[1])} - Enter and touch, s skips, q ends")
+
+
+class Continuous(AbstractDirector):
+    """Takes windows one after the other, without labels.
+
+    Args:
+        length: of a window, s.
+        first: number of the first.
+        wanted: asked of every frame that could begin a window; None: each does.
+    """
+
+    def __init__(
+        self, length: float, first: int = 0, wanted: Callable[[np.ndarray], bool] | None = None
+    ) -> None:
+        super().__init__(length)
+        self._number, self._wanted = first, wanted
+
+    def _begin(self, frame: Frame) -> Take | None:
+        if self._wanted is not None and not self._wanted(frame.values):
+            return None
+        self._number += 1
+        return Take(self._number - 1, None, frame.t, frame.segment)

@@ -1,0 +1,125 @@
+"""The command, with an emulated skin before it and a browser behind it."""
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "experiment=rules",
+    "simulator=naive",
+    "data.gestures=1000",
+    "device.test_gestures=96",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.gestures=96",
+]
+PATIENCE = 240  # s, on a machine that is busy with other things
+
+WATCH = """
+window.log = [];
+const note = () => log.push([document.body.dataset.state, document.getElementById("head").textContent,
+                             getComputedStyle(document.body).backgroundColor]);
+new MutationObserver(note).observe(document.getElementById("head"), {childList: true, subtree: true});
+note();
+"""
+
+
+def started(folder, script, *overrides):
+    """Start a command; what it says goes to files."""
+    with (folder / f"{script}.out").open("w") as out, (folder / f"{script}.err").open("w") as err:
+        return subprocess.Popen(
+            [sys.executable, ROOT / "experiments" / script, *overrides], cwd=folder, stdout=out, stderr=err
+        )
+
+
+def until(found, process, what):
+    """Wait until a function gives something true, and return it."""
+    deadline = monotonic() + PATIENCE
+    while monotonic() < deadline:
+        assert process.poll() is None, f"ended while waiting for {what}"
+        if result := found():
+            return result
+        sleep(0.2)
+    raise AssertionError(f"waited in vain for {what}")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """The overrides that lead to a store with one run of rules."""
+    folder = tmp_path_factory.mktemp("live")
+    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+    train = [sys.executable, ROOT / "experiments" / "train.py", *SMALL, *own]
+    subprocess.run(train, cwd=folder, check=True, capture_output=True, timeout=600)
+    return own
+
+
+@pytest.mark.slow
+def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(store, browser, tmp_path):
+    link = tmp_path / "skin"
+    faults = ["faults.unplug=[20]", "faults.away=3"]
+    pace = ["emulate.rate=50", "emulate.gap=1.5"]
+    emulator = started(tmp_path, "emulate.py", "simulator=naive", f"link={link}", *pace, *faults)
+    live = None
+    try:
+        until(link.exists, emulator, "the port")
+        scale = re.search(r"device\.scale=(\S+)", (tmp_path / "emulate.py.out").read_text())[1]
+        reader = ["live.reader.backoff=[0.2,0.5]", f"live.scale={scale}", "web=true", "live.web_port=0"]
+        live = started(tmp_path, "live.py", f"port={link}", *reader, *store)
+        said = tmp_path / "live.py.err"
+        page = until(lambda: re.search(r"page: (http\S+)", said.read_text()), live, "the page")[1]
+        browser.open(page)
+        browser.run(WATCH)
+        log = lambda: browser.run("return log")  # noqa: E731
+        red = until(lambda: [entry for entry in log() if entry[0] == "danger"], live, "an alarm")
+        assert "DANGEROUS" in red[0][1]
+        assert red[-1][2] == "rgb(163, 13, 29)"
+        away = until(
+            lambda: [n for n, entry in enumerate(log()) if "unplugged" in entry[1]], live, "unplugging"
+        )
+        assert log()[away[0]][0] == "away"
+        healed = lambda: {entry[0] for entry in log()[away[0] :]} & {"idle", "touch", "danger"}  # noqa: E731
+        until(healed, live, "healing")
+        assert browser.run("return pictures") > 20
+        assert "1 reconnected" in browser.run("return document.getElementById('line').textContent")
+        live.send_signal(signal.SIGINT)
+        assert live.wait(60) == 0, said.read_text()
+        lines = (tmp_path / "live.py.out").read_text()
+        assert "DANGEROUS: " in lines
+        assert "unplugged" in lines
+        assert "Traceback" not in said.read_text()
+        assert "dangerous=1" in (tmp_path / "emulate.py.out").read_text()
+    finally:
+        for process in (live, emulator):
+            if process and process.poll() is None:
+                process.kill()
+                process.wait()
+
+
+@pytest.mark.slow
+def test_the_simulator_is_watched_without_hardware(store, tmp_path):
+    live = started(tmp_path, "live.py", "port=simulated", "seconds=8", *store)
+    assert live.wait(PATIENCE) == 0
+    assert re.search(r"\d+ verdicts, 10\.0 Hz, frame to verdict", (tmp_path / "live.py.err").read_text())
+    assert "filling the window" in (tmp_path / "live.py.out").read_text()
+
+
+@pytest.mark.parametrize(
+    ("override", "needed"),
+    [
+        ("seed=0", "give port=/dev/ttyACM0"),
+        ("live.patience.alarm=0.2", "give 0.03 s at most"),
+        ("live.scale=-1", "live.scale must be above 0"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, override, needed):
+    live = started(tmp_path, "live.py", override)
+    assert live.wait(PATIENCE) == 2
+    said = (tmp_path / "live.py.err").read_text()
+    assert needed in said
+    assert said.count("\n") == 1

@@ -1,0 +1,142 @@
+"""The board, the terminal and the page, without a model behind them."""
+
+import json
+import re
+import urllib.error
+import urllib.request
+from base64 import b64decode
+from threading import Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.interpolate import LinearNDInterpolator
+
+from skin.errors import InputError
+from skin.live import terminal, web
+from skin.live.board import Board, Facts
+from skin.live.picture import Picture
+from skin.live.verdict import Verdict
+from skin.port.frame import Frame
+
+PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
+SIZE = 0.16, 0.12
+PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "dangerous": True}, True, False)
+
+
+def board():
+    return Board(Facts("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0))
+
+
+def frame(values, valid=None):
+    valid = np.ones(5, bool) if valid is None else valid
+    return Frame(None, 0.0, 0.0, np.asarray(values, float), valid)
+
+
+def fetch(address, **headers):
+    """Return status, headers and the beginning of what an address gives."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, ""
+
+
+def test_no_peak_between_two_looks_is_missed():
+    subject = board()
+    subject.show(frame(np.zeros(5)))
+    seen = subject.look().number
+    for height in (1, 7, 2):
+        subject.show(frame(height * np.eye(5)[3]))
+    look = subject.look(seen)
+    assert look.values.tolist() == [0, 0, 0, 7, 0]
+    assert subject.look(look.number).values[3] == 2
+
+
+def test_the_picture_interpolates_between_the_sensors():
+    values = np.array([1.0, 2.0, 0.5, 3.0, 1.5])
+    image = Picture(PLACES, SIZE, 32, 4.0)(values)
+    row, column = 17, 15
+    place = (column + 0.5) / 32 * SIZE[0], (row + 0.5) / 32 * SIZE[1]
+    expected = LinearNDInterpolator(PLACES[:, :2], values)(*place)
+    assert image[row, column] == pytest.approx(255 * expected / 4, abs=1.01)
+    assert Picture(PLACES[:1], SIZE, 8, 4.0)(values[:1]).tolist() == [[63] * 8] * 8
+
+
+def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
+    subject = board()
+    with (tmp_path / "said").open("w") as file, terminal.shown(subject, Console(file=file, width=60)):
+        for verdict in (None, None, PRESSED, PRESSED):
+            subject.say(verdict, "" if verdict else "taking the baseline: do not touch")
+            sleep(0.3)
+    said = (tmp_path / "said").read_text().splitlines()
+    assert said[-2:] == ["taking the baseline", "DANGEROUS: small dangerous"]
+
+
+def test_the_terminal_shows_the_alarm_and_the_probability():
+    subject = board()
+    subject.say(PRESSED)
+    subject.tell("99.9 Hz")
+    console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        console.print(terminal.screen(subject, subject.look(), Picture(PLACES, SIZE, 24, 4.0)))
+    text = console.export_text()
+    assert "DANGEROUS" in text
+    assert re.search(r"small .* 80 %", text)
+    assert "99.9 Hz" in text
+
+
+def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
+    subject = board()
+    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
+    subject.say(PRESSED)
+    with web.served(subject, 0) as address:
+        code, page = fetch(address)
+        assert code == 200
+        assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
+        facts = json.loads(fetch(f"{address}/skin.json")[1])
+        assert facts["positions"] == PLACES.tolist()
+        with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
+            line = answer.readline().decode()
+        picture = json.loads(line.removeprefix("data: "))
+    assert picture["verdict"]["dangerous"] is True
+    assert picture["verdict"]["words"] == [["small", 0.8], ["dangerous", 0.9]]
+    assert picture["values"][2] == 2.0
+    assert picture["valid"] == [True, True, True, True, False]
+    assert len(b64decode(picture["picture"])) == facts["pixels"] ** 2
+
+
+def test_pictures_come_thirty_times_a_second_at_most():
+    with (
+        web.served(board(), 0) as address,
+        urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer,
+    ):
+        began = monotonic()
+        for _ in range(2 * 60):  # and an empty line after each
+            answer.readline()
+        passed = monotonic() - began
+    assert passed > 0.9 * 60 / web.HERTZ
+    # A machine that is busy with other things must not fail this.
+    assert passed < 10 * 60 / web.HERTZ
+
+
+def test_other_sites_and_ports_in_use_are_refused():
+    with web.served(board(), 0) as address:
+        assert fetch(f"{address}/skin.json", Host="evil.example")[0] == 400
+        with pytest.raises(InputError, match=r"live\.web_port="):
+            web.served(board(), int(address.rsplit(":", 1)[1])).__enter__()
+
+
+def test_the_page_goes_when_the_watching_ends():
+    subject = board()
+    with web.served(subject, 0) as address:
+        answer = urllib.request.urlopen(f"{address}/pictures", timeout=30)
+        answer.readline()
+        reader = Thread(target=answer.read)
+        reader.start()
+    reader.join(10)
+    assert not reader.is_alive()
+    answer.close()
+    assert subject.closed.is_set()

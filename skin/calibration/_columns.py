@@ -79,6 +79,7 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
     if name not in table.column_names:
         raise InputError(f"{where}: no column {name}, found {', '.join(table.column_names)}")
     try:
-        return table[name].cast(pa.float64()).to_numpy()
+        # A copy, because Arrow's memory cannot be written to and torch warns of that.
+        return np.array(table[name].cast(pa.float64()).to_numpy())
     except pa.ArrowException as error:
         raise InputError(f"{where}: column {name} must hold numbers: {error}") from error

@@ -33,6 +33,7 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(tmp_path):
         "device.gain_spread=0.2",
     )
     assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
     assert "8 presses" in done.stdout
     assert "RMSE on 2 held-out presses" in done.stdout
     assert len(read(out)) == 4

@@ -33,6 +33,8 @@ def main(config: DictConfig) -> None:
     device, learner = build_device(config), build_learner(config)
     shapes = device.blank() if isinstance(device, Serial) else device
     restore(store, run, learner, build_data(config, shapes))
+    if isinstance(device, Serial):
+        device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     name = f"evaluation_{config.device['_target_'].split('.')[-2]}"
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(overrides)}

@@ -112,6 +112,8 @@ class Config:
     format: str | None = None
     emulate: dict[str, Any] | None = None
     faults: dict[str, Any] | None = None
+    record: dict[str, Any] | None = None
+    compare: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

@@ -1,7 +1,7 @@
 """Touches from a real skin, or an emulated one, gesture by gesture."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,9 +11,10 @@ import torch
 
 from skin.body.sheet import Sheet
 from skin.calibration.values import read
+from skin.device._blank import Blank
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
-from skin.labels import TOUCH, TOUCH_OR_NOT, Task
+from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
 from skin.port.baseline import rest
 from skin.port.detect import Format
@@ -82,10 +83,6 @@ class Serial(AbstractDevice):
     stream: bool = False
 
     def __post_init__(self) -> None:
-        if self.port is None:
-            raise InputError(
-                "device=serial needs a port: add device.port=/dev/ttyACM0; experiments/emulate.py makes one"
-            )
         if self.labels not in _LABELS:
             raise InputError(f"device.labels must be one of {', '.join(_LABELS)}, got {self.labels}")
         if self.gestures < 1 or not self.tare >= 0:
@@ -121,11 +118,14 @@ class Serial(AbstractDevice):
 
     def blank(self) -> AbstractDevice:
         """Return a device of the same shapes whose touches are 0: a run is brought back without a touch."""
-        return _Blank(self.task, self.size, self._touches([], count=1))
+        return Blank(self.task, self.size, self._touches([], count=1))
 
     def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
         """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
-        assert self.port is not None
+        if self.port is None:
+            raise InputError(
+                "device=serial needs a port: add device.port=/dev/ttyACM0; experiments/emulate.py makes one"
+            )
         tap = Tap(partial(open_wire, self.port, self.baudrate))
         limits = None if self.limits is None else (self.limits[0], self.limits[1])
         settings: dict[str, Any] = {"format": self.format, "limits": limits, "timeout": self.timeout}
@@ -150,17 +150,21 @@ class Serial(AbstractDevice):
             baseline = rest(*reduced(frames, frames[0].t, self.rate, int(self.tare * self.rate + 1e-6)))
         return frames, baseline, newtons(len(self.sensors), baseline, self.scale, self._known, skin.header)
 
-    def director(self, tap: Tap, meaning: Newtons, done: int = 0) -> AbstractDirector:
-        """Return who says what a gesture is; ``done`` gestures are there already."""
+    def director(self, tap: Tap, meaning: Newtons, done: Collection[int] = ()) -> AbstractDirector:
+        """Return who says what a gesture is; those with a number in ``done`` are there already."""
         if self.labels == "announced":
             return Announced(self.length, tap, self.task)
         if self.labels == "none":
             touched = np.ones(len(self.sensors), dtype=bool)
             return Continuous(
-                self.length, done, lambda values: bool((meaning(values, touched)[0] > self.trigger).any())
+                self.length,
+                max(done, default=-1) + 1,
+                lambda values: bool((meaning(values, touched)[0] > self.trigger).any()),
             )
         wanted = enumerate(plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
-        return Prompted(self.length, (one for one in wanted if done <= one[0] < self.gestures), _say)
+        return Prompted(
+            self.length, (one for one in wanted if one[0] < self.gestures and one[0] not in done), _say
+        )
 
     def stored(self, takes: Sequence[Take], meaning: Newtons) -> Recording:
         """Return gestures as a recording."""
@@ -219,16 +223,6 @@ class Serial(AbstractDevice):
                     return
         except (SkinTimeout, SkinDisconnected) as end:
             _say(str(end))
-
-
-@dataclass
-class _Blank(AbstractDevice):
-    task: Task
-    size: tuple[float, float]
-    zeros: Touches
-
-    def touches(self, split: Split, epoch: int = 0) -> Touches:
-        return self.zeros
 
 
 def _say(text: str) -> None:

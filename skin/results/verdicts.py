@@ -11,7 +11,7 @@ from skin.evaluation import Report
 from skin.labels import Task
 from skin.results.figures import confusions, save
 
-__all__ = ["page", "publish", "verdicts"]
+__all__ = ["page", "publish", "verdicts", "whole"]
 
 
 def page(found: Report, task: Task, title: str, about: str) -> str:
@@ -45,7 +45,7 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
 
 def publish(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [_write(page(found, task, title, about), path)]
+    written = [whole(page(found, task, title, about), path)]
     if found.confusion is not None:
         named = dict(zip(task.names, found.confusion.numpy(), strict=True))
         written.append(save(confusions(named, ("no", "yes")), path.with_suffix(".png")))
@@ -80,7 +80,8 @@ def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
     return "\n".join(said), path
 
 
-def _write(text: str, path: Path) -> Path:
+def whole(text: str, path: Path) -> Path:
+    """Write a text under a temporary name and rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
     partial.write_text(text, encoding="utf-8")

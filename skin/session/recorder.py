@@ -1,0 +1,96 @@
+"""Records a session gesture by gesture, and makes a recording of it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from skin.device.serial import Serial
+from skin.errors import InputError
+from skin.port.errors import SkinDisconnected, SkinTimeout
+from skin.port.text import Header
+from skin.recording import join
+from skin.session.log import Log, read
+from skin.session.takes import Continuous
+from skin.storage import write
+
+__all__ = ["finish", "record"]
+
+
+def record(
+    device: Serial, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
+) -> None:
+    """Write frames until all gestures are done, ``seconds`` are over, or a person ends it.
+
+    Args:
+        device: where they come from, and which gestures.
+        path: x.csv; one that exists is resumed.
+        seconds: of the device's clock; None: no limit.
+        free: whatever is done counts, in windows one after the other.
+        tell: says a sentence to the person.
+    """
+    skin, tap = device.open(reconnect=True)
+    with skin:
+        first, _, meaning = device.settle(skin)
+        log = Log(path, _about(device, skin.header), len(device.sensors))
+        try:
+            log.meaning(meaning)
+            for frame in first:
+                log.frame(frame)
+            if log.done:
+                tell(f"{path} has {len(log.done)} gestures: going on")
+            director = device.director(tap, meaning, log.done)
+            if free:
+                director = Continuous(device.length, max(log.done, default=-1) + 1)
+            wanted = None if free else device.gestures
+            for frame in skin:
+                take, before = director.take, len(log.done)
+                if (done := director.show(frame)) is not None:
+                    log.end(done)
+                if len(log.done) > before:
+                    tell(f"{len(log.done)} of {wanted or 'any'} gestures")
+                if director.take is not None and director.take is not take:
+                    log.begin(director.take, frame)
+                log.frame(frame)
+                late = seconds is not None and frame.t - first[0].t >= seconds
+                if late or director.over or (wanted is not None and len(log.done) >= wanted):
+                    return
+        except (SkinTimeout, SkinDisconnected) as end:
+            tell(str(end))
+        finally:
+            log.close()
+
+
+def _about(device: Serial, header: Header | None) -> dict[str, Any]:
+    """Return what stands beside a session."""
+    return {
+        "format": 1,
+        "unit": header.unit if header and header.unit else "adc",
+        "bits": header.bits if header else None,
+        "id": header.id if header else None,
+        "started": datetime.now(UTC).isoformat(),
+        "positions": device.sensors.positions.tolist(),
+        "footprint": list(device.sensors.footprint),
+        "size": list(device.size),
+        "rate": device.rate,
+        "window": device.window,
+        "calibration": device.calibration,
+    }
+
+
+def finish(device: Serial, path: Path) -> tuple[Path, int]:
+    """Write the whole gestures of a session as a recording beside it; return it and how many there are.
+
+    Raises:
+        InputError: no session, none whole, or a session of another layout.
+    """
+    stored = read(path)
+    if stored.about.get("positions") != device.sensors.positions.tolist():
+        raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
+    takes = [stored.takes[number] for number in sorted(stored.takes)]
+    if not takes:
+        raise InputError(f"{path} has {stored.frames} frames and no whole gesture: record some more")
+    whole = join([device.stored([take], meaning) for take, meaning in takes])
+    about = stored.about | {"source": "session", "session": path.name, "lost": [one.lost for one, _ in takes]}
+    return write(replace(whole, metadata=about), path.with_suffix(".parquet")), len(takes)

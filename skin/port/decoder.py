@@ -63,6 +63,9 @@ class Decoder:
             now: s, the host's monotonic clock at their arrival.
         """
         self.counters.bytes += len(data)
+        if self.speech is None:
+            # Where nothing is recognised for long, only the latest is searched.
+            self._buffer = self._buffer[-2 * self._enough :]
         self._buffer += data
         if self.speech is None and not self._recognise(data, now):
             return []
@@ -91,8 +94,6 @@ class Decoder:
         passed = now - self._fed_at
         self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
         self._fed_at = now
-        # Where nothing was recognised for long, only the latest is searched.
-        self._buffer = self._buffer[-2 * self._enough :]
         if b"\n" not in data and b"\0" not in data:
             return False
         self._found = detect(self._buffer, self.sensors, self.format)

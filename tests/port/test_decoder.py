@@ -189,3 +189,7 @@ def test_after_a_restart_the_number_of_sensors_is_demanded_again():
     for number in range(0, 400, 40):
         decoder.feed(b"".join(lines(40, sensors=3, first=number)))
     assert "3 values per frame, the layout has 4" in str(decoder.refusal())
+
+
+def test_a_long_first_piece_is_read_from_its_first_frame():
+    assert numbers(Decoder(4).feed(b"".join(lines(3000)))) == list(range(3000))

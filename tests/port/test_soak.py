@@ -1,0 +1,29 @@
+"""Five seconds of a faulty wire; experiments/benchmarks/wire.py takes as many minutes as one likes."""
+
+import importlib.util
+
+import pytest
+
+from skin.config import ROOT
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def wire():
+    """Return the benchmark, which is no part of the package."""
+    spec = importlib.util.spec_from_file_location("wire", ROOT / "experiments" / "benchmarks" / "wire.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_intact_frame_arrives_and_no_wrong_value(wire):
+    found = wire.soak(5.0)
+    assert found["bad_frames"] > 5
+    assert (found["missed"], found["wrong"], found["dropped"], found["resets"]) == (0, 0, 0, 0)
+    assert found["memory_growth_bytes"] < 5e6
+
+
+def test_decoding_takes_less_than_a_twentieth_of_a_core(wire):
+    assert wire.decode_core_share() < 0.05

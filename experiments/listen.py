@@ -1,0 +1,39 @@
+"""Is the skin wired well? Say what a port sends: python experiments/listen.py device.port=/dev/ttyACM0"""
+
+import signal
+from contextlib import suppress
+
+from omegaconf import DictConfig
+
+from skin.config import command, plain
+from skin.errors import InputError
+
+_KEYS = ("baudrate", "format", "limits", "timeout")
+
+
+@command("listen")
+def main(config: DictConfig) -> None:
+    """Say once a second how many frames came, how fast and how sound; at the end, what each channel read."""
+    device = plain(config)["device"]
+    if device["port"] is None:
+        raise InputError("which port? add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER")
+
+    from skin.port.errors import SkinDisconnected, SkinTimeout
+    from skin.port.listening import Listener
+    from skin.port.opening import open_skin
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sensors = None if config.n is None else range(config.n)
+    with open_skin(device["port"], sensors, **{key: device[key] for key in _KEYS}) as skin:
+        listener = Listener(skin)
+        try:
+            with suppress(KeyboardInterrupt):
+                for line in listener.lines(config.seconds):
+                    print(line, flush=True)
+        except (SkinTimeout, SkinDisconnected) as error:
+            raise InputError(f"{device['port']}: {error}") from error
+        print(listener.summary())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""The first command that a person with a skin types."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tty
+from threading import Thread
+from time import sleep
+
+import pytest
+
+from skin.config import ROOT
+from skin.port.text import Header, encode_header, encode_line
+
+LISTEN = str(ROOT / "experiments" / "listen.py")
+
+
+def listen(*arguments):
+    return subprocess.run(
+        [sys.executable, LISTEN, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=ROOT,
+    )
+
+
+@pytest.fixture
+def address():
+    """Return the address of a skin of three sensors at 100 Hz, one line of ten spoilt."""
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def run():
+        device, _ = server.accept()
+        with device:
+            device.sendall(b"boot\n" + encode_header(Header(n=3, rate=100.0, bits=10)))
+            for number in range(100_000):
+                line = encode_line([512, 500 + number % 2, 1023], number, 10_000 * number)
+                try:
+                    device.sendall(line.replace(b"512", b"513") if number % 10 == 9 else line)
+                except OSError:
+                    return
+                sleep(0.01)
+
+    Thread(target=run, daemon=True).start()
+    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+    server.close()
+
+
+def test_it_says_what_comes(address):
+    done = listen(f"device.port={address}", "seconds=1.5", "n=3")
+    assert done.returncode == 0, done.stderr
+    first = done.stdout.splitlines()[0]
+    assert "text, checksum crc16, 3 sensors" in first
+    assert "1 skipped" in first
+    assert "checksum)" in first
+    assert "the device says: proto=1 n=3 rate=100 bits=10" in done.stdout
+    assert [line.split()[:4] + line.split()[5:] for line in done.stdout.splitlines()[-3:]] == [
+        ["0", "512", "512", "512", "ok"],
+        ["1", "500", "500", "501", "ok"],
+        ["2", "1023", "1023", "1023", "saturated"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "which port? add device.port="),
+        (["device.port=/dev/ttyACM77"], "no port /dev/ttyACM77"),
+        (["device.port=/dev/ttyACM77", "device.format=xml"], "device.format must be one of"),
+    ],
+)
+def test_what_cannot_be_listened_to_ends_with_code_2_and_a_sentence(arguments, said):
+    done = listen(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_another_number_of_sensors_and_silence_end_with_code_2(address):
+    done = listen(f"device.port={address}", "n=25", "seconds=20", "device.timeout=20")
+    assert done.returncode == 2
+    assert "sends 3 values per frame, the layout has 25 sensors" in done.stderr
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    done = listen(f"device.port={os.ttyname(slave)}", "device.timeout=0.2")
+    os.close(master)
+    os.close(slave)
+    assert done.returncode == 2
+    assert "port open, nothing received" in done.stderr
+
+
+def test_ctrl_c_ends_it_well(address):
+    command = [sys.executable, LISTEN, f"device.port={address}", "seconds=null"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
+        assert "text" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        out, said = process.communicate(timeout=120)
+    assert (process.returncode, "saturated" in out) == (0, True), said

@@ -1,7 +1,5 @@
 """Averages of learners."""
 
-from functools import partial
-
 import pytest
 import torch
 from hydra.utils import instantiate

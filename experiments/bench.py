@@ -12,6 +12,7 @@ from pathlib import Path
 from benchmarks import mechanics, training
 from benchmarks.generation import GESTURES
 from benchmarks.setting import seconds
+from benchmarks.wire import decode_core_share
 from rich.console import Console
 
 from skin.config import ROOT
@@ -33,8 +34,10 @@ def main() -> None:
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}",
         "versions": {name: version(name) for name in PACKAGES},
     }
-    say("generation")
-    figures["generation"] = {name: _generation(name, repeats) for name in ("naive", "fem")}
+    say("generation, device, live")
+    figures["generation"] = {name: _own("generation", name, str(repeats)) for name in ("naive", "fem")}
+    figures["device"] = {"decode_core_share": decode_core_share()}
+    figures["live"] = _own("live", "1000")
     say("operator")
     built = mechanics.build_seconds(repeats)
     figures["operator"] = {name: {"build_seconds": value} for name, value in built.items()}
@@ -58,9 +61,9 @@ def main() -> None:
     print(text)
 
 
-def _generation(simulator: str, repeats: int) -> dict[str, float]:
-    """Measure in a process of its own, so that its peak memory is its own."""
-    command = [sys.executable, str(HERE / "benchmarks" / "generation.py"), simulator, str(repeats)]
+def _own(module: str, *arguments: str) -> dict[str, float]:
+    """Measure in a process of its own, so that its peak memory and its threads are its own."""
+    command = [sys.executable, str(HERE / "benchmarks" / f"{module}.py"), *arguments]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 

@@ -105,6 +105,8 @@ class _Pty(AbstractOutlet):
                 raise InputError(f"cannot make link={self._link}: {error}") from error
 
     def connected(self) -> bool:
+        if self._master < 0:
+            return False
         watch = select.poll()
         watch.register(self._master, 0)
         return not any(event & select.POLLHUP for _, event in watch.poll(0))
@@ -143,7 +145,7 @@ class _Tcp(AbstractOutlet):
             self._client.close()
             self._client = None
         if self._client is None:
-            with suppress(BlockingIOError):
+            with suppress(OSError):  # nobody comes, or it is unplugged
                 self._client, _ = self._server.accept()
                 self._client.setblocking(False)
         return self._client is not None

@@ -1,0 +1,100 @@
+"""The commands of a skin at a port, end to end: emulate, record, play back, evaluate."""
+
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+
+from skin.config import ROOT
+from skin.session.log import read as read_session
+from skin.storage import read
+
+SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
+PATIENCE = 300  # s: machines are busy at times
+
+
+def run(script, *arguments):
+    return subprocess.run(
+        [sys.executable, ROOT / "experiments" / script, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+
+
+@contextmanager
+def emulated(*overrides):
+    """Run the emulator; give what device.port takes and the process."""
+    with subprocess.Popen(
+        [sys.executable, ROOT / "experiments" / "emulate.py", *SMALL, *overrides],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process.stdout.readline().strip(), process
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_emulator_well(tmp_path):
+    link = tmp_path / "skin"
+    with emulated(f"link={link}") as (port, process):
+        assert port == str(link)
+        assert "device.scale=0.0390625" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 0
+    assert not link.is_symlink()
+
+
+@pytest.mark.slow
+def test_a_session_that_was_killed_goes_on_and_is_played_back(tmp_path):
+    path = tmp_path / "s.csv"
+    with emulated("emulate.speed=5", "touch.window=30") as (port, _):
+        settings = ["device.labels=announced", "device.scale=0.0390625", f"device.port={port}"]
+        command = ["record.py", *SMALL, f"out={path}", *settings]
+        with subprocess.Popen(
+            [sys.executable, ROOT / "experiments" / command[0], *command[1:]], stderr=subprocess.DEVNULL
+        ) as killed:
+            deadline = time.monotonic() + PATIENCE
+            while not path.exists() or '"event": "end"' not in path.read_text():
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            killed.kill()
+        before = path.read_text()
+        assert before.endswith("\n")
+        done = len(read_session(path).takes)
+        assert done >= 1
+        resumed = run(*command, f"device.gestures={done + 2}")
+    assert resumed.returncode == 0, resumed.stderr
+    assert path.read_text().startswith(before)
+    stored = read(tmp_path / "s.parquet")
+    assert len(stored) == done + 2
+    assert stored.touches.readings.shape[1:] == (30, 4)
+    assert (stored.touches.readings.flatten(1).amax(1) > 0.3).all()
+    again = run("record.py", *SMALL, f"out={path}", "record.finish=true")
+    assert f"{done + 2} gestures" in again.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (("emulate.py", "port=usb"), "pty or tcp"),
+        (("emulate.py", "format=morse"), "text, binary"),
+        (("emulate.py", "+faults.flip=1"), "flip"),
+        (("record.py",), "out=session.csv"),
+        (("compare.py",), "which session?"),
+    ],
+)
+@pytest.mark.slow
+def test_bad_input_ends_with_2_and_one_sentence(command, reason):
+    done = run(*command)
+    assert done.returncode == 2, done.stderr
+    assert reason in done.stderr
+    assert "Traceback" not in done.stderr

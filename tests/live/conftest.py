@@ -24,7 +24,11 @@ class Browser:
 
     def __init__(self, driver: str, binary: str) -> None:
         self._process = subprocess.Popen([driver, "--port=0"], stdout=subprocess.PIPE, text=True)
-        found = next(found for line in self._process.stdout if (found := re.search(r"on port (\d+)", line)))
+        found = next(
+            found
+            for line in self._process.stdout
+            if (found := re.search(r"successfully on port (\d+)", line))
+        )
         self._address = f"http://127.0.0.1:{found[1]}/session"
         chrome = {"goog:chromeOptions": {"binary": binary, "args": OPTIONS}}
         made = self._ask("", {"capabilities": {"alwaysMatch": chrome}})

@@ -1,6 +1,7 @@
 """The report's figures 4, 7, 8, 10 and 11 from our own data, each written whole."""
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ Layout = tuple[tuple[float, float], float]
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_MARKS = ("o", "s", "^", "D")
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -125,12 +127,14 @@ def misclassified(
     middles = np.concatenate([[0.0], (bins[1:] + bins[:-1]) / 2])
     # Static touches go to group 0, a slide in bin k to group k.
     group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, bins), 1, len(bins) - 1))
-    for (row, errors), colour in zip(wrong.items(), _COLOURS * 2, strict=False):
+    # Every colour comes with one mark after the other, so that any number of rows can be told apart.
+    styles = product(_MARKS, _COLOURS)
+    for (row, errors), (mark, colour) in zip(wrong.items(), styles, strict=False):
         counts = np.bincount(group, minlength=len(middles))
         shares = np.bincount(group, weights=errors, minlength=len(middles)) / np.maximum(counts, 1)
         spread = np.sqrt(shares * (1 - shares) / np.maximum(counts, 1))
         axis.errorbar(
-            middles * 1e3, shares, spread, marker="o", markersize=4, capsize=2, color=colour, label=row
+            middles * 1e3, shares, spread, marker=mark, markersize=4, capsize=2, color=colour, label=row
         )
     axis.set_xlabel("speed, mm per frame (0: static)")
     axis.set_ylabel(f"share with “{label}” wrong")

@@ -7,7 +7,6 @@ Settings of one's own follow as overrides: layout.path=sensors.csv simulator=nai
 import argparse
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import train
@@ -50,8 +49,11 @@ def run(study: Study, variants: Sequence[Variant], overrides: list[str], folder:
         for sweep in study.sweeps:
             # In this process, as it is the longest way into torch and mlflow; what fails is missing below.
             sys.argv = [str(Path(train.__file__)), "-m", f"sweep={sweep}", *overrides]
-            with suppress(SystemExit):
+            try:
                 train.main()
+            except SystemExit as stop:
+                if isinstance(stop.code, int) and stop.code > 128:  # a signal: train nothing more
+                    raise
     findings = collect(store, variants, study.self_share)
     outcomes = conclusions(study.statements, findings)
     settings = [word for word in overrides[1:] if not word.startswith("tracking.")]

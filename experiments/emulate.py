@@ -36,10 +36,11 @@ def main(config: DictConfig) -> None:
     port = outlet(config.port, config.link)
     try:
         emulator = Emulator(device, port, settings, faults, config.format == "binary", _tell)
-        print(port.address, flush=True)
-        scale = f" device.scale={emulator.converter.scale:g}" if settings.bits else ""
-        print(f"device=serial device.port={port.address}{scale}", flush=True)
+        # From the first line on, because whoever reads it may stop this at once.
         with suppress(KeyboardInterrupt):
+            print(port.address, flush=True)
+            scale = f" device.scale={emulator.converter.scale:g}" if settings.bits else ""
+            print(f"device=serial device.port={port.address}{scale}", flush=True)
             emulator.run(config.seconds, config.gestures)
         print(f"{emulator.frames} frames")
     finally:

@@ -1,6 +1,11 @@
 """What all tests share."""
 
 import os
+import signal
+
+# Where tests run in the background Ctrl-C may be ignored, and commands that they start would inherit that.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tests are many small problems: a second thread only waits, and for long where the machine is busy.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -94,7 +94,7 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(stor
         assert "unplugged" in lines
         assert "Traceback" not in said.read_text()
         played = (tmp_path / "emulate.py.out").read_text()
-    assert re.search(r"gesture \d+: .*(?<!not )dangerous", played), played
+        assert re.search(r"gesture \d+: .*(?<!not )dangerous", played), played
     finally:
         for process in (live, emulator):
             if process and process.poll() is None:

@@ -10,7 +10,7 @@ from skin.config import fingerprint
 from skin.results.study import Paired, Statement, Variant, conclude, paired, verdict
 from skin.tracking import Store
 
-__all__ = ["COSTS", "Finding", "Outcome", "collect", "conclusions", "self_share"]
+__all__ = ["COSTS", "Finding", "Outcome", "collect", "conclusions", "graph_share"]
 
 COSTS = ("seconds_per_epoch", "parameters")
 """Metrics that are no shares."""
@@ -67,7 +67,7 @@ def collect(store: Store, variants: Sequence[Variant], shares: bool = False) -> 
     Args:
         store: where runs are.
         variants: of a study.
-        shares: add the column ``self``, :func:`self_share` of a variant's graph.
+        shares: add the column ``self``, :func:`graph_share` of a variant's graph.
     """
     findings = []
     for variant in variants:
@@ -78,21 +78,19 @@ def collect(store: Store, variants: Sequence[Variant], shares: bool = False) -> 
                 runs[seed] = finished[0]
         extra = {}
         if shares and runs:
-            extra = {"self": f"{self_share(next(iter(variant.configs.values()))):.2f}"}
+            extra = {"self": f"{graph_share(next(iter(variant.configs.values()))):.2f}"}
         findings.append(Finding(variant, runs, extra))
     return findings
 
 
-def self_share(config: DictConfig) -> float:
-    """Return how much of its own row of the normalised graph a node is: the mean of the diagonal.
-
-    At 1 no node sees a neighbour: the graph is a set of lone sensors.
-    """
+def graph_share(config: DictConfig) -> float:
+    """Return how much of its own row a node of the configured graph is, by ``self_share`` of the graphs."""
     from skin.build import build_data, build_device
+    from skin.representation.graph import self_share
 
     data = build_data(config, build_device(config))
     graph = data.representation_for(data.touches("train").positions)
-    return float(graph.adjacency.diagonal().mean())  # type: ignore[operator, union-attr]
+    return self_share(graph.adjacency)  # type: ignore[arg-type]
 
 
 def conclusions(statements: Sequence[Statement], findings: Sequence[Finding]) -> list[Outcome]:

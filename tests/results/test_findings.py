@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from skin.results.findings import Finding, conclusions, self_share
+from skin.results.findings import Finding, conclusions, graph_share
 from skin.results.study import Statement, Variant
 
 ACCURACY = "same/overall/accuracy"
@@ -82,4 +82,4 @@ def test_what_did_not_finish_is_missing_and_decides_nothing():
 def test_four_sensors_that_are_all_neighbours_are_a_quarter_themselves(configured):
     square = ["layout=grid", "layout.rows=2", "layout.columns=2", "representation.count=3"]
     small = ["simulator=naive", "data.gestures=10", "representation=graph", "representation.weight=none"]
-    assert self_share(configured(*square, *small)) == pytest.approx(0.25)
+    assert graph_share(configured(*square, *small)) == pytest.approx(0.25)

@@ -16,7 +16,6 @@ from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
-from skin.port.baseline import rest
 from skin.port.detect import Format
 from skin.port.errors import SkinDisconnected, SkinTimeout
 from skin.port.frame import Frame
@@ -25,14 +24,14 @@ from skin.port.opening import open_skin
 from skin.port.wire import open_wire
 from skin.recording import Recording, Touches
 from skin.session.newtons import Newtons, newtons
-from skin.session.reduction import check_rate, rate_of, reduced
+from skin.session.reduction import reduced
+from skin.session.settling import settle
 from skin.session.takes import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.session.tap import Tap
 
 __all__ = ["Serial"]
 
 _LABELS = ("announced", "prompted", "none")
-_SETTLE = 1.0  # s in which the rate shows
 
 
 @dataclass(kw_only=True, eq=False)
@@ -138,16 +137,7 @@ class Serial(AbstractDevice):
             its frames, the baseline (S,) in the device's unit, None without tare, and what values mean.
         """
         assert self.rate is not None
-        _say("reading the untouched skin: keep off" if self.tare else "reading the rate")
-        frames = [skin.read(1)[0]]
-        while len(frames) < 3 or frames[-1].t - frames[0].t < max(self.tare, _SETTLE):
-            frames += skin.read(1)
-            if frames[-1].segment != frames[0].segment:
-                frames = frames[-1:]
-        check_rate(rate_of(frames), self.rate)
-        baseline = None
-        if self.tare:
-            baseline = rest(*reduced(frames, frames[0].t, self.rate, int(self.tare * self.rate + 1e-6)))
+        frames, baseline = settle(skin, self.rate, self.tare, _say)
         return frames, baseline, newtons(len(self.sensors), baseline, self.scale, self._known, skin.header)
 
     def director(self, tap: Tap, meaning: Newtons, done: Collection[int] = ()) -> AbstractDirector:

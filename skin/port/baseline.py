@@ -3,6 +3,7 @@
 import numpy as np
 
 from skin.errors import InputError
+from skin.port.errors import SkinTouched
 
 __all__ = ["median", "rest"]
 
@@ -10,6 +11,7 @@ _FEWEST = 10  # frames
 # As multiples of the noise and of the smallest step seen.
 _MOVED = 8.0, 3.0  # within the frames
 _SHIFTED = 20.0, 10.0  # against the old baseline, because offsets drift
+_SMOOTH = 0.5  # von Neumann's ratio of successive differences to variance: 2 for noise, near 0 for a hand
 
 
 def rest(
@@ -27,7 +29,8 @@ def rest(
         touch: smallest shift of the baseline that is taken for a touch, however small the noise.
 
     Raises:
-        InputError: too few frames, or the skin was touched.
+        InputError: too few frames.
+        SkinTouched: the skin was touched.
     """
     middle = median(values)
     asked = np.asarray(valid.any(axis=0))
@@ -37,6 +40,9 @@ def rest(
     smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
     smallest[np.isinf(smallest)] = 0.0
     moved = np.abs(values - middle).max(axis=0)
+    # A hand that strokes all the time steps as far as noise does, but its next step goes the same way.
+    smooth = (steps**2).mean(axis=0) < _SMOOTH * values.var(axis=0)
+    noise = np.where(smooth, 0.0, noise)
     _refuse("moved by", moved, np.maximum(_MOVED[0] * noise, _MOVED[1] * smallest), asked)
     if before is not None:
         limit = np.maximum(np.maximum(_SHIFTED[0] * noise, _SHIFTED[1] * smallest), touch)
@@ -59,7 +65,7 @@ def _refuse(what: str, found: np.ndarray, limit: np.ndarray, asked: np.ndarray) 
     beyond = np.where(asked, found - limit, -np.inf)
     channel = int(beyond.argmax())
     if beyond[channel] > 0:
-        raise InputError(
+        raise SkinTouched(
             f"the skin is touched: channel {channel} {what} {found[channel]:.4g}, noise explains "
             f"{limit[channel]:.4g}; let go and tare again, or tare(force=True) if nothing touches it"
         )

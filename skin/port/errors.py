@@ -2,9 +2,14 @@
 
 from collections.abc import Sequence
 
+from skin.errors import InputError
 from skin.port.frame import Frame
 
-__all__ = ["SkinDisconnected", "SkinTimeout"]
+__all__ = ["SkinDisconnected", "SkinTimeout", "SkinTouched"]
+
+
+class SkinTouched(InputError):  # noqa: N818
+    """No baseline can be taken, because something touches the skin."""
 
 
 class SkinTimeout(TimeoutError):  # noqa: N818 - the name says what happened, as TimeoutError's does

@@ -19,6 +19,8 @@ __all__ = ["AbstractDirector", "Announced", "Continuous", "Prompted", "Take", "p
 
 Labels = Mapping[str, int]
 
+_LATE = 0.25  # share of an announced window that may be missed at its beginning
+
 
 @dataclass
 class Take:
@@ -120,7 +122,8 @@ class Announced(AbstractDirector):
             if frame.seq < said.seq:
                 return None
             self._heard.popleft()
-            if frame.seq < said.seq + said.frames:
+            # Of one that began long before somebody listened the rest is no gesture.
+            if frame.seq <= said.seq + _LATE * said.frames:
                 begin = frame.t - (frame.seq - said.seq) * self._length / said.frames
                 labels = {"touch": 1} | dict(said.labels)
                 if missing := [name for name in self._task.names if name not in labels]:

@@ -5,6 +5,7 @@ import pytest
 
 from skin.errors import InputError
 from skin.port.baseline import rest
+from skin.port.errors import SkinTouched
 
 RNG = np.random.default_rng(3)
 VALID = np.ones((100, 6), dtype=bool)
@@ -60,3 +61,22 @@ def test_a_channel_that_means_nothing_is_not_asked():
 def test_too_few_frames():
     with pytest.raises(InputError, match="10 frames, got 9"):
         rest(idle()[:9], VALID[:9])
+
+
+def test_a_hand_that_strokes_all_the_time_is_no_noise():
+    time = np.arange(200) / 100
+    values = (
+        500 + 30 * np.sin(2 * np.pi * time / 1.2)[:, None] + np.random.default_rng(0).normal(size=(200, 3))
+    )
+    with pytest.raises(SkinTouched, match="moved"):
+        rest(values[::10], np.ones((20, 3), dtype=bool))
+
+
+def test_noise_is_no_hand():
+    refused = 0
+    for seed in range(200):
+        try:
+            rest(np.random.default_rng(seed).normal(size=(20, 25)), np.ones((20, 25), dtype=bool))
+        except SkinTouched:
+            refused += 1
+    assert refused <= 4

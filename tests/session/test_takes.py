@@ -48,6 +48,11 @@ def test_a_window_keeps_its_place_where_its_first_frames_are_lost():
     assert (take.frames[0].seq, take.frames[-1].seq, take.lost) == (14, 39, 4)
 
 
+def test_a_gesture_that_was_half_over_is_none():
+    director = Announced(0.3, heard(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH)
+    assert [take.number for take in shown(director, frames(range(15, 70)))] == [1]
+
+
 def test_windows_that_touch_each_other_are_two():
     director = Announced(0.1, heard(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH)
     assert [take.number for take in shown(director, frames(range(25)))] == [0, 1]

@@ -45,9 +45,8 @@ class Simulated(AbstractDevice):
         test_gestures: how many gestures ``test`` has.
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
-        stream: touches are windows, cut at random strides from streams of gestures with idle gaps between
-            them: a window shows part of a gesture, a whole one or none, and has the label ``touch`` too.
-            ``gestures`` and ``test_gestures`` then count windows. Every split has streams of its own.
+        stream: touches are windows of streams of gestures with idle gaps between them: a window shows part
+            of a gesture, a whole one or none, and has the label ``touch`` too. Each split has its own.
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
         gain_spread, offset, noise, ... quantum: as in :class:`skin.imperfection.Imperfection`.
@@ -101,6 +100,8 @@ class Simulated(AbstractDevice):
         self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded)
         self.window = self.sampler.settings.window
         self.model = self.simulator(self.body, true)
+        if self.sampler.settings.shear:
+            self.model.refuse_drag()
         self.imperfection = Imperfection.of(self)
         drawn = generator(Stream.CONSTANTS, self.seed)
         self.constants = self.imperfection.constants(len(self.sensors), drawn)
@@ -169,9 +170,8 @@ class Simulated(AbstractDevice):
         """Draw gestures or windows in batches; ``complete`` adds the displacements."""
         parts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
         if self.stream:
-            return join(
-                in_threads(lambda n: self._windows(parts[n], complete, stream, (*key, n)), len(parts))
-            )
+            found = in_threads(lambda n: self._windows(parts[n], complete, stream, (*key, n)), len(parts))
+            return join(found)
         wanted = balanced(count, generator(stream, *key, 0))
         return join(
             in_threads(lambda n: self._batch(wanted[parts[n]], complete, stream, (*key, 1 + n)), len(parts))

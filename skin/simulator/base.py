@@ -1,7 +1,7 @@
 """What a simulator is: a differentiable map from surface pressure to true sensor readings."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
@@ -28,11 +28,33 @@ class AbstractSimulator(nn.Module, ABC):
 
     Every simulator is positively homogeneous: ``k`` times the pressure gives ``k`` times the response, for
     k >= 0. So a static touch needs one image, whatever its time profile.
+
+    Attributes:
+        feels_shear: readings depend on forces along the surface too.
     """
 
+    feels_shear: ClassVar[bool] = False
+
     @abstractmethod
-    def forward(self, pressure: Tensor) -> Response:
-        """Return the response to pressure (..., H, W), Pa."""
+    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+        """Return the response to pressure (..., H, W), Pa.
+
+        Args:
+            pressure: on the surface cells, into the skin.
+            drag: (..., 2), the traction along x and y that goes with each frame, over its pressure: the
+                coefficient of friction times the direction in which the object moves. None: no friction.
+
+        Raises:
+            InputError: drag, where the simulator feels none.
+        """
+
+    def refuse_drag(self) -> None:
+        """Raise an InputError that says which simulator feels friction, unless this one does."""
+        if not self.feels_shear:
+            raise InputError(
+                "friction needs a simulator that feels forces along the surface, got "
+                f"simulator={self._name}: set simulator=solid, or touch.shear=0"
+            )
 
     def motion(self, pressure: Tensor) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
@@ -42,8 +64,11 @@ class AbstractSimulator(nn.Module, ABC):
         Raises:
             InputError: in this simulator sensors do not move along the sheet.
         """
-        name = type(self).__module__.rpartition(".")[2]
         raise InputError(
-            f"sensors that move need a simulator in which they can, got simulator={name}: "
+            f"sensors that move need a simulator in which they can, got simulator={self._name}: "
             "set simulator=fem simulator.constraint=free"
         )
+
+    @property
+    def _name(self) -> str:
+        return type(self).__module__.rpartition(".")[2]

@@ -75,8 +75,14 @@ class PlatesAndBeams(AbstractSimulator):
         moves = np.concatenate([self.operator.along_x, self.operator.along_y, self.operator.sensor])
         self.register_buffer("along", torch.from_numpy(moves.T.copy()).float())
 
-    def forward(self, pressure: Tensor) -> Response:
-        """Return the response to pressure (..., H, W), Pa, with D_s and D_t as its displacement."""
+    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+        """Return the response to pressure (..., H, W), Pa, with D_s and D_t as its displacement.
+
+        Raises:
+            InputError: drag; only normal forces are felt.
+        """
+        if drag is not None:
+            self.refuse_drag()
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         sensor, surface, force = (cells @ self.transfer).chunk(3, dim=-1)
         displacement = torch.stack([sensor, surface], dim=-1)

@@ -37,7 +37,13 @@ class Naive(AbstractSimulator):
         area = body.footprint_areas(sensors).sum(axis=1)
         self.register_buffer("area", torch.from_numpy(area).float())
 
-    def forward(self, pressure: Tensor) -> Response:
-        """Return the response to pressure (..., H, W), Pa; it knows no displacement."""
+    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+        """Return the response to pressure (..., H, W), Pa; it knows no displacement.
+
+        Raises:
+            InputError: drag; only normal forces are felt.
+        """
+        if drag is not None:
+            self.refuse_drag()
         cells = flatten(pressure, self.shape, self.area.dtype)
         return Response(cells[..., self.cell] * self.area, None)

@@ -11,7 +11,7 @@ from skin.errors import InputError
 from skin.labels import Thresholds
 from skin.touch.shapes import Shapes
 
-__all__ = ["Draws", "GestureSettings", "draw_gestures", "draw_paths", "fold"]
+__all__ = ["Draws", "GestureSettings", "draw_gestures", "draw_paths", "fold", "heading"]
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
@@ -41,6 +41,7 @@ class GestureSettings:
     path: float = 0.010
     spare: float = 0.010
     ramp: int = 3
+    shear: float = 0.0
     redraws: int = 30
     gap: tuple[int, int] = (10, 60)
     stride: tuple[int, int] = (15, 45)
@@ -82,6 +83,10 @@ class GestureSettings:
         for name, low in (("path", 0), ("spare", 0), ("ramp", 2), ("redraws", 1)):
             if getattr(self, name) < low:
                 raise InputError(f"touch.{name} must be at least {low}, got {getattr(self, name)}")
+        if not 0 <= self.shear < np.inf:
+            raise InputError(
+                f"touch.shear is a coefficient of friction from 0 up, got {self.shear}: as in touch.shear=0.5"
+            )
         for name in ("gap", "stride"):
             given = getattr(self, name)
             if (
@@ -216,3 +221,21 @@ def fold(place: np.ndarray, room: np.ndarray) -> np.ndarray:
     """Return places reflected at 0 and ``room``, as a ball between two walls (a triangle wave)."""
     round_trip = np.mod(place, 2 * room)
     return np.minimum(round_trip, 2 * room - round_trip)
+
+
+def heading(way: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (U, 2) along which objects have come to their places; 0 where they stand still.
+
+    A step that a wall reflects counts as what it is: from place to place. The first frame of a path, to which
+    nothing has led, takes the direction of its first step.
+
+    Args:
+        way: (U, 2), m, the places of all paths, one path after another.
+        first: (B,), ascending, where each path begins.
+    """
+    steps = np.diff(way, axis=0, prepend=way[:1])
+    steps[first] = 0
+    more = first[np.diff(first, append=len(way)) > 1]
+    steps[more] = steps[more + 1]
+    length = np.linalg.norm(steps, axis=1, keepdims=True)
+    return np.divide(steps, length, out=np.zeros_like(steps), where=length > 0)

@@ -12,7 +12,7 @@ from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.labels import TOUCH, measure
 from skin.simulator.base import AbstractSimulator, Response
-from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, fold
+from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, fold, heading
 from skin.touch.shapes import Shapes
 
 __all__ = ["Movie", "TouchSampler", "balanced", "join"]
@@ -45,6 +45,8 @@ class Movie:
         parameters: (B,) each: shape (index), angle (rad), duration and onset (frames), direction (rad), speed
             (m per frame), peak (highest cell pressure, Pa), force (N, all cells at full force), area (largest
             share of the sheet in contact), draws (how many were drawn until one had the wanted labels).
+        drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
+            times the direction of motion, 0 where nothing slides; None: no friction.
     """
 
     frames: Tensor
@@ -52,6 +54,7 @@ class Movie:
     scale: Tensor
     labels: Tensor
     parameters: dict[str, Tensor]
+    drag: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -67,6 +70,7 @@ class Movie:
             self.scale[rows],
             self.labels[rows],
             {name: values[rows] for name, values in self.parameters.items()},
+            None if self.drag is None else self.drag[shown],
         )
 
     @property
@@ -84,7 +88,8 @@ class Movie:
         The displacement is None if the simulator knows none, or if it is not asked for.
         """
         home = next(simulator.buffers(), self.frames).device
-        readings, moves = simulator(self.frames.to(home))
+        drag = None if self.drag is None else self.drag.to(home)
+        readings, moves = simulator(self.frames.to(home), drag)
         index, scale = self.index.to(home), self.scale.to(home)
         if not displacement or moves is None:
             return Response(readings[index] * scale[..., None], None)
@@ -94,12 +99,14 @@ class Movie:
 def join(movies: Sequence[Movie]) -> Movie:
     """Return one movie of all gestures of ``movies``, in order."""
     starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
+    drags = [movie.drag for movie in movies if movie.drag is not None]
     return Movie(
         torch.cat([movie.frames for movie in movies]),
         torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
         torch.cat([movie.scale for movie in movies]),
         torch.cat([movie.labels for movie in movies]),
         {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
+        torch.cat(drags) if drags else None,
     )
 
 
@@ -223,7 +230,8 @@ class TouchSampler:
         measures = measure(frames, shown, shares, self.footprints, body.cell, settings.thresholds.contact)
         parameters = gestures | {"force": force, "area": measures.area.numpy()}
         known = {name: torch.from_numpy(parameters[name]).float() for name in _PARAMETERS}
-        return Movie(frames, shown, shares, measures.labels(settings.thresholds), known)
+        drag = torch.from_numpy(settings.shear * heading(way, first)).float() if settings.shear else None
+        return Movie(frames, shown, shares, measures.labels(settings.thresholds), known, drag)
 
 
 def _never(labels: np.ndarray, settings: GestureSettings) -> InputError:

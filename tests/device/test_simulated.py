@@ -167,3 +167,8 @@ def test_the_summary_counts(plain):
 def test_bad_settings_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         device(**changes)
+
+
+def test_friction_that_nothing_feels_is_refused_at_the_door():
+    with pytest.raises(InputError, match=r"got simulator=naive: set simulator=solid, or touch.shear=0"):
+        device(touch={"shear": 0.5})

@@ -9,6 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from skin.body.sheet import Sheet
+from skin.errors import InputError
 from skin.layout.scattered import Scattered
 from skin.simulator.base import AbstractSimulator, Response
 
@@ -115,3 +116,15 @@ def test_its_state_is_all_in_its_buffers(simulator):
         buffer.zero_()
     simulator.load_state_dict(state)
     np.testing.assert_array_equal(simulator(pressure()).readings, before)
+
+
+def test_drag_is_felt_or_refused_by_name(simulator):
+    frames, drag = pressure(3), torch.tensor([[0.5, 0.0], [0.0, 0.5], [0.0, 0.0]])
+    if not simulator.feels_shear:
+        with pytest.raises(InputError, match=r"friction needs a simulator .* set simulator=solid"):
+            simulator(frames, drag)
+        return
+    plain, dragged, twice = simulator(frames), simulator(frames, drag), simulator(2 * frames, drag)
+    assert not torch.allclose(plain.readings[:2], dragged.readings[:2], rtol=1e-3)
+    torch.testing.assert_close(plain.readings[2], dragged.readings[2], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(twice.readings, 2 * dragged.readings, rtol=1e-4, atol=1e-5)

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.labels import Thresholds
-from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold
+from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading
 from skin.touch.shapes import Shapes
 
 CONF = Path(__file__).parents[2] / "conf" / "touch.yaml"
@@ -39,6 +39,8 @@ def test_the_shipped_configuration_is_the_default_difficulty():
         ({"dangerous_peak": [50e3, 180e3]}, r"touch.dangerous_peak"),
         ({"speed": [0.02, 0.003]}, r"touch.speed must be a range"),
         ({"path": 0.03}, r"touch.path=0.03 m is longer"),
+        ({"shear": -0.1}, r"touch.shear is a coefficient of friction from 0 up, got -0.1"),
+        ({"shear": float("nan")}, r"touch.shear"),
         ({"redraws": 0}, r"touch.redraws must be at least 1"),
     ],
 )
@@ -62,6 +64,17 @@ def test_fold_is_a_ball_between_two_walls():
             place, step = (2 * room - place if place > room else -place), -step
     straight = 2.0 + 0.3 * np.arange(200)
     np.testing.assert_allclose(fold(straight, np.full(200, room)), ways, atol=1e-9)
+
+
+def test_heading_is_where_each_step_led():
+    """A straight path, one that a wall turns within a step, one of a single frame, one that stands still."""
+    straight = np.array([[0.0, 0.0], [3.0, 4.0], [6.0, 8.0]])
+    turned = np.array([[8.0, 1.0], [9.0, 2.0], [9.4, 3.0], [8.4, 4.0]])
+    way = np.concatenate([straight, turned, [[5.0, 5.0]], [[2.0, 2.0], [2.0, 2.0]]])
+    half = np.sqrt(0.5)
+    corner = np.array([0.4, 1.0]) / np.hypot(0.4, 1.0)
+    expected = [[0.6, 0.8]] * 3 + [[half, half], [half, half], corner, [-half, half]] + [[0, 0]] * 3
+    np.testing.assert_allclose(heading(way, np.array([0, 3, 7, 8])), expected, atol=1e-12)
 
 
 def test_a_shape_that_never_fits_is_named():

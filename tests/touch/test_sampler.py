@@ -193,3 +193,42 @@ def test_nothing_but_the_path_gives_dynamic_away():
     booster = HistGradientBoostingClassifier(max_iter=60, random_state=0)
     score = cross_val_score(booster, known.numpy(), movie.labels[:, 1].numpy(), cv=5).mean()
     assert score <= 0.60
+
+
+def test_friction_changes_nothing_but_the_drag():
+    plain, rough = (
+        sampler(SHEETS["default"], shear=shear).sample(48, np.random.default_rng(3)) for shear in (0.0, 0.5)
+    )
+    assert plain.drag is None
+    assert torch.equal(plain.frames, rough.frames)
+    assert all(torch.equal(plain.parameters[name], rough.parameters[name]) for name in plain.parameters)
+
+
+def test_drag_follows_the_centre_of_pressure():
+    """Seen in the frames alone: the drag points from where the pressure was to where it is."""
+    source = sampler(SHEETS["default"], shear=0.5)
+    movie = source.sample(96, np.random.default_rng(3))
+    size = torch.linalg.vector_norm(movie.drag, dim=1)
+    dynamic = movie.labels[:, 1] == 1
+    x, y = (torch.arange(32) + 0.5) * 0.005, (torch.arange(32) + 0.5) * 0.005
+    for index, scale, slides in zip(movie.index, movie.scale, dynamic.tolist(), strict=True):
+        shown = index[scale > 0]
+        if not slides:
+            assert (size[shown] == 0).all()
+            continue
+        frames = movie.frames[shown].double()
+        total = frames.sum((1, 2))
+        centre = torch.stack([(frames.sum(1) * x).sum(1), (frames.sum(2) * y).sum(1)], 1) / total[:, None]
+        steps = centre.diff(dim=0)
+        far = torch.linalg.vector_norm(steps, dim=1) > 2e-3
+        # Rendering on cells of 5 mm moves a centre by parts of a millimetre.
+        cosine = torch.cosine_similarity(steps, movie.drag[shown][1:].double())
+        assert (cosine[far] > 0.97).all()
+        torch.testing.assert_close(size[shown], torch.full((len(shown),), 0.5))
+
+
+def test_rows_and_joined_movies_keep_their_drag():
+    movie = sampler(SHEETS["default"], shear=0.5).sample(32, np.random.default_rng(3))
+    rows = torch.tensor([5, 2, 19])
+    for part in (movie[rows], join([movie[rows[:1]], movie[rows[1:]]])):
+        assert torch.equal(part.drag[part.index], movie.drag[movie.index[rows]])

@@ -3,21 +3,24 @@
 python experiments/benchmarks/wire.py 600 crc16
 """
 
+import argparse
 import json
 import os
+import subprocess
 import sys
 import time
 import tty
-from contextlib import suppress
-from multiprocessing import get_context
+from dataclasses import dataclass, field
+from functools import partial
+from typing import get_args
 
 import numpy as np
 import psutil
 
 from skin.port.decoder import Decoder
 from skin.port.errors import SkinTimeout
-from skin.port.frame import Check
-from skin.port.live import Skin
+from skin.port.frame import Check, Frame
+from skin.port.live import Skin, Stats
 from skin.port.opening import open_skin
 from skin.port.text import encode_line
 
@@ -25,7 +28,10 @@ __all__ = ["decode_core_share", "soak"]
 
 SENSORS = 25
 _SPOILT = 0.01
-_WARM = 0.1  # share of a soak before memory is compared
+_WHOLE = 10  # lines at the beginning that are whole, so that the format shows
+_MINUTE = 60.0  # s after which memory is compared; a tenth of a short soak
+_LATE = 0.05  # s: a piece that comes later than that was held up by the machine
+_BURST = 16  # bytes
 
 
 def decode_core_share(rate: float = 1000.0, frames: int = 20_000) -> float:
@@ -41,56 +47,114 @@ def decode_core_share(rate: float = 1000.0, frames: int = 20_000) -> float:
 def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[str, float]:
     """Read from a pseudo-terminal that another process fills, one line of a hundred spoilt.
 
-    A spoilt line has two bits flipped, has lost two bytes, or has lost its end and glues to the next.
+    A spoilt line has two bits flipped, has lost two bytes, has lost its end and glues to the next, has a run
+    of up to 16 bytes overwritten at random, has lost such a run, or says it twice.
 
     Returns:
         frames ``sent`` and ``intact``, those ``delivered`` with the right values, ``wrong`` ones taken for
-        right, ``missed`` ones (intact, but not delivered), the growth of memory in bytes since a tenth of the
-        time, the seconds it took (more than asked for where the sender gets no core, and 5 of silence at the
-        end), and the share of a core that the reader's process took, with this comparison.
+        right, ``missed`` ones (intact, but not delivered); the resident memory after a minute, or a tenth
+        of a short soak, and at the end, bytes; the rate reached, Hz, and how many lines were sent more than 50 ms
+        late; the shares of a core that the reader's process took, with this comparison, and the sender's.
     """
     master, slave = os.openpty()
     tty.setraw(slave)
-    count, process = round(seconds * rate), psutil.Process()
-    right, wrong, warm = np.zeros(count, dtype=bool), 0, 0
-    with open_skin(os.ttyname(slave), range(SENSORS), timeout=5.0) as skin:
-        sender = get_context("fork").Process(target=_send, args=(master, count, rate, check), daemon=True)
-        sender.start()
-        began, start = time.process_time(), time.monotonic()
-        for frame in _frames(skin):
-            seq = frame.seq or 0
-            if seq < count and np.array_equal(frame.values, _values(seq)):
-                right[seq] = True
-            else:
-                wrong += 1
-            warm = warm or (seq > _WARM * count and process.memory_info().rss) or 0
-        passed = time.monotonic() - start
-        share = (time.process_time() - began) / passed
-        sender.join()
-        grown, stats = process.memory_info().rss - warm, skin.stats
-    os.close(master)
-    os.close(slave)
-    intact = np.array([not _spoilt(number) and not _glued(number - 1) for number in range(count)])
-    # Without a CRC the first line is left out: it may be half a line.
-    return {
-        "seconds": passed,
-        "sent": count,
-        "intact": int(intact.sum()),
-        "delivered": int(right.sum()),
-        "missed": int((intact & ~right).sum()),
-        "wrong": wrong,
-        "bad_frames": stats.bad_frames,
-        "dropped": stats.dropped,
-        "gaps": stats.gaps,
-        "resets": stats.resets,
-        "memory_growth_bytes": grown,
-        "core_share": share,
-    }
+    tally = _Tally(round(seconds * rate), after=min(_MINUTE, seconds / 10))
+    command = [sys.executable, __file__, str(seconds), check, str(rate), "--send", str(master)]
+    sender = subprocess.Popen(command, pass_fds=[master], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert sender.stdin is not None
+    assert sender.stdout is not None
+    try:
+        with open_skin(os.ttyname(slave), range(SENSORS)) as skin:
+            sender.stdout.readline()  # it is ready
+            sender.stdin.write(b"go\n")
+            sender.stdin.flush()
+            tally.watch(skin, sender)
+            stats = skin.stats
+        told = json.loads(sender.stdout.read())
+    finally:
+        sender.kill()
+        sender.communicate()
+        os.close(master)
+        os.close(slave)
+    return tally.figures(stats, check) | told
 
 
-def _frames(skin: Skin):
-    with suppress(SkinTimeout):
-        yield from skin
+@dataclass
+class _Tally:
+    """Compares what comes with what was sent.
+
+    Attributes:
+        count: frames that are sent.
+        after: s when memory is looked at for the first time.
+    """
+
+    count: int
+    after: float
+    wrong: int = 0
+    memory: list[int] = field(default_factory=list)
+    core_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.right = np.zeros(self.count, dtype=bool)
+        self._resident = partial(psutil.Process().memory_info)
+
+    def watch(self, skin: Skin, sender: "subprocess.Popen[bytes]") -> None:
+        """Take frames until the sender has ended and nothing more comes."""
+        began, start, ended = time.process_time(), time.monotonic(), False
+        while True:
+            frames = _frames(skin)
+            if ended and not frames:
+                break
+            ended = sender.poll() is not None
+            for frame in frames:
+                self._take(frame)
+            if not self.memory and time.monotonic() - start >= self.after:
+                self.memory.append(self._resident().rss)
+        self.core_share = (time.process_time() - began) / (time.monotonic() - start)
+        self.memory.append(self._resident().rss)
+
+    def _take(self, frame: Frame) -> None:
+        seq = frame.seq or 0
+        if seq < self.count and frame.values.tolist() == _values(seq):
+            self.right[seq] = True
+        else:
+            self.wrong += 1
+
+    def figures(self, stats: Stats, check: Check) -> dict[str, float]:
+        """Return what became of the frames."""
+        spoilt = _spoilt(self.count)
+        glued = np.array([_glued(number) for number in np.flatnonzero(spoilt)], dtype=bool)
+        intact = ~spoilt
+        # The line that another glues itself to is lost with it.
+        intact[np.minimum(np.flatnonzero(spoilt)[glued] + 1, self.count - 1)] = False
+        # Without a CRC the first line is left out: it may be half a line.
+        intact[0] = check == "crc16"
+        return {
+            "sent": self.count,
+            "intact": int(intact.sum()),
+            "delivered": int(self.right.sum()),
+            "missed": int((intact & ~self.right).sum()),
+            "wrong": self.wrong,
+            "bad_frames": stats.bad_frames,
+            "dropped": stats.dropped,
+            "gaps": stats.gaps,
+            "resets": stats.resets,
+            "memory_early_bytes": self.memory[0],
+            "memory_end_bytes": self.memory[-1],
+            "reader_core_share": self.core_share,
+        }
+
+
+def _frames(skin: Skin) -> list[Frame]:
+    """Return what came: all that waits, after the first."""
+    try:
+        first = skin.read(1, 1.0)
+    except SkinTimeout as few:
+        return few.frames
+    try:
+        return first + skin.read(1024, 0.0)
+    except SkinTimeout as few:
+        return first + few.frames
 
 
 def _values(number: int) -> list[int]:
@@ -101,45 +165,78 @@ def _line(number: int, period: float, check: Check) -> bytes:
     return encode_line(_values(number), number, round(number * period * 1e6) % 2**32, check)
 
 
-def _spoilt(number: int) -> bool:
-    # The first lines are whole, so that the format shows.
-    return number >= 10 and np.random.default_rng((1, number)).random() < _SPOILT
+def _spoilt(count: int) -> np.ndarray:
+    """Return which lines are spoilt, (count,), bool: drawn at once, for a draw each would cost the sender."""
+    chosen = np.random.default_rng(1).random(count) < _SPOILT
+    chosen[:_WHOLE] = False
+    return chosen
+
+
+def _kind(number: int) -> tuple[int, np.random.Generator]:
+    draw = np.random.default_rng((2, number))
+    return int(draw.integers(6)), draw
 
 
 def _glued(number: int) -> bool:
-    return number >= 0 and _spoilt(number) and np.random.default_rng((2, number)).random() < 1 / 3
+    return _kind(number)[0] == 2
 
 
 def _spoil(number: int, line: bytes) -> bytes:
-    if _glued(number):
-        return line[:-1]
-    draw = np.random.default_rng((3, number))
-    data = bytearray(line[:-1])
-    flips = draw.random() < 0.5
-    for _ in range(2):
-        place = int(draw.integers(len(data)))
-        if flips:
+    kind, draw = _kind(number)
+    data, first, run = bytearray(line[:-1]), int(draw.integers(len(line) - 1)), int(draw.integers(2, _BURST))
+    if kind == 0:
+        for place in draw.integers(len(data), size=2).tolist():
             data[place] ^= 1 << int(draw.integers(8))
-        else:
-            del data[place]
+    elif kind == 1:
+        for _ in range(2):
+            del data[int(draw.integers(len(data)))]
+    elif kind == 2:
+        return bytes(data)
+    elif kind == 3:
+        data[first : first + run] = draw.bytes(len(data[first : first + run]))
+    elif kind == 4:
+        del data[first : first + run]
+    else:
+        data[first:first] = data[first : first + run]
     return bytes(data) + b"\n"
 
 
-def _send(master: int, count: int, rate: float, check: Check) -> None:
-    began = time.monotonic()
+def _send(master: int, seconds: float, check: Check, rate: float) -> None:
+    """Send a line each period, by the clock: what is late is made up for; then print how that went."""
+    count, late = round(seconds * rate), 0
+    spoilt = _spoilt(count).tolist()
+    print("ready", flush=True)
+    sys.stdin.readline()
+    began, worked = time.monotonic(), time.process_time()
     for number in range(count):
         line = _line(number, 1 / rate, check)
-        piece = _spoil(number, line) if _spoilt(number) else line
-        time.sleep(max(0.0, began + number / rate - time.monotonic()))
+        piece = _spoil(number, line) if spoilt[number] else line
+        wait = began + number / rate - time.monotonic()
+        late += wait < -_LATE
+        if wait > 0:
+            time.sleep(wait)
         while piece:
             piece = piece[os.write(master, piece) :]
+    passed = time.monotonic() - began
+    share = (time.process_time() - worked) / passed
+    print(json.dumps({"rate_hz": count / passed, "late": late, "sender_core_share": share}), flush=True)
 
 
 def main() -> None:
     """Print the figures."""
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
-    check: Check = sys.argv[2] if len(sys.argv) > 2 else "crc16"  # type: ignore[assignment]
-    print(json.dumps({"decode_core_share": decode_core_share()} | soak(seconds, check), indent=2))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("seconds", type=float, nargs="?", default=60.0)
+    parser.add_argument("check", choices=get_args(Check), nargs="?", default="crc16")
+    parser.add_argument("rate", type=float, nargs="?", default=500.0, help="Hz")
+    parser.add_argument("--send", type=int, metavar="DESCRIPTOR", help="be the sender of a soak")
+    given = parser.parse_args()
+    if given.send is not None:
+        _send(given.send, given.seconds, given.check, given.rate)
+        return
+    found = soak(given.seconds, given.check, given.rate)
+    print(json.dumps({"decode_core_share": decode_core_share()} | found, indent=2))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def build_device(config: DictConfig) -> AbstractDevice:
     """Return the source of touches, with its body, layout and, where it has one, its simulator."""
     groups = plain(config)
     body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
-    # Not as arguments of instantiate: it would take the dataclass Sheet for a configuration.
+    # Not as arguments of instantiate: it would take the dataclass of the body for a configuration.
     return instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
 
 

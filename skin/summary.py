@@ -4,13 +4,13 @@ from typing import Any
 
 import torch
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.recording import Recording
 
 __all__ = ["line", "summarise"]
 
 
-def summarise(recording: Recording, body: Sheet) -> dict[str, Any]:
+def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
     """Return what a simulated data set is like, as shares of 1 and SI units.
 
     The strain of the top layer is its highest pressure by its modulus. Linear theory is good to about 0.3;

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import torch
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.calibration._columns import load, numbers
 from skin.errors import InputError
 from skin.simulator.base import AbstractSimulator
@@ -107,7 +107,7 @@ def of_table(table: pa.Table, where: str, indenter: str, radius: float, delay: f
     )
 
 
-def per_newton(simulator: AbstractSimulator, body: Sheet, gauge: Gauge) -> np.ndarray:
+def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -> np.ndarray:
     """Return what every sensor truly reads per N of a press, (P, S).
 
     Simulators are positively homogeneous, so one frame of 1 N tells a press of any force.
@@ -131,7 +131,7 @@ def per_newton(simulator: AbstractSimulator, body: Sheet, gauge: Gauge) -> np.nd
 @torch.no_grad()
 def _answers(
     simulator: AbstractSimulator,
-    body: Sheet,
+    body: AbstractBody,
     indenter: Sequence[str] | np.ndarray,
     place: np.ndarray,
     radius: np.ndarray,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.device._cost import CAPTURES, FULL, ROWS, SOURCE, refusal
 from skin.device._cost_cache import captures
 from skin.device.base import AbstractDevice, Split
@@ -84,7 +84,7 @@ class Cost(AbstractDevice):
         InputError: settings that cannot be used, no file, or one that is not in the corpus's format.
     """
 
-    body: Sheet | None = None
+    body: AbstractBody | None = None
     layout: AbstractLayout | None = None
     path: str | None = None
     gestures: str | Sequence[str] = "report"

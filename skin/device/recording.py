@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
@@ -40,7 +40,7 @@ class Recorded(AbstractDevice):
 
     def __init__(
         self,
-        body: Sheet,
+        body: AbstractBody,
         layout: AbstractLayout,
         path: str | None = None,
         split_seed: int = 0,
@@ -64,7 +64,7 @@ class Recorded(AbstractDevice):
         touches = self._recording.touches
         self.rate, self.window = touches.rate, touches.readings.shape[1]
 
-    def _compare(self, body: Sheet) -> None:
+    def _compare(self, body: AbstractBody) -> None:
         stored, size = self._recording.touches.positions, self._recording.size
         if not np.allclose(size, body.size):
             raise InputError(

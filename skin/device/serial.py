@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.calibration.values import read
 from skin.device._blank import Blank
 from skin.device.base import AbstractDevice, Split
@@ -63,7 +63,7 @@ class Serial(AbstractDevice):
         InputError: settings that cannot be used, or a device that does not fit the model.
     """
 
-    body: Sheet
+    body: AbstractBody
     layout: AbstractLayout
     port: str | None = None
     baudrate: int = 115200

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from skin import __version__
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.device._threads import in_threads
 from skin.device._tracking import tracker
 from skin.device.base import AbstractDevice, Split
@@ -61,9 +61,9 @@ class Simulated(AbstractDevice):
         InputError: settings that cannot be used.
     """
 
-    body: Sheet
+    body: AbstractBody
     layout: AbstractLayout
-    simulator: Callable[[Sheet, Sensors], AbstractSimulator]
+    simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
     touch: Mapping[str, Any] | GestureSettings | None = None
     gestures: int = 4038
     test_gestures: int = 4000

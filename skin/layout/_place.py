@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout.base import Sensors
 
@@ -16,7 +16,7 @@ _APART = 1e-6
 
 
 def place(
-    body: Sheet, x: np.ndarray, y: np.ndarray, depth: np.ndarray | None, footprint: Sequence[float]
+    body: AbstractBody, x: np.ndarray, y: np.ndarray, depth: np.ndarray | None, footprint: Sequence[float]
 ) -> Sensors:
     """Return sensors at x, y and depth, each (S,), m; without depth they lie at ``body.sensor_depth``.
 
@@ -36,7 +36,7 @@ def place(
     return Sensors(positions, (lengths[0], lengths[1]))
 
 
-def _inside(body: Sheet, positions: np.ndarray) -> None:
+def _inside(body: AbstractBody, positions: np.ndarray) -> None:
     extent = np.array([*body.size, body.thickness])
     outside = ((positions < 0) | (positions > extent + 1e-9)).any(axis=1)
     if outside.any():

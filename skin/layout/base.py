@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 
 __all__ = ["AbstractLayout", "Sensors"]
 
@@ -31,7 +31,7 @@ class AbstractLayout(ABC):
     """Places sensors in a body."""
 
     @abstractmethod
-    def sensors(self, body: Sheet) -> Sensors:
+    def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors of this layout in ``body``.
 
         Raises:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout._place import place
 from skin.layout.base import AbstractLayout, Sensors
@@ -37,7 +37,7 @@ class File(AbstractLayout):
         self.places = _read(self.path)
         self.footprint = footprint
 
-    def sensors(self, body: Sheet) -> Sensors:
+    def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""
         return place(body, self.places["x_m"], self.places["y_m"], self.places.get("depth_m"), self.footprint)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.layout._grid import grid
 from skin.layout._place import place
 from skin.layout.base import AbstractLayout, Sensors
@@ -28,7 +28,7 @@ class Grid(AbstractLayout):
         self.centres = grid(rows, columns)
         self.footprint = footprint
 
-    def sensors(self, body: Sheet) -> Sensors:
+    def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
         x, y = (self.centres * np.array(body.size)).T
         return place(body, x, y, None, self.footprint)

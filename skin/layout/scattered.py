@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout._grid import grid
 from skin.layout._place import place
@@ -46,7 +46,7 @@ class Scattered(AbstractLayout):
         self.seed = seed
         self.footprint = footprint
 
-    def sensors(self, body: Sheet) -> Sensors:
+    def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""
         moves = np.random.default_rng(self.seed).uniform(-self.jitter, self.jitter, self.centres.shape)
         x, y = np.round((self.centres + moves * self.pitch) * body.size, 6).T

@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.recording import Touches
 from skin.representation._channels import channels
@@ -59,7 +59,7 @@ def typical_distance(positions: np.ndarray) -> float:
 
 
 def adjacency(
-    positions: np.ndarray, linked: np.ndarray, weight: Weight, body: Sheet | None = None
+    positions: np.ndarray, linked: np.ndarray, weight: Weight, body: AbstractBody | None = None
 ) -> np.ndarray:
     """Return the weights (S, S) of the edges ``linked``; 0 where there is none.
 
@@ -91,7 +91,9 @@ def adjacency(
     return linked * (np.exp(-distance / unit) if weight == "exp" else distance / unit)
 
 
-def _stiffness(positions: np.ndarray, linked: np.ndarray, unit: float, body: Sheet | None) -> np.ndarray:
+def _stiffness(
+    positions: np.ndarray, linked: np.ndarray, unit: float, body: AbstractBody | None
+) -> np.ndarray:
     if body is None:
         raise InputError(
             "representation.weight=stiffness needs to know the skin: set representation.body=${body}, "
@@ -165,7 +167,7 @@ class Graph(AbstractRepresentation):
         coordinates: bool = False,
         scale: float = 10.0,
         mask: bool = False,
-        body: Sheet | None = None,
+        body: AbstractBody | None = None,
     ) -> None:
         super().__init__()
         self.scale, self.mask, self.coordinates = scale, mask, coordinates

@@ -8,13 +8,13 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.simulator._assembly import Constraint, Structure
 
 __all__ = ["deflection", "draw_surface", "surface"]
 
 
-def deflection(body: Sheet, pressure: Tensor, constraint: Constraint = "vertical") -> np.ndarray:
+def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "vertical") -> np.ndarray:
     """Return how far every node moves into the skin, (F, layers, ny + 1, nx + 1), m, from the table up.
 
     The plates and beams of :class:`skin.simulator.fem.PlatesAndBeams`, solved for the frames themselves and

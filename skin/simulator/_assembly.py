@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy import sparse
 
-from skin.body.sheet import Sheet, overlaps
+from skin.body.base import AbstractBody, overlaps
 from skin.errors import InputError
 from skin.layout.base import Sensors
 from skin.simulator import _beam, _plate
@@ -40,7 +40,7 @@ class Structure:
         InputError: an unknown constraint.
     """
 
-    body: Sheet
+    body: AbstractBody
     constraint: Constraint = "vertical"
 
     def __post_init__(self) -> None:
@@ -170,13 +170,13 @@ class Structure:
         return (nodes[:, :, None] * each + np.arange(each)).reshape(len(nodes), -1)
 
 
-def _section_edges(body: Sheet, axis: int) -> np.ndarray:
+def _section_edges(body: AbstractBody, axis: int) -> np.ndarray:
     """Return the borders between nodes' parts of the sheet, m: halfway between them, and the edges."""
     nodes = np.linspace(0, body.size[axis], body.cells[axis] + 1)
     return np.concatenate([nodes[:1], (nodes[1:] + nodes[:-1]) / 2, nodes[-1:]])
 
 
-def _beam_moduli(body: Sheet) -> np.ndarray:
+def _beam_moduli(body: AbstractBody) -> np.ndarray:
     """Return each beam's modulus over its layer's, (layers, ny+1, nx+1): the mean of the cells it touches.
 
     A beam's section takes an equal part of each of them.

@@ -27,7 +27,7 @@ _FORMAT = 2
 _HERE = Path(__file__).parent
 # Mechanics that changed must not be answered from a file that the old mechanics wrote.
 _SOURCES = [
-    _HERE.parent / "body" / "sheet.py",
+    _HERE.parent / "body" / "base.py",
     *(_HERE / name for name in ("_assembly.py", "_beam.py", "_operator.py", "_plate.py")),
 ]
 

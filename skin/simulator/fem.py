@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout.base import Sensors
 from skin.simulator._assembly import Constraint, Structure
@@ -57,7 +57,7 @@ class PlatesAndBeams(AbstractSimulator):
 
     def __init__(
         self,
-        body: Sheet,
+        body: AbstractBody,
         sensors: Sensors,
         reading: Reading = "equation10",
         constraint: Constraint = "vertical",

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.layout.base import Sensors
 from skin.simulator._frames import flatten
 from skin.simulator.base import AbstractSimulator, Response
@@ -25,7 +25,7 @@ class Naive(AbstractSimulator):
     cell: Tensor
     area: Tensor
 
-    def __init__(self, body: Sheet, sensors: Sensors) -> None:
+    def __init__(self, body: AbstractBody, sensors: Sensors) -> None:
         super().__init__()
         # A sensor on the far edge belongs to the last cell.
         column, row = (

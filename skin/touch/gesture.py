@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.labels import Thresholds
 from skin.touch.shapes import Shapes
@@ -171,7 +171,7 @@ def _draw_bodies(
     raise _no_room(big[todo[0]], settings, shapes.body)
 
 
-def _no_room(big: bool, settings: GestureSettings, body: Sheet) -> InputError:
+def _no_room(big: bool, settings: GestureSettings, body: AbstractBody) -> InputError:
     kind = "big" if big else "small"
     area = settings.big_area if big else settings.small_area
     return InputError(

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.labels import TOUCH, measure
 from skin.simulator.base import AbstractSimulator, Response
@@ -124,7 +124,7 @@ class TouchSampler:
 
     Args:
         body: the sheet.
-        footprints: (S, H * W), area weights of each sensor that sum to 1 (``Sheet.footprints``).
+        footprints: (S, H * W), area weights of each sensor that sum to 1 (``AbstractBody.footprints``).
         settings: the difficulty, as ``conf/touch.yaml`` gives it.
         padded: gestures begin at a random frame of the window, not at its first.
 
@@ -134,7 +134,7 @@ class TouchSampler:
 
     def __init__(
         self,
-        body: Sheet,
+        body: AbstractBody,
         footprints: np.ndarray,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody
 from skin.touch.images import load, pyramid
 
 __all__ = ["Shapes"]
@@ -37,7 +37,7 @@ class Shapes:
         InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load`).
     """
 
-    def __init__(self, names: Sequence[str], body: Sheet, contact: float = 0.02) -> None:
+    def __init__(self, names: Sequence[str], body: AbstractBody, contact: float = 0.02) -> None:
         self.names = tuple(names)
         self.body = body
         self.contact = contact

@@ -1,0 +1,171 @@
+"""What a body is: layers of silicone on something hard, and a chart of their surface."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from skin.body._given import Layer, cells_of, layers_of, size_of
+from skin.body._memory import require_memory
+from skin.body._variation import along, check_variation, factors
+
+if TYPE_CHECKING:
+    from skin.layout.base import Sensors
+
+__all__ = ["AbstractBody", "Layer", "overlaps"]
+
+# What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
+_BYTES_PER_CELL = 25 * 8 + 30 * 4
+
+
+@dataclass(frozen=True)
+class AbstractBody(ABC):
+    """Layers glued to something hard, cut into equal cells, seen through a chart of their surface.
+
+    In the chart the surface is a rectangle: x runs to the right, y downwards, both along the surface from
+    the upper left corner; z is the depth below it. Positions, pressures and pictures are in the chart; only
+    three-dimensional mechanics and pictures in space ask where that is (:meth:`place`, :meth:`frame`).
+
+    Attributes:
+        size: extent (x, y) along the surface, m.
+        cells: number of cells (along x, along y); a pressure on the body is (..., H, W) with H = cells[1]
+            and W = cells[0].
+        layers: from the table up (or whatever they are glued to). A configuration gives each as
+            ``{material, thickness}``, with the material as in :meth:`skin.material.Material.of` and the
+            thickness in m.
+        variation: standard deviation of Young's modulus from cell to cell of each layer, as a share of the
+            layer's own, which stays its mean (log-normal, independent, so never below 0); 0: the same
+            everywhere. Another mesh is another draw.
+        variation_seed: what the moduli are drawn from.
+        flat: whether the chart is the body itself, so that plates lie in it.
+
+    Raises:
+        InputError: a size or thickness that is not positive, fewer than two cells along a side, no layer, an
+            unknown material, a variation below 0, or more cells than memory allows.
+    """
+
+    size: tuple[float, float]
+    cells: tuple[int, int]
+    layers: tuple[Layer, ...]
+    variation: float = 0.0
+    variation_seed: int = 0
+
+    flat: ClassVar[bool]
+
+    def __post_init__(self) -> None:
+        check_variation(self.variation, self.variation_seed)
+        object.__setattr__(self, "size", size_of(self.size))
+        object.__setattr__(self, "cells", cells_of(self.cells))
+        object.__setattr__(self, "layers", layers_of(self.layers))
+        require_memory(
+            _BYTES_PER_CELL * math.prod(self.cells),
+            f"body.cells=[{self.cells[0]},{self.cells[1]}]",
+            "give fewer cells, such as body.cells=[32,32]",
+        )
+
+    @abstractmethod
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""
+
+    @abstractmethod
+    def frame(self, points: np.ndarray) -> np.ndarray:
+        """Return the local axes at points (..., 3) of the chart, m, as (..., 3, 3).
+
+        The rows are the unit vectors, in space, along the chart's x, along its y, and into the skin.
+        """
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W): the shape of a pressure frame, rows along y."""
+        return self.cells[1], self.cells[0]
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        """Extent (x, y) of one cell, m."""
+        return self.size[0] / self.cells[0], self.size[1] / self.cells[1]
+
+    @property
+    def thickness(self) -> float:
+        """Thickness of all layers, m."""
+        return sum(layer.thickness for layer in self.layers)
+
+    @cached_property
+    def interfaces(self) -> tuple[float, ...]:
+        """Depth below the surface of each layer's upper face, m, from the table up; the last is 0.
+
+        The table itself is no interface: nothing moves there.
+        """
+        above = [layer.thickness for layer in self.layers[1:]]
+        return tuple(math.fsum(above[level:]) for level in range(len(self.layers)))
+
+    @property
+    def sensor_depth(self) -> float:
+        """Where sensors lie by default, m: under the top layer; on the surface of a single layer."""
+        return self.interfaces[-2] if len(self.layers) > 1 else 0.0
+
+    @cached_property
+    def moduli(self) -> np.ndarray:
+        """Young's modulus of each cell over that of its layer, (layers, H, W), from the table up."""
+        return factors(self.variation, self.variation_seed, (len(self.layers), *self.shape))
+
+    @property
+    def tension(self) -> float:
+        """Force along the surface per width and strain, N/m: the layers' E h together, without variation."""
+        return sum(layer.material.young * layer.thickness for layer in self.layers)
+
+    def stiffness(self, first: np.ndarray, second: np.ndarray, width: float) -> np.ndarray:
+        """Return how stiff strips of the body between places are along themselves, (n,), N/m.
+
+        That is the layers' E h, averaged along the straight line where the modulus varies, times w / d.
+
+        Args:
+            first: where the strips begin, (n, 3), m.
+            second: where they end, (n, 3), m; elsewhere than they begin.
+            width: w of every strip, m.
+        """
+        per_layer = [layer.material.young * layer.thickness for layer in self.layers]
+        per_cell = np.tensordot(per_layer, self.moduli, axes=1)
+        tension = along(per_cell, self.cell, first[:, :2], second[:, :2])
+        return tension * width / np.linalg.norm(second - first, axis=1)
+
+    def footprint_areas(self, sensors: "Sensors") -> np.ndarray:
+        """Return the area that each sensor's footprint shares with each cell, (S, H*W), m^2.
+
+        A footprint that passes the body's edge is cut there.
+        """
+        along_x, along_y = (
+            overlaps(
+                np.linspace(0, self.size[axis], self.cells[axis] + 1),
+                sensors.positions[:, axis],
+                sensors.footprint[axis],
+            )
+            for axis in (0, 1)
+        )
+        return np.einsum("sh,sw->shw", along_y, along_x).reshape(len(sensors), -1)
+
+    def footprints(self, sensors: "Sensors") -> np.ndarray:
+        """Return weights (S, H*W) that sum to 1 per sensor.
+
+        ``footprints(sensors) @ pressure.reshape(H * W)`` is the mean pressure over each sensor's footprint,
+        Pa; cells that it covers in part weigh by area.
+        """
+        areas = self.footprint_areas(sensors)
+        return areas / areas.sum(axis=1, keepdims=True)
+
+
+def overlaps(edges: np.ndarray, centres: np.ndarray, extent: float) -> np.ndarray:
+    """Return the length that intervals share with the cells between consecutive edges.
+
+    Args:
+        edges: (n + 1,), ascending, m.
+        centres: (S,), the intervals' centres, m.
+        extent: the intervals' length, m.
+
+    Returns:
+        (S, n), m.
+    """
+    low, high = (centres[:, None] + side * extent / 2 for side in (-1, 1))
+    return np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0, None)

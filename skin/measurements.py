@@ -34,34 +34,46 @@ def measurements(touches: Touches) -> dict[str, Tensor]:
 
 
 def _longest(active: Tensor) -> Tensor:
-    """Return the longest run of true values over time, (B,), of active (B, T)."""
-    run = torch.zeros(len(active), dtype=torch.int64)
-    longest = run
-    for now in active.unbind(dim=1):
-        run = (run + 1) * now
-        longest = torch.maximum(longest, run)
-    return longest.to(torch.float32)
+    """Return the longest run of true values over time, (B, K), of active (B, T, K)."""
+    passed = active.cumsum(dim=1, dtype=torch.int32)
+    before = torch.where(active, 0, passed).cummax(dim=1).values
+    return (passed - before).amax(dim=1).to(torch.float32)
 
 
 def _levels(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
     """How long and on how many sensors a touch exceeds absolute and relative levels."""
-    result: dict[str, Tensor] = {}
     highest = x.amax(dim=1)
     top = peak.amax(dim=1, keepdim=True).clamp(min=1e-6)
     at_peak = x[torch.arange(len(x)), frame.argmax(dim=1)]
-    for level in LEVELS:
-        result[f"frames above {level} N"] = (peak > level).sum(dim=1)
-        result[f"longest run above {level} N"] = _longest(peak > level)
-        result[f"sensors above {level} N"] = (highest > level).sum(dim=1)
-        result[f"most sensors above {level} N at once"] = (x > level).sum(dim=2).amax(dim=1)
-    for share in SHARES:
-        result[f"longest run above {share} of the peak"] = _longest(peak > share * top)
-        result[f"longest run of the sum above {share} of its peak"] = _longest(
-            frame > share * frame.amax(dim=1, keepdim=True)
-        )
-        result[f"sensors above {share} of the peak"] = (highest > share * top).sum(dim=1)
-        result[f"sensors above {share} of the peak at once"] = (at_peak > share * top).sum(dim=1)
-    return result
+    # All levels at once, for a window alone costs what the calls cost.
+    levels, shares = (torch.tensor(values, dtype=x.dtype, device=x.device) for values in (LEVELS, SHARES))
+    above = peak[..., None] > levels
+    strong = peak[..., None] > (shares * top)[:, None]
+    much = frame[..., None] > (shares * frame.amax(dim=1, keepdim=True))[:, None]
+    runs = _longest(torch.cat([above, strong, much], dim=2)).split([len(LEVELS), len(SHARES), len(SHARES)], 1)
+
+    def most(level: float) -> Tensor:
+        return (x > level).sum(dim=2).amax(dim=1)
+
+    absolute = {
+        "frames above {} N": above.sum(dim=1),
+        "longest run above {} N": runs[0],
+        "sensors above {} N": (highest[..., None] > levels).sum(dim=1),
+        "most sensors above {} N at once": torch.stack([most(level) for level in LEVELS], dim=1),
+    }
+    relative = {
+        "longest run above {} of the peak": runs[1],
+        "longest run of the sum above {} of its peak": runs[2],
+        "sensors above {} of the peak": (highest[..., None] > (shares * top)[:, None]).sum(dim=1),
+        "sensors above {} of the peak at once": (at_peak[..., None] > (shares * top)[:, None]).sum(dim=1),
+    }
+    return _named(absolute, LEVELS) | _named(relative, SHARES)
+
+
+def _named(columns: dict[str, Tensor], levels: tuple[float, ...]) -> dict[str, Tensor]:
+    """Return the columns (B, K) level by level, each under its name with the level in it."""
+    each = {name: column.unbind(dim=1) for name, column in columns.items()}
+    return {name.format(level): each[name][k] for k, level in enumerate(levels) for name in each}
 
 
 def _sorted(raw: Tensor, x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:

@@ -1,5 +1,7 @@
 """Measurements of touches made by hand."""
 
+from itertools import groupby
+
 import pytest
 import torch
 
@@ -87,3 +89,38 @@ def test_an_idle_window_or_a_dead_sensor_gives_numbers():
     for touches in (idle, broken):
         for name, column in measurements(touches).items():
             assert torch.isfinite(column.float()).all(), name
+
+
+def random_touches(count, seed=3):
+    generator = torch.Generator().manual_seed(seed)
+    readings = 3 * torch.rand(count, 30, 4, generator=generator)
+    readings *= torch.rand(count, 30, 4, generator=generator) > 0.5
+    valid = torch.rand(count, 30, 4, generator=generator) > 0.1
+    return Touches(readings, valid, PLACES, None, 10.0)
+
+
+def test_a_window_alone_gives_what_it_gives_in_a_batch():
+    touches = random_touches(20)
+    together = measurements(touches)
+    for place in range(len(touches)):
+        for name, alone in measurements(touches[place : place + 1]).items():
+            torch.testing.assert_close(alone[0], together[name][place], rtol=1e-6, atol=1e-6, msg=name)
+
+
+def test_runs_and_counts_are_those_that_plain_python_finds():
+    touches = random_touches(50)
+    found = measurements(touches)
+    raw = touches.readings.where(touches.valid, 0)
+    x = (raw - raw.quantile(0.2, dim=1, keepdim=True)) * touches.valid
+    for place, rows in enumerate(x):
+        peak, total = rows.amax(dim=1), rows.sum(dim=1)
+        for series, level, name in (
+            (peak, 1.0, "longest run above 1.0 N"),
+            (peak, 0.3 * peak.max(), "longest run above 0.3 of the peak"),
+            (total, 0.7 * total.max(), "longest run of the sum above 0.7 of its peak"),
+        ):
+            runs = [len(list(run)) for on, run in groupby((series > level).tolist()) if on]
+            assert found[name][place] == max(runs, default=0), name
+        at_once = max(sum(force > 2.0 for force in row) for row in rows.tolist())
+        assert found["most sensors above 2.0 N at once"][place] == at_once
+        assert found["frames above 0.6 N"][place] == sum(force > 0.6 for force in peak.tolist())

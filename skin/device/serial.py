@@ -21,6 +21,7 @@ from skin.port.errors import SkinDisconnected, SkinTimeout
 from skin.port.frame import Frame
 from skin.port.live import Skin
 from skin.port.opening import open_skin
+from skin.port.text import Header
 from skin.port.wire import open_wire
 from skin.recording import Recording, Touches
 from skin.session.newtons import Newtons, newtons
@@ -44,7 +45,7 @@ class Serial(AbstractDevice):
     Args:
         body: the sheet of the model.
         layout: where its sensors are; the device must send as many values.
-        port, baudrate, format, limits, timeout: as in :func:`skin.port.opening.open_skin`.
+        port, baudrate, format, limits, timeout, backoff: as in :func:`skin.port.opening.open_skin`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: how many.
         seed: of the order of prompts.
@@ -77,6 +78,7 @@ class Serial(AbstractDevice):
     calibration: str | None = None
     limits: Sequence[float | None] | None = None
     timeout: float = 10.0
+    backoff: Sequence[float] = (1.0, 10.0)
     window: int = 30
     rate: float | None = None
     stream: bool = False
@@ -88,6 +90,8 @@ class Serial(AbstractDevice):
             raise InputError(
                 f"device.gestures={self.gestures} must be 1 or more, tare={self.tare} not negative"
             )
+        if self.scale is not None and not self.scale > 0:
+            raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
         if self.labels == "none" and self.stream:
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
         self.rate = 10.0 if self.rate is None else float(self.rate)
@@ -126,8 +130,9 @@ class Serial(AbstractDevice):
                 "device=serial needs a port: add device.port=/dev/ttyACM0; experiments/emulate.py makes one"
             )
         tap = Tap(partial(open_wire, self.port, self.baudrate))
-        limits = None if self.limits is None else (self.limits[0], self.limits[1])
+        limits = None if self.limits is None else tuple(self.limits)
         settings: dict[str, Any] = {"format": self.format, "limits": limits, "timeout": self.timeout}
+        settings |= {"backoff": self.backoff}
         return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **settings), tap
 
     def settle(self, skin: Skin) -> tuple[list[Frame], np.ndarray | None, Newtons]:
@@ -138,7 +143,15 @@ class Serial(AbstractDevice):
         """
         assert self.rate is not None
         frames, baseline = settle(skin, self.rate, self.tare, _say)
-        return frames, baseline, newtons(len(self.sensors), baseline, self.scale, self._known, skin.header)
+        return frames, baseline, self.meaning(baseline, skin.header)
+
+    def meaning(self, baseline: np.ndarray | None, header: Header | None) -> Newtons:
+        """Return what values mean, given a baseline (S,) and what the device tells of itself.
+
+        Raises:
+            InputError: nobody knows what a count is worth.
+        """
+        return newtons(len(self.sensors), baseline, self.scale, self._known, header)
 
     def director(self, tap: Tap, meaning: Newtons, done: Collection[int] = ()) -> AbstractDirector:
         """Return who says what a gesture is; those with a number in ``done`` are there already."""

@@ -1,45 +1,25 @@
-"""What a device's numbers mean: force above what the untouched skin reads."""
+"""What a device's numbers mean while it is watched: force above what the untouched skin reads."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from skin.errors import InputError
 from skin.port.baseline import rest
+from skin.port.errors import SkinTouched
 from skin.port.frame import Frame
 from skin.port.text import Header
+from skin.session import newtons as meanings
+from skin.session.reduction import reduced
 
-if TYPE_CHECKING:
-    from skin.calibration.values import Calibration
+__all__ = ["Meaning", "Newtons"]
 
-__all__ = ["Newtons", "Unit"]
+Meaning = Callable[[np.ndarray | None, Header | None], meanings.Newtons]
+"""From a baseline (S,), or None, and what a device tells of itself to what its values mean; InputError where
+nobody knows."""
 
 _HEADER = 3.0  # s in which a device must tell its unit
 _OFTEN = 0.2  # s between two attempts at a baseline
-
-
-@dataclass(frozen=True)
-class Unit:
-    """How numbers become newtons.
-
-    Attributes:
-        scale: N per number that the device sends; None: as its header tells.
-        tare: s without touch that give the baseline; 0: there is none.
-
-    Raises:
-        InputError: a scale that is not above 0, or a negative time.
-    """
-
-    scale: float | None = None
-    tare: float = 1.0
-
-    def __post_init__(self) -> None:
-        if (self.scale is not None and not self.scale > 0) or self.tare < 0:
-            raise InputError(
-                f"live.scale must be above 0 and live.tare at least 0, got {self.scale} and {self.tare}"
-            )
 
 
 class Newtons:
@@ -49,10 +29,10 @@ class Newtons:
     It is kept over restarts of the device: nobody knows whether that happened under a touch.
 
     Args:
-        unit: how numbers become newtons.
+        meaning: what values mean.
+        tare: s without touch that give the baseline, of values reduced as the model's are; 0: there is none.
+        rate: of the model, Hz.
         header: what the device tells of itself, once it does.
-        calibration: of this device; takes the place of the scale, and its broken sensors are masked.
-        plain: numbers are N, as those of a recording or of the simulator.
 
     Attributes:
         waiting: why there are no frames; empty if there are.
@@ -60,82 +40,70 @@ class Newtons:
 
     def __init__(
         self,
-        unit: Unit,
-        header: Callable[[], Header | None],
-        calibration: "Calibration | None" = None,
-        plain: bool = False,
+        meaning: Meaning,
+        tare: float,
+        rate: float,
+        header: Callable[[], Header | None] = lambda: None,
     ) -> None:
-        self._unit, self._header, self._calibration = unit, header, calibration
+        self._meaning, self._header = meaning, header
+        self._tare, self._rate = tare, rate
         self.waiting = "waiting for the first frame"
-        self._scale = unit.scale or (1.0 if plain else None)
-        self._baseline: np.ndarray | None = None
-        self._gain: np.ndarray | float = 1.0
-        self._usable: np.ndarray | bool = True
+        self._known: meanings.Newtons | None = None
         self._quiet: list[Frame] = []
         self._first: float | None = None
         self._tried = -np.inf
-        if calibration is not None:
-            values = calibration.values()
-            self._scale, self._gain, self._usable = calibration.scale, values["gain"], ~values["dead"]
 
     def __call__(self, frame: Frame) -> Frame | None:
         """Return a frame in N; None while unit or baseline are not known.
 
         Raises:
-            InputError: the device does not tell what its numbers mean, and nobody else does.
+            InputError: the device does not tell what its numbers mean and nobody else does, or too short a
+                tare.
         """
-        scale = self._known(frame.t_host)
-        if scale is None or (self._baseline is None and not self._tare(frame)):
+        if self._known is None and self._told(frame.t_host):
+            self._known = self._settled(frame)
+        if self._known is None:
             return None
         self.waiting = ""
-        values = (frame.values - self._baseline) * scale / self._gain
-        return frame._replace(values=values, valid=frame.valid & self._usable)
+        values = (frame.values - self._known.zero) * self._known.scale
+        return frame._replace(values=values, valid=frame.valid & ~self._known.broken)
 
-    def _known(self, now: float) -> float | None:
-        """Return N per number as the header tells, if nothing else did."""
-        if self._scale is not None:
-            return self._scale
-        header = self._header()
+    def _told(self, now: float) -> bool:
+        """Return whether it is known what numbers mean; a device may tell a little late."""
         self._first = now if self._first is None else self._first
-        if header is not None and header.unit == "N":
-            self._scale = 1.0
-        elif header is not None and header.unit:
-            raise InputError(
-                f"the device sends {header.unit}, not N: give live.scale=N_PER_COUNT (experiments/emulate.py "
-                "prints its own) or live.calibration=FILE.yaml"
-            )
-        elif now - self._first > _HEADER:
-            raise InputError(
-                "the device does not tell what its numbers mean: give live.scale=N_PER_COUNT (1 if it sends "
-                "N) or live.calibration=FILE.yaml"
-            )
-        self.waiting = "waiting for the device to tell its unit"
-        return self._scale
+        header = self._header()
+        try:
+            self._meaning(None, header)
+        except InputError:
+            if header is not None or now - self._first > _HEADER:
+                raise
+            self.waiting = "waiting for the device to tell its unit"
+            return False
+        return True
 
-    def _tare(self, frame: Frame) -> bool:
+    def _settled(self, frame: Frame) -> meanings.Newtons | None:
         """Take the baseline from the last quiet frames, if they are long enough and quiet."""
-        if not self._unit.tare:
-            zero = 0.0 if self._calibration is None else self._calibration.zero
-            offset = 0.0 if self._calibration is None else self._calibration.values()["offset"]
-            self._baseline = zero + offset / (self._scale or 1.0) + np.zeros(len(frame.values))
-            return True
+        if not self._tare:
+            return self._meaning(None, self._header())
         if self._quiet and self._quiet[-1].segment != frame.segment:
             self._quiet.clear()
         self._quiet.append(frame)
-        while frame.t - self._quiet[0].t > 1.5 * self._unit.tare:
+        while frame.t - self._quiet[0].t > 1.5 * self._tare:
             self._quiet.pop(0)
-        if frame.t - self._quiet[0].t < self._unit.tare:
+        if frame.t - self._quiet[0].t < self._tare:
             self.waiting = "taking the baseline: do not touch the skin"
         elif frame.t_host - self._tried >= _OFTEN:
             self._tried = frame.t_host
-            self._try()
-        return self._baseline is not None
+            return self._rested()
+        return None
 
-    def _try(self) -> None:
-        values, valid = (
-            np.stack([getattr(one, name) for one in self._quiet]) for name in ("values", "valid")
-        )
+    def _rested(self) -> meanings.Newtons | None:
+        intervals = int(self._tare * self._rate + 1e-6)
+        begin = self._quiet[-1].t - intervals / self._rate
+        newest = [frame for frame in self._quiet if frame.t >= begin]
         try:
-            self._baseline = rest(values, valid)
-        except InputError as touched:
+            baseline = rest(*reduced(newest, begin, self._rate, intervals))
+        except SkinTouched as touched:
             self.waiting = f"no baseline yet: {str(touched).split(';')[0]}"
+            return None
+        return self._meaning(baseline, self._header())

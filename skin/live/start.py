@@ -8,16 +8,22 @@ from omegaconf import DictConfig, OmegaConf
 
 from skin.build import build_data, build_device, build_learner
 from skin.device.base import AbstractDevice
+from skin.device.recording import Recorded
+from skin.device.serial import Serial
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation import Answers
 from skin.gate import Threshold, gates, rise
 from skin.live.engine import Engine
+from skin.live.newtons import Newtons
 from skin.live.verdict import Patience
+from skin.port.live import Skin
+from skin.port.opening import open_skin
 from skin.reload import restore
+from skin.session.newtons import newtons
 from skin.tracking import Store
 
-__all__ = ["Trained", "engine", "trained"]
+__all__ = ["Source", "Trained", "engine", "source", "trained"]
 
 _FEW = 10  # gestures, where only their shape matters
 _MANY = 4000  # windows of streams, a tenth of which tunes what touch is
@@ -40,6 +46,48 @@ class Trained:
     window: int
     positions: torch.Tensor
     rate: float
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where frames come from.
+
+    Attributes:
+        name: of it, for a person.
+        skin: open.
+        newtons: what its numbers mean.
+    """
+
+    name: str
+    skin: Skin
+    newtons: Newtons
+
+
+def source(device: AbstractDevice) -> Source:
+    """Open a skin at a port, a recording, or the simulator, as the configuration names the device.
+
+    Raises:
+        InputError: it cannot be opened, or is a device that has no stream.
+    """
+    if isinstance(device, Serial):
+        skin, _ = device.open(reconnect=True)
+        assert device.rate is not None
+        return Source(
+            str(device.port), skin, Newtons(device.meaning, device.tare, device.rate, lambda: skin.header)
+        )
+    # Its readings are N, and what a run has learnt from such is without a baseline too.
+    if isinstance(device, Recorded):
+        return Source(device.path, open_skin(device.path, device.sensors), _plain(len(device.sensors)))
+    if isinstance(device, Simulated):
+        return Source("simulator", open_skin("simulated", device=device), _plain(len(device.sensors)))
+    raise InputError(
+        "only a skin at a port, a recording or the simulator can be watched: give device=serial "
+        "device.port=/dev/ttyACM0, device=recording device.path=FILE.parquet, or leave out device="
+    )
+
+
+def _plain(sensors: int) -> Newtons:
+    return Newtons(lambda baseline, header: newtons(sensors, None, 1.0, None, None), 0.0, 1.0)
 
 
 def trained(store: Store, run: Run, config: DictConfig) -> Trained:
@@ -89,6 +137,6 @@ def _tuned(device: AbstractDevice) -> float:
         raise InputError(
             "this run does not know what no touch is: give live.touch=0.3 (N), or train on streams"
         )
-    known = device.replace(stream=True, gestures=_MANY).touches("validation")
+    known = device.replace(stream=True, direction=False, gestures=_MANY).touches("validation")
     assert known.labels is not None
     return Threshold.tuned(rise(known), known.labels[:, -1] > 0.5).least

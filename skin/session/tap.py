@@ -9,6 +9,7 @@ from skin.port.wire import ByteStream
 __all__ = ["Tap"]
 
 _LONGEST = 4096  # bytes
+_KEPT = 64  # announcements, where nobody takes them
 
 
 class Tap:
@@ -23,7 +24,7 @@ class Tap:
 
     def __init__(self, opener: Callable[[], ByteStream]) -> None:
         self._opener = opener
-        self.heard: deque[Announcement] = deque()
+        self.heard: deque[Announcement] = deque(maxlen=_KEPT)
 
     def __call__(self) -> ByteStream:
         """Open the stream, once more after each unplugging."""

@@ -69,8 +69,8 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(stor
     try:
         until(link.exists, emulator, "the port")
         scale = re.search(r"device\.scale=(\S+)", (tmp_path / "emulate.py.out").read_text())[1]
-        reader = ["live.reader.backoff=[0.2,0.5]", f"live.scale={scale}", "web=true", "live.web_port=0"]
-        live = started(tmp_path, "live.py", f"port={link}", *reader, *store)
+        reader = ["device=serial", f"device.port={link}", f"device.scale={scale}", "device.backoff=[0.2,0.5]"]
+        live = started(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store)
         said = tmp_path / "live.py.err"
         page = until(lambda: re.search(r"page: (http\S+)", said.read_text()), live, "the page")[1]
         browser.open(page)
@@ -104,7 +104,7 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(stor
 
 @pytest.mark.slow
 def test_the_simulator_is_watched_without_hardware(store, tmp_path):
-    live = started(tmp_path, "live.py", "port=simulated", "seconds=8", *store)
+    live = started(tmp_path, "live.py", "seconds=8", *store)
     assert live.wait(PATIENCE) == 0
     assert re.search(r"\d+ verdicts, 10\.0 Hz, frame to verdict", (tmp_path / "live.py.err").read_text())
     assert "filling the window" in (tmp_path / "live.py.out").read_text()
@@ -113,13 +113,13 @@ def test_the_simulator_is_watched_without_hardware(store, tmp_path):
 @pytest.mark.parametrize(
     ("override", "needed"),
     [
-        ("seed=0", "give port=/dev/ttyACM0"),
         ("live.patience.alarm=0.2", "give 0.03 s at most"),
-        ("live.scale=-1", "live.scale must be above 0"),
+        ("run=none", "no finished training run none"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, override, needed):
-    live = started(tmp_path, "live.py", override)
+    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
+    live = started(tmp_path, "live.py", override, *own)
     assert live.wait(PATIENCE) == 2
     said = (tmp_path / "live.py.err").read_text()
     assert needed in said

@@ -1,22 +1,40 @@
 """Shapes pressed on a sheet: their outline, their contact area, and their frames on the sheet's cells."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import avg_pool2d, grid_sample
 
 from skin.body.base import AbstractBody
 from skin.touch.images import load, pyramid
 
-__all__ = ["Shapes"]
+__all__ = ["Shapes", "Solids"]
 
 # Frames rendered at once: their sampling grid (32 KiB a frame on 32 x 32 cells) then stays in the cache.
 _CELLS_AT_ONCE = 128 * 1024
+_POINTS = 4
 _CALIBRATION_SIZES, _CALIBRATION_POSES = 24, 6
+
+
+class Solids(NamedTuple):
+    """What cells see of shapes that are taken for objects with an outline.
+
+    Attributes:
+        inside: (F, H, W), bool, the cells that the object covers by at least half; if there is none, those
+            that it covers most.
+        grey: (F, H, W), mean grey of the covered part, 1 = white; 0 outside.
+        rim: (F, H, W), its mean distance from the outline, m; 0 outside.
+    """
+
+    inside: Tensor
+    grey: Tensor
+    rim: Tensor
 
 
 class Shapes:
@@ -41,7 +59,7 @@ class Shapes:
         self.names = tuple(names)
         self.body = body
         self.contact = contact
-        # Cells are sampled at 2 x 2 points, a spacing apart.
+        # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
         finest = max(64, max(body.size) / self.spacing)
         self.levels = pyramid([load(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
@@ -101,21 +119,63 @@ class Shapes:
             scale: (F,), m.
             place: (F, 2), m.
         """
-        # A shape smaller than the samples' spacing would fall between them.
-        scale = np.maximum(scale, max(self.body.cell) / 4)
-        texel = 2 * scale / self.levels[0].shape[-1]
-        level = np.clip(np.floor(np.log2(self.spacing / texel)), 0, len(self.levels) - 1).astype(int)
+        frames = torch.empty(len(shape), *self.body.shape)
+        for part, cells in self._rendered(self.levels, shape, angle, scale, place):
+            frames[part] = cells[:, 0].div_(cells.sum((2, 3)).unsqueeze(2))
+        return frames
+
+    def solids(self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, place: np.ndarray) -> Solids:
+        """Return what cells see of shapes as objects: poses as :meth:`render` takes them.
+
+        The object is where the picture is brighter than ``contact``.
+        """
+        cells = torch.empty(len(shape), 3, *self.body.shape)
+        for part, values in self._rendered(self._objects, shape, angle, scale, place):
+            cells[part] = values
+        cover, grey, rim = cells.unbind(1)
+        most = cover.amax((1, 2), keepdim=True)
+        inside = cover >= torch.minimum(most, torch.tensor(_POINTS / 2))
+        size = torch.from_numpy(self._visible(scale)).float()[:, None, None]
+        return Solids(inside, *((value / cover).where(inside, 0) for value in (grey, rim * size)))
+
+    @cached_property
+    def _objects(self) -> list[Tensor]:
+        """Levels (N, 3, p, p): is it inside, and there, its grey and its distance from the rim in scales."""
+        finest = self.levels[0][:, 0]
+        inside = finest > self.contact
+        # To the outline, which runs between pixels, and not to the middle of the next pixel outside.
+        rim = np.stack([distance_transform_edt(mask) for mask in inside.numpy()]) - 0.5
+        scales = torch.from_numpy(rim).float() * (2 / finest.shape[-1])
+        levels = [torch.stack([inside.float(), finest * inside, scales * inside], dim=1)]
+        while levels[-1].shape[-1] > 1:
+            levels.append(avg_pool2d(levels[-1], 2))
+        return levels
+
+    def _visible(self, scale: np.ndarray) -> np.ndarray:
+        """Return scales (F,), m, at which shapes do not fall between the samples."""
+        return np.maximum(scale, max(self.body.cell) / 4)
+
+    def _rendered(
+        self,
+        levels: list[Tensor],
+        shape: np.ndarray,
+        angle: np.ndarray,
+        scale: np.ndarray,
+        place: np.ndarray,
+    ) -> Iterator[tuple[slice, Tensor]]:
+        """Yield parts of the frames and sums (f, C, H, W) of their cells' samples of levels (N, C, p, p)."""
+        scale = self._visible(scale)
+        texel = 2 * scale / levels[0].shape[-1]
+        level = np.clip(np.floor(np.log2(self.spacing / texel)), 0, len(levels) - 1).astype(int)
         turn = np.exp(-1j * angle) / scale
         shift = turn * (place[:, 0] + 1j * place[:, 1])
-        frames = torch.empty(len(shape), *self.body.shape)
         step = max(1, _CELLS_AT_ONCE // int(np.prod(self.body.shape)))
         runs = np.split(np.arange(len(level)), np.flatnonzero(np.diff(level)) + 1)
         for run in runs:
             for start in range(0, len(run), step):
                 part = slice(run[start], run[min(start + step, len(run)) - 1] + 1)
-                texture = self.levels[level[run[0]]][torch.from_numpy(shape[part])]
-                frames[part] = self._sample(texture, turn[part], shift[part])
-        return frames
+                texture = levels[level[run[0]]][torch.from_numpy(shape[part])]
+                yield part, self._sample(texture, turn[part], shift[part])
 
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
@@ -130,17 +190,16 @@ class Shapes:
         return x, 1j * y[:, None]
 
     def _sample(self, texture: Tensor, turn: np.ndarray, shift: np.ndarray) -> Tensor:
-        """Return frames (f, H, W) of textures (f, 1, p, p) seen at ``turn * point - shift``, in scales."""
+        """Return sums (f, C, H, W) of textures (f, C, p, p) seen at ``turn * point - shift``, in scales."""
         x, y = self._points
         turns, shifts = (torch.from_numpy(values)[:, None, None] for values in (turn, shift))
         # A turn of the plane is a product of complex numbers; its two real halves are what grid_sample takes.
         across, down = (turns * x - shifts).to(torch.complex64), (turns * y).to(torch.complex64)
         grid = torch.view_as_real(across + down)
         samples = grid_sample(texture, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-        upper, lower = samples[:, 0].chunk(2, dim=1)
-        left, right = (upper + lower).chunk(2, dim=2)
-        cells = left + right
-        return cells.div_(cells.sum((1, 2), keepdim=True))
+        upper, lower = samples.chunk(2, dim=2)
+        left, right = (upper + lower).chunk(2, dim=3)
+        return left + right
 
 
 def _hulls(images: np.ndarray, contact: float) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""What pressure an object makes where it touches the skin."""

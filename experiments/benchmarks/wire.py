@@ -53,8 +53,8 @@ def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[st
     Returns:
         frames ``sent`` and ``intact``, those ``delivered`` with the right values, ``wrong`` ones taken for
         right, ``missed`` ones (intact, but not delivered); the resident memory after a minute, or a tenth
-        of a short soak, and at the end, bytes; the rate reached, Hz, and how many lines were sent more than 50 ms
-        late; the shares of a core that the reader's process took, with this comparison, and the sender's.
+        of a short soak, and at the end, bytes; the rate reached, Hz, and how many lines were sent more than
+        50 ms late; the shares of a core that reader, with this comparison, and sender took.
     """
     master, slave = os.openpty()
     tty.setraw(slave)
@@ -123,7 +123,7 @@ class _Tally:
     def figures(self, stats: Stats, check: Check) -> dict[str, float]:
         """Return what became of the frames."""
         spoilt = _spoilt(self.count)
-        glued = np.array([_glued(number) for number in np.flatnonzero(spoilt)], dtype=bool)
+        glued = np.array([_glued(number) for number in np.flatnonzero(spoilt).tolist()], dtype=bool)
         intact = ~spoilt
         # The line that another glues itself to is lost with it.
         intact[np.minimum(np.flatnonzero(spoilt)[glued] + 1, self.count - 1)] = False

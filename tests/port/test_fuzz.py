@@ -1,5 +1,9 @@
 """Whatever the wire says: no exception, and every good frame after the next delimiter is recovered."""
 
+import json
+import subprocess
+import sys
+from importlib import import_module
 from itertools import pairwise
 
 import numpy as np
@@ -7,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from skin.config import ROOT
 from skin.port.binary import encode_frame
 from skin.port.decoder import Decoder
 from skin.port.text import encode_line, parse_line
@@ -89,3 +94,74 @@ def test_how_many_wrong_values_pass_each_checksum(check, most):
             wrong += frame.values.tolist() != values
     assert wrong / count <= most
     assert wrong > 0 or check == "crc16"  # the test can see them
+
+
+@pytest.fixture(scope="module")
+def benchmarks():
+    """Return the benchmark and the frames that it writes, which are no part of the package."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "experiments")
+        return import_module("benchmarks.fuzz"), import_module("benchmarks.pieces")
+
+
+def test_another_hand_writes_the_same_frames(benchmarks):
+    _, pieces = benchmarks
+    values = [0.0, 512.0, 1023.0, 7.0]
+    for check in ("crc16", "xor", "none"):
+        fields = [b"12", b"34000", *(b"%d" % value for value in values)]
+        written = pieces.line(fields, b",", check) + b"\n"
+        assert written == encode_line([int(value) for value in values], 12, 34000, check)
+    for kind, name in ((1, "u16"), (2, "i16"), (3, "f32")):
+        assert pieces.binary(12, 34000, values * 40, kind) == encode_frame(values * 40, 12, 34000, name)
+
+
+@pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
+def test_every_good_frame_of_a_long_bad_stream_is_recovered(benchmarks, spoken):
+    found = benchmarks[0].fuzz(5000, spoken, 25, 7)
+    assert found["missed"] == 0
+    assert found["good"] == found["recovered"] > 3000
+    assert found["pieces"] > 1.5 * found["good"]
+    if spoken in ("crc16", "binary"):
+        assert found["wrong"] == 0
+
+
+@pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
+@given(seed=st.integers(0, 2**32), sensors=st.integers(1, 70))
+@settings(quickly, max_examples=15)
+def test_every_good_frame_of_any_bad_stream_is_recovered(benchmarks, spoken, seed, sensors):
+    assert benchmarks[0].fuzz(60, spoken, sensors, seed)["missed"] == 0
+
+
+@pytest.mark.parametrize("fault", ["drops", "alters"])
+def test_the_oracle_sees_a_decoder_that_fails(benchmarks, fault, monkeypatch):
+    class Failing:
+        def __init__(self, *given):
+            self._decoder, self._count = Decoder(*given), 0
+
+        def feed(self, data, now):
+            for frame in self._decoder.feed(data, now):
+                self._count += 1
+                if self._count % 50:
+                    yield frame
+                elif fault == "alters":
+                    yield frame._replace(values=frame.values + 1)
+
+    monkeypatch.setattr(benchmarks[0], "Decoder", Failing)
+    found = benchmarks[0].fuzz(1000, "crc16", 5, 0)
+    assert found["missed"] > 20
+    assert (found["wrong"] > 20) == (fault == "alters")
+
+
+def test_the_command_prints_what_it_found():
+    command = [
+        sys.executable,
+        str(ROOT / "experiments" / "benchmarks" / "fuzz.py"),
+        "300",
+        "binary",
+        "3",
+        "1",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    found = json.loads(done.stdout)
+    assert found["format"] == "binary"
+    assert found["good"] == found["recovered"] > 100

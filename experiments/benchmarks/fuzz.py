@@ -159,7 +159,8 @@ class _Stream:
         if self._spoken == "binary":
             self._put(senseless(number, clock, values, number % 3 + 1, rng))
             return
-        fields, trouble, check = _fields(number, clock, values), rng.randrange(5), self._spoken
+        fields, trouble = _fields(number, clock, values), rng.randrange(5)
+        check: Spoken = self._spoken
         others: list[Spoken] = [other for other in FORMATS if other not in (check, "binary")]
         if trouble == 0:
             fields[rng.randrange(len(fields) - 1)] = rng.choice(_NO_NUMBERS)

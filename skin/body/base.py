@@ -66,6 +66,10 @@ class AbstractBody(ABC):
             "give fewer cells, such as body.cells=[32,32]",
         )
 
+    def resized(self, size: tuple[float, float]) -> str:
+        """Return the overrides that give the body an extent (x, y), m, for a person to type."""
+        return f"body.size=[{size[0]:g},{size[1]:g}]"
+
     @abstractmethod
     def place(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""

@@ -68,8 +68,8 @@ class Recorded(AbstractDevice):
         stored, size = self._recording.touches.positions, self._recording.size
         if not np.allclose(size, body.size):
             raise InputError(
-                f"{self.path} was recorded on a sheet of {size[0]:g} x {size[1]:g} m, the body is "
-                f"{body.size[0]:g} x {body.size[1]:g} m: add body.size=[{size[0]:g},{size[1]:g}]"
+                f"{self.path} was recorded on a skin of {size[0]:g} x {size[1]:g} m, the body is "
+                f"{body.size[0]:g} x {body.size[1]:g} m: add {body.resized(size)}"
             )
         if len(stored) != len(self.sensors):
             raise InputError(

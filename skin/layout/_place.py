@@ -16,12 +16,19 @@ _APART = 1e-6
 
 
 def place(
-    body: AbstractBody, x: np.ndarray, y: np.ndarray, depth: np.ndarray | None, footprint: Sequence[float]
+    body: AbstractBody,
+    x: np.ndarray,
+    y: np.ndarray,
+    depth: np.ndarray | None,
+    footprint: Sequence[float],
+    normals: np.ndarray | None = None,
 ) -> Sensors:
     """Return sensors at x, y and depth, each (S,), m; without depth they lie at ``body.sensor_depth``.
 
+    Their normals (S, 3), unit vectors, are those of the surface if none are given.
+
     Raises:
-        InputError: a footprint that is not two positive lengths, a sensor outside the sheet or deeper than
+        InputError: a footprint that is not two positive lengths, a sensor outside the body or deeper than
             it, or two sensors at one place in the plane, whatever their depths: images and graphs are flat.
     """
     lengths = [float(extent) for extent in footprint]
@@ -33,7 +40,8 @@ def place(
     positions = np.column_stack([x, y, np.full_like(x, body.sensor_depth) if depth is None else depth])
     _inside(body, positions)
     _apart(positions)
-    return Sensors(positions, (lengths[0], lengths[1]))
+    extent = lengths[0], lengths[1]
+    return Sensors(positions, extent) if normals is None else Sensors(positions, extent, normals)
 
 
 def _inside(body: AbstractBody, positions: np.ndarray) -> None:
@@ -43,10 +51,10 @@ def _inside(body: AbstractBody, positions: np.ndarray) -> None:
         number = int(outside.argmax())
         x, y, depth = positions[number]
         raise InputError(
-            f"{outside.sum()} of {len(positions)} sensors lie outside the sheet; the first is "
-            f"sensor {number + 1} at x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a sheet of "
+            f"{outside.sum()} of {len(positions)} sensors lie outside the body; the first is "
+            f"sensor {number + 1} at x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a surface of "
             f"{extent[0]:g} x {extent[1]:g} m, {extent[2]:g} m thick: positions are in metres from the "
-            "upper left corner; mend the layout, give body.size=[x,y] or take layout=grid"
+            "upper left corner; mend the layout, give a larger body or take layout=grid"
         )
 
 

@@ -15,21 +15,29 @@ from skin.layout.base import AbstractLayout, Sensors
 __all__ = ["File"]
 
 _ROOT = Path(__file__).parents[2]
-_NEED = "a layout has the columns x_m, y_m and optionally depth_m, in metres from the upper left corner"
+_NEED = (
+    "a layout has the columns x_m, y_m and optionally depth_m, in metres from the upper left corner, and "
+    "normal_x, normal_y, normal_z, which way a sensor faces"
+)
+_FACING = ("normal_x", "normal_y", "normal_z")
+_PLACE = ("x_m", "y_m", "depth_m")
 
 
 class File(AbstractLayout):
     """Sensors of a CSV file with the columns ``x_m``, ``y_m`` and optionally ``depth_m``, all m.
 
-    The order of the rows is the order of the readings: that of the hardware's channels. Other columns are
-    ignored.
+    The order of the rows is the order of the readings: that of the hardware's channels. ``normal_x``,
+    ``normal_y`` and ``normal_z``, of any length, say which way a sensor faces, in the local frame (x, y,
+    into the skin); without them it faces the surface. Only ``simulator=solid`` feels tilted sensors. Other
+    columns are ignored.
 
     Args:
         path: the file; a relative path is looked for in the working directory, then in the repository.
         footprint: extent (x, y) over which a sensor feels, m.
 
     Raises:
-        InputError: no such file, nothing in it, a column missing, or a cell that is no number, with its line.
+        InputError: no such file, nothing in it, a column missing, a cell that is no number or a normal
+            without a length, with its line.
     """
 
     def __init__(self, path: str, footprint: Sequence[float] = (0.01, 0.01)) -> None:
@@ -39,7 +47,15 @@ class File(AbstractLayout):
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""
-        return place(body, self.places["x_m"], self.places["y_m"], self.places.get("depth_m"), self.footprint)
+        x, y, depth = self.places["x_m"], self.places["y_m"], self.places.get("depth_m")
+        return place(body, x, y, depth, self.footprint, self._normals())
+
+    def _normals(self) -> np.ndarray | None:
+        """Return the unit vectors of the file, (S, 3), if it has any."""
+        if _FACING[0] not in self.places:
+            return None
+        vectors = np.column_stack([self.places[name] for name in _FACING])
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def _find(given: str) -> Path:
@@ -60,10 +76,11 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             reader = csv.DictReader(lines, skipinitialspace=True)
             names = [name.strip() for name in reader.fieldnames or []]
             reader.fieldnames = names
-            if missing := {"x_m", "y_m"} - set(names):
+            needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
+            if missing := needed - set(names):
                 found = ", ".join(names) or "nothing"
                 raise InputError(f"{path}: no column {' and '.join(sorted(missing))}, found {found}; {_NEED}")
-            columns = [name for name in names if name in ("x_m", "y_m", "depth_m")]
+            columns = [name for name in names if name in _PLACE + _FACING]
             rows = list(_rows(path, reader, columns))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"cannot read the layout {path}: {error}; {_NEED}") from error
@@ -81,8 +98,15 @@ def _rows(path: Path, reader: csv.DictReader, columns: list[str]) -> Iterator[li
             except ValueError:
                 number = math.nan
             if not math.isfinite(number):
+                unit = " in m" if name in _PLACE else ""
                 raise InputError(
-                    f"{path}, line {reader.line_num}: {name} must be a number in m, got {row[name]!r}"
+                    f"{path}, line {reader.line_num}: {name} must be a number{unit}, got {row[name]!r}"
                 )
             numbers.append(number)
+        facing = [number for name, number in zip(columns, numbers, strict=True) if name in _FACING]
+        if facing and not any(facing):
+            raise InputError(
+                f"{path}, line {reader.line_num}: a normal of length 0 faces nowhere: as in "
+                "normal_x,normal_y,normal_z = 0,0,1, which faces the surface"
+            )
         yield numbers

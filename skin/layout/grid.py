@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skin.body.base import AbstractBody
+from skin.layout._facing import rosette
 from skin.layout._grid import grid
 from skin.layout._place import place
 from skin.layout.base import AbstractLayout, Sensors
@@ -13,22 +14,31 @@ __all__ = ["Grid"]
 
 
 class Grid(AbstractLayout):
-    """Sensors in the middle of equal tiles of the sheet.
+    """Sensors in the middle of equal tiles of the body's surface.
 
     Args:
         rows: number of rows (along y).
         columns: number of columns (along x).
         footprint: extent (x, y) over which a sensor feels, m.
+        tilt: angle between each sensor's normal and the surface's, rad: along +x, +y, -x and -y in turn, so
+            that all neighbours feel another direction of shear. Only ``simulator=solid`` feels it.
 
     Raises:
-        InputError: no row or column.
+        InputError: no row or column, or a tilt outside 0 to pi / 2.
     """
 
-    def __init__(self, rows: int = 5, columns: int = 5, footprint: Sequence[float] = (0.01, 0.01)) -> None:
+    def __init__(
+        self,
+        rows: int = 5,
+        columns: int = 5,
+        footprint: Sequence[float] = (0.01, 0.01),
+        tilt: float = 0.0,
+    ) -> None:
         self.centres = grid(rows, columns)
+        self.normals = rosette(rows, columns, tilt)
         self.footprint = footprint
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
         x, y = (self.centres * np.array(body.size)).T
-        return place(body, x, y, None, self.footprint)
+        return place(body, x, y, None, self.footprint, self.normals)

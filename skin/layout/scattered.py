@@ -6,6 +6,7 @@ import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
+from skin.layout._facing import rosette
 from skin.layout._grid import grid
 from skin.layout._place import place
 from skin.layout.base import AbstractLayout, Sensors
@@ -22,9 +23,11 @@ class Scattered(AbstractLayout):
         jitter: how far a sensor may move along x and y, as a share of the pitch, 0 to 0.5.
         seed: what the moves are drawn from.
         footprint: extent (x, y) over which a sensor feels, m.
+        tilt: angle between each sensor's normal and the surface's, rad, as in ``layout=grid``.
+        normals: (S, 3), which way each sensor faces instead; None: as ``tilt`` says.
 
     Raises:
-        InputError: no row or column, or a jitter at which two sensors could meet.
+        InputError: no row or column, a jitter at which two sensors could meet, or a tilt outside 0 to pi / 2.
     """
 
     def __init__(
@@ -34,6 +37,8 @@ class Scattered(AbstractLayout):
         jitter: float = 0.25,
         seed: int = 0,
         footprint: Sequence[float] = (0.01, 0.01),
+        tilt: float = 0.0,
+        normals: np.ndarray | None = None,
     ) -> None:
         if not 0 <= jitter < 0.5:
             raise InputError(
@@ -41,6 +46,7 @@ class Scattered(AbstractLayout):
                 "as in layout.jitter=0.25"
             )
         self.centres = grid(rows, columns)
+        self.normals = rosette(rows, columns, tilt) if normals is None else normals
         self.pitch = np.array([1 / columns, 1 / rows])
         self.jitter = jitter
         self.seed = seed
@@ -50,4 +56,4 @@ class Scattered(AbstractLayout):
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""
         moves = np.random.default_rng(self.seed).uniform(-self.jitter, self.jitter, self.centres.shape)
         x, y = np.round((self.centres + moves * self.pitch) * body.size, 6).T
-        return place(body, x, y, None, self.footprint)
+        return place(body, x, y, None, self.footprint, self.normals)

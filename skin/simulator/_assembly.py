@@ -37,13 +37,19 @@ class Structure:
             leaves motion along x and y free too. Rotation about z is held.
 
     Raises:
-        InputError: an unknown constraint.
+        InputError: an unknown constraint, or a body that is not flat.
     """
 
     body: AbstractBody
     constraint: Constraint = "vertical"
 
     def __post_init__(self) -> None:
+        if not self.body.flat:
+            name = type(self.body).__module__.rpartition(".")[2]
+            raise InputError(
+                f"plates and beams are flat, body={name} is not: set simulator=solid or "
+                "simulator=naive, or body=sheet"
+            )
         if self.constraint not in _FREE:
             raise InputError(
                 f"simulator.constraint must be {' or '.join(get_args(Constraint))}, got {self.constraint}"

@@ -6,6 +6,7 @@ from typing import ClassVar, NamedTuple
 from torch import Tensor, nn
 
 from skin.errors import InputError
+from skin.layout.base import Sensors
 
 __all__ = ["AbstractSimulator", "Response"]
 
@@ -54,6 +55,14 @@ class AbstractSimulator(nn.Module, ABC):
             raise InputError(
                 "friction needs a simulator that feels forces along the surface, got "
                 f"simulator={self._name}: set simulator=solid, or touch.shear=0"
+            )
+
+    def refuse_tilted(self, sensors: Sensors) -> None:
+        """Raise an InputError that names a sensor that leans, unless this simulator feels that."""
+        if not self.feels_shear and sensors.tilted.any():
+            raise InputError(
+                f"sensor {int(sensors.tilted.argmax()) + 1} is tilted, but simulator={self._name} knows only "
+                "forces across the surface: set simulator=solid, or give normals (0, 0, 1)"
             )
 
     def motion(self, pressure: Tensor) -> Tensor:

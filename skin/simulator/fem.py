@@ -44,8 +44,8 @@ class PlatesAndBeams(AbstractSimulator):
             user's cache.
 
     Raises:
-        InputError: an unknown reading or constraint, a sensor at no interface, or a mesh finer than memory
-            allows.
+        InputError: an unknown reading or constraint, a body that is not flat, a sensor at no interface or
+            tilted, or a mesh finer than memory allows.
 
     Attributes:
         operator: the rows D_s, D_t, F_in, the carried force and the motion along x and y in float64, as
@@ -64,6 +64,7 @@ class PlatesAndBeams(AbstractSimulator):
         cache: str | Path | None = None,
     ) -> None:
         super().__init__()
+        self.refuse_tilted(sensors)
         if reading not in get_args(Reading):
             raise InputError(f"simulator.reading must be {' or '.join(get_args(Reading))}, got {reading}")
         self.reading, self.constraint = reading, constraint

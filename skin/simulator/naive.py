@@ -18,8 +18,11 @@ class Naive(AbstractSimulator):
     Choose it to see what mechanics is worth, or for a skin too thin to spread a touch.
 
     Args:
-        body: the sheet; only its cells matter.
-        sensors: where the sensors are; a footprint that passes the sheet's edge is cut there.
+        body: any; only its cells matter.
+        sensors: where the sensors are; a footprint that passes the body's edge is cut there.
+
+    Raises:
+        InputError: a sensor that does not face the surface.
     """
 
     cell: Tensor
@@ -27,6 +30,7 @@ class Naive(AbstractSimulator):
 
     def __init__(self, body: AbstractBody, sensors: Sensors) -> None:
         super().__init__()
+        self.refuse_tilted(sensors)
         # A sensor on the far edge belongs to the last cell.
         column, row = (
             np.minimum(sensors.positions[:, axis] / body.cell[axis], body.cells[axis] - 1).astype(np.int64)

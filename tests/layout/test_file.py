@@ -6,12 +6,16 @@ import pytest
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.layout.file import File
+from skin.layout.grid import Grid
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
     {"material": "EcoFlex 00-30", "thickness": 0.005},
 ]
 BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+
+
+FACING = "x_m,y_m,normal_x,normal_y,normal_z\n"
 
 
 @pytest.fixture
@@ -36,6 +40,25 @@ def test_depth_defaults_to_the_interface_under_the_top_layer(sensors):
     assert sensors("x_m,y_m\n0.1,0.1\n").positions[0, 2] == 0.005
 
 
+def test_normals_are_made_unit_vectors(sensors):
+    """3-4-5 triangles; one that faces outwards stays so."""
+    read = sensors(FACING + "0.1,0.1,0.3,0,0.4\n0.05,0.1,0,0,-7\n0.1,0.05,0,-4,3\n")
+    np.testing.assert_allclose(read.normals, [[0.6, 0, 0.8], [0, 0, -1], [0, -0.8, 0.6]], atol=1e-15)
+    assert read.tilted.tolist() == [True, False, True]
+
+
+def test_sensors_face_the_surface_where_the_file_does_not_say(sensors):
+    read = sensors("x_m,y_m\n0.1,0.1\n0.05,0.1\n")
+    np.testing.assert_array_equal(read.normals, [[0, 0, 1]] * 2)
+    assert not read.tilted.any()
+
+
+def test_the_shipped_tilted_file_is_the_shipped_layout_turned_by_30_degrees():
+    tilted, upright = (File(f"data/layouts/{name}_5x5.csv").sensors(BODY) for name in ("tilted", "jittered"))
+    np.testing.assert_array_equal(tilted.positions, upright.positions)
+    np.testing.assert_allclose(tilted.normals, Grid(5, 5, tilt=np.pi / 6).sensors(BODY).normals, atol=1e-6)
+
+
 def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
     here = tmp_path / "data" / "layouts"
     here.mkdir(parents=True)
@@ -57,9 +80,15 @@ def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
         ("x_m,y_m\n0.1\n", "line 2: y_m must be a number in m, got None"),
         ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
         ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
-        ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the sheet.*depth = 0.02 m"),
+        ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the body.*depth = 0.02 m"),
         ("x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n", "sensors 1 and 3 are at one place, x = 0.1 m, y = 0.1 m"),
         ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one place"),
+        (
+            "x_m,y_m,normal_x,normal_z\n0.1,0.1,0,1\n",
+            "no column normal_y, found x_m, y_m, normal_x, normal_z",
+        ),
+        (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 faces nowhere"),
+        (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
         (b"x_m,y_m\n\xff\xfe,0.1\n", "cannot read the layout"),
     ],
 )

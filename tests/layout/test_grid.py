@@ -16,9 +16,30 @@ def test_sensors_stand_in_the_middle_of_equal_tiles():
     np.testing.assert_allclose(positions[:, 1], [0.02] * 4 + [0.06] * 4)
 
 
+def test_neighbours_are_tilted_along_different_axes():
+    normals = Grid(rows=3, columns=6, tilt=0.4).sensors(BODY).normals.reshape(3, 6, 3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
+    np.testing.assert_allclose(normals[..., 2], np.cos(0.4))
+    np.testing.assert_allclose(normals[0, 0], [np.sin(0.4), 0, np.cos(0.4)], atol=1e-15)
+    for row in range(2):
+        for column in range(5):
+            four = normals[row : row + 2, column : column + 2].reshape(4, 3)
+            assert len({tuple(np.round(one, 6)) for one in four}) == 4
+            np.testing.assert_allclose(four.sum(axis=0)[:2], 0, atol=1e-15)
+
+
+def test_without_a_tilt_sensors_face_the_surface_to_the_last_bit():
+    normals = Grid().sensors(BODY).normals
+    assert normals.tobytes() == np.tile([0.0, 0.0, 1.0], (25, 1)).tobytes()
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
+        ({"tilt": -0.1}, "layout.tilt must be an angle in rad from 0 to below pi/2"),
+        ({"tilt": np.pi / 2}, "layout.tilt must be an angle"),
+        ({"tilt": float("nan")}, "layout.tilt must be an angle"),
+        ({"tilt": "much"}, "layout.tilt must be an angle.*'much'"),
         ({"rows": 0}, "layout.rows must be a whole number of at least 1, got 0"),
         ({"columns": 2.5}, "layout.columns must be a whole number"),
         ({"footprint": [0.01, 0]}, "layout.footprint must be two positive lengths"),

@@ -1,0 +1,83 @@
+"""A sleeve of silicone layers around a part of an arm."""
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from skin.body._given import positive
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+
+__all__ = ["Arm"]
+
+
+@dataclass(frozen=True)
+class Arm(AbstractBody):
+    """Layers glued around a hard core, over a part of its circumference: a sheet rolled up (docs/adr/0010).
+
+    The chart is the outer surface unrolled: x runs around the arm, y along it. So distances between places
+    on the surface are those of the chart; deeper down, an arc over the same x is shorter. In space y is the
+    arm's axis, and the middle of the sleeve is on top, along z.
+
+    Attributes:
+        radius: of the outer surface, m.
+        length: of the sleeve along the arm, m.
+        angle: that the sleeve covers, rad.
+        size: (radius * angle, length), m.
+        cells, layers, variation, variation_seed: as in :class:`skin.body.base.AbstractBody`; layers from the
+            core outwards.
+
+    Raises:
+        InputError: as in :class:`skin.body.base.AbstractBody`, and a sleeve that closes, or layers that
+            leave no core.
+    """
+
+    size: tuple[float, float] = field(init=False)
+    radius: float = field(kw_only=True)
+    length: float = field(kw_only=True)
+    angle: float = field(kw_only=True)
+
+    flat: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        for name, example in (("radius", "0.05"), ("length", "0.16"), ("angle", "3.2")):
+            if not positive(value := getattr(self, name)):
+                unit = "an angle in rad" if name == "angle" else "a length in m"
+                raise InputError(
+                    f"body.{name} must be {unit} above 0, got {value!r}: as in body.{name}={example}"
+                )
+        if self.angle >= 2 * math.pi:
+            raise InputError(
+                f"body.angle={self.angle:g} rad is a full turn: a sleeve that closes has no edge, and "
+                "its chart would tear neighbours apart: give less than 6.283, as in body.angle=6.2"
+            )
+        object.__setattr__(self, "size", (self.radius * self.angle, self.length))
+        super().__post_init__()
+        if self.thickness >= self.radius:
+            raise InputError(
+                f"layers of {self.thickness:g} m together leave no core within "
+                f"body.radius={self.radius:g} m: give a larger body.radius or thinner layers"
+            )
+
+    def resized(self, size: tuple[float, float]) -> str:
+        """Return the overrides that give the sleeve an extent (x, y), m."""
+        return f"body.angle={size[0] / self.radius:g} body.length={size[1]:g}"
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""
+        x, y, depth = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        turn, radius = self._turn(x), self.radius - depth
+        return np.stack([radius * np.sin(turn), y, radius * np.cos(turn)], axis=-1)
+
+    def frame(self, points: np.ndarray) -> np.ndarray:
+        """Return the local axes at points (..., 3), (..., 3, 3): around the arm, along it, to its axis."""
+        turn = self._turn(np.asarray(points, dtype=float)[..., 0])
+        sine, cosine, none = np.sin(turn), np.cos(turn), np.zeros_like(turn)
+        around, along, inwards = (cosine, none, -sine), (none, none + 1, none), (-sine, none, -cosine)
+        return np.stack([np.stack(axis, axis=-1) for axis in (around, along, inwards)], axis=-2)
+
+    def _turn(self, x: np.ndarray) -> np.ndarray:
+        """Return the angle from the middle of the sleeve at a place around it (...,), m, in rad."""
+        return x / self.radius - self.angle / 2

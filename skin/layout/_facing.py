@@ -1,0 +1,37 @@
+"""Which way sensors face: unit vectors in the local frame (x, y, into the skin)."""
+
+import math
+
+import numpy as np
+
+from skin.errors import InputError
+
+__all__ = ["rosette"]
+
+_WAYS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+
+
+def rosette(rows: int, columns: int, tilt: float) -> np.ndarray:
+    """Return the normals (S, 3) of a grid's sensors, row by row, tilted along +x, +y, -x and -y in turn.
+
+    Each row begins two ways after the one above, so that a sensor's eight neighbours all lean another way
+    than it does, and any two by two of them lean all four: shear along any direction is felt everywhere.
+
+    Args:
+        rows: number of rows (along y).
+        columns: number of columns (along x).
+        tilt: angle between the sensors' normals and the surface's, rad, from 0 to below pi / 2.
+
+    Raises:
+        InputError: another tilt.
+    """
+    number = isinstance(tilt, int | float) and not isinstance(tilt, bool)
+    if not number or not 0 <= tilt < math.pi / 2:
+        raise InputError(
+            f"layout.tilt must be an angle in rad from 0 to below pi/2 = 1.5708, got {tilt!r}: "
+            "as in layout.tilt=0.5236, which is 30 degrees"
+        )
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    lean = math.sin(tilt) * _WAYS[(column + 2 * row) % 4]
+    # Without a tilt, -0.0 would be another key to stored operators than 0.0.
+    return np.column_stack([lean + 0.0, np.full(len(lean), math.cos(tilt))])

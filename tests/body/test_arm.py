@@ -1,0 +1,112 @@
+"""The arm: a sheet rolled up, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.arm import Arm
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.grid import Grid
+from skin.simulator.fem import PlatesAndBeams
+from skin.simulator.naive import Naive
+
+LAYERS = [
+    {"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}, "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+
+
+def arm(**changes) -> Arm:
+    return Arm(**{"radius": 0.05, "length": 0.2, "angle": 2.0, "cells": [8, 6], "layers": LAYERS, **changes})
+
+
+def test_its_chart_is_the_outer_surface_unrolled():
+    assert arm().size == pytest.approx((0.1, 0.2))
+    assert arm().cell == pytest.approx((0.0125, 0.2 / 6))
+    assert arm().sensor_depth == 0.005
+
+
+def test_places_by_hand():
+    """A half sleeve of 5 cm: its edges lie level with the axis, its middle on top."""
+    half = arm(angle=np.pi)
+    edge = np.pi * 0.05
+    chart = [[0, 0, 0], [edge / 2, 0.1, 0], [edge, 0.2, 0], [edge / 2, 0.1, 0.015], [edge, 0, 0.015]]
+    space = [[-0.05, 0, 0], [0, 0.1, 0.05], [0.05, 0.2, 0], [0, 0.1, 0.035], [0.035, 0, 0]]
+    np.testing.assert_allclose(half.place(np.array(chart)), space, atol=1e-15)
+    top = half.frame(np.array([edge / 2, 0.1, 0.0]))
+    np.testing.assert_allclose(top, [[1, 0, 0], [0, 1, 0], [0, 0, -1]], atol=1e-15)
+    np.testing.assert_allclose(half.frame(np.zeros(3)), [[0, 0, 1], [0, 1, 0], [1, 0, 0]], atol=1e-15)
+
+
+def test_all_places_lie_on_the_cylinder_and_into_the_skin_is_to_its_axis():
+    body, rng = arm(), np.random.default_rng(0)
+    given = rng.uniform(size=(100, 3)) * [*body.size, body.thickness]
+    space, into = body.place(given), body.frame(given)[:, 2]
+    radius = np.hypot(space[:, 0], space[:, 2])
+    np.testing.assert_allclose(radius, 0.05 - given[:, 2])
+    np.testing.assert_allclose(space + radius[:, None] * into, space * [0, 1, 0], atol=1e-15)
+
+
+def test_straight_lines_of_the_chart_are_the_shortest_on_the_surface():
+    """Distances between sensors: the helix's length by small steps in space, and no detour is shorter."""
+    body = arm()
+    first, second = np.array([0.01, 0.03, 0.0]), np.array([0.09, 0.15, 0.0])
+    share = np.linspace(0, 1, 2001)[:, None]
+    helix = first + share * (second - first)
+    along = np.linalg.norm(np.diff(body.place(helix), axis=0), axis=1).sum()
+    assert along == pytest.approx(np.linalg.norm(second - first), rel=1e-6)
+    for bend in (-0.01, 0.01):
+        detour = helix + bend * np.sin(np.pi * share) * [1, 0, 0]
+        assert np.linalg.norm(np.diff(body.place(detour), axis=0), axis=1).sum() > along
+
+
+def test_a_large_arm_is_a_sheet():
+    size = (0.1, 0.2)
+    sheet = Sheet(size, [8, 6], LAYERS)
+    large = arm(radius=1e4, angle=size[0] / 1e4)
+    given = np.random.default_rng(0).uniform(size=(50, 3)) * [*size, 0.015]
+    middle = np.array([size[0] / 2, 0, -1e4])
+    np.testing.assert_allclose(large.place(given) + middle, sheet.place(given), atol=1e-6)
+    np.testing.assert_allclose(large.frame(given), sheet.frame(given), atol=1e-5)
+    assert large.stiffness(given[:1], given[1:2], 0.01) == pytest.approx(
+        sheet.stiffness(given[:1], given[1:2], 0.01)
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"radius": 0}, "body.radius must be a length in m above 0, got 0: as in body.radius=0.05"),
+        ({"length": -1}, "body.length must be a length in m above 0"),
+        ({"length": "long"}, "body.length must be .*'long'"),
+        ({"angle": float("nan")}, "body.angle must be an angle in rad above 0"),
+        ({"angle": 2 * np.pi}, r"body.angle=6.28319 rad is a full turn:.*give less than 6.283"),
+        ({"radius": 0.015}, "layers of 0.015 m together leave no core within body.radius=0.015 m"),
+        ({"cells": [1, 8]}, "body.cells must be two whole numbers"),
+        ({"layers": []}, "at least one layer"),
+        ({"variation": -1}, "body.variation must be"),
+    ],
+)
+def test_what_is_no_arm_is_refused_by_name(changes, says):
+    with pytest.raises(InputError, match=says):
+        arm(**changes)
+
+
+def test_it_says_how_to_give_it_another_size():
+    """Recordings and layouts know extents, not angles."""
+    body = arm()
+    typed = dict(part.removeprefix("body.").split("=") for part in body.resized((0.12, 0.16)).split())
+    assert arm(**{name: float(value) for name, value in typed.items()}).size == pytest.approx((0.12, 0.16))
+
+
+def test_plates_do_not_bend_around_it():
+    sensors = Grid(2, 2).sensors(arm())
+    with pytest.raises(InputError, match="plates and beams are flat, body=arm is not: set simulator=solid"):
+        PlatesAndBeams(arm(), sensors)
+    assert Naive(arm(), sensors)(torch.ones(6, 8)).readings.numpy() == pytest.approx(1e-4)
+
+
+def test_its_size_is_not_to_be_given():
+    with pytest.raises(TypeError, match="size"):
+        arm(size=[0.16, 0.16])

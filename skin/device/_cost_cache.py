@@ -11,7 +11,7 @@ import numpy as np
 
 from skin.device._cost import CHANNELS, SOURCE, Captures, read
 from skin.errors import InputError
-from skin.simulator._operator import cache_folder
+from skin.simulator._store import folder
 
 __all__ = ["captures"]
 
@@ -40,7 +40,7 @@ def captures(path: Path, window: int) -> Captures:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     key = hashlib.sha256(f"{_FORMAT} {window} {content}".encode()).hexdigest()
-    stored = cache_folder(None) / f"cost-{key}.npz"
+    stored = folder(None) / f"cost-{key}.npz"
     known = _load(stored, window)
     if known is not None:
         return known

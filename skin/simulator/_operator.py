@@ -5,27 +5,22 @@ s)' P p. One factorisation and one solve per functional replace one solve per fr
 """
 
 import hashlib
-import json
-import os
-import tempfile
-import warnings
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 from scipy.sparse.linalg import splu
 
 from skin.body._memory import require_memory
 from skin.layout.base import Sensors
+from skin.simulator import _store
 from skin.simulator._assembly import Structure
 
-__all__ = ["Operator", "build", "cache_folder", "cached"]
+__all__ = ["Operator", "build", "cached"]
 
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 2
 _HERE = Path(__file__).parent
-# Mechanics that changed must not be answered from a file that the old mechanics wrote.
 _SOURCES = [
     _HERE.parent / "body" / "base.py",
     *(_HERE / name for name in ("_assembly.py", "_beam.py", "_operator.py", "_plate.py")),
@@ -89,36 +84,10 @@ def build(structure: Structure, sensors: Sensors) -> Operator:
 
 
 def cached(structure: Structure, sensors: Sensors, folder: Path) -> Operator:
-    """Return the operator from its file in ``folder``, or build it and write the file.
-
-    A file that is damaged, foreign or of another shape is rebuilt; a folder that cannot be written to costs
-    a warning.
-    """
-    key = _key(structure, sensors)
-    path = folder / f"operator-{key}.npz"
-    shape = (len(sensors), structure.body.cells[0] * structure.body.cells[1])
-    stored = _load(path, key, shape)
-    if stored is not None:
-        return stored
-    operator = build(structure, sensors)
-    try:
-        _save(path, key, operator)
-    except OSError as error:
-        warnings.warn(f"the operator cannot be kept in {folder}: {error}", RuntimeWarning, stacklevel=2)
-    return operator
-
-
-def cache_folder(given: str | Path | None) -> Path:
-    """Return where operators are kept: as given, else by the variable SKIN_CACHE, else the user's cache."""
-    return Path(given or os.environ.get("SKIN_CACHE") or platformdirs.user_cache_dir("skin")).expanduser()
-
-
-def _key(structure: Structure, sensors: Sensors) -> str:
-    """Hash everything that the operator depends on."""
+    """Return the operator from its file in ``folder``, or build it and write the file."""
     body = structure.body
     content = {
         "format": _FORMAT,
-        "sources": [hashlib.sha256(source.read_bytes()).hexdigest() for source in _SOURCES],
         "size": body.size,
         "cells": body.cells,
         "layers": [(layer.material.young, layer.material.poisson, layer.thickness) for layer in body.layers],
@@ -127,35 +96,11 @@ def _key(structure: Structure, sensors: Sensors) -> str:
         "positions": sensors.positions.tolist(),
         "footprint": sensors.footprint,
     }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _load(path: Path, key: str, shape: tuple[int, int]) -> Operator | None:
-    """Return the operator in a file, or None if there is no file or anything about it is wrong."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if str(file["key"]) != key:
-                return None
-            rows = {field.name: file[field.name] for field in fields(Operator)}
-    except Exception:  # Whatever a broken archive raises, the answer is the same: build it anew.
-        return None
-    sound = all(
-        row.shape == shape and row.dtype == np.float64 and np.isfinite(row).all() for row in rows.values()
-    )
-    return Operator(**rows) if sound else None
-
-
-def _save(path: Path, key: str, operator: Operator) -> None:
-    """Write the file whole or not at all: others may read or write it at the same time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, key=np.array(key), **vars(operator))
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    key = _store.hashed(content, _SOURCES)
+    shape = (len(sensors), body.cells[0] * body.cells[1])
+    shapes = {field.name: shape for field in fields(Operator)}
+    path = folder / f"operator-{key}.npz"
+    return Operator(**_store.kept(path, key, shapes, lambda: vars(build(structure, sensors))))
 
 
 def _bytes(structure: Structure, sensors: int) -> float:

@@ -78,6 +78,17 @@ class AbstractSimulator(nn.Module, ABC):
             "set simulator=fem simulator.constraint=free"
         )
 
+    def compliance(self) -> Tensor:
+        """Return C (cells, cells), m/Pa: how far each cell's surface moves inwards under 1 Pa on each cell.
+
+        Raises:
+            InputError: in this simulator the surface does not move as a whole.
+        """
+        raise InputError(
+            "a rigid object needs a simulator whose surface gives way, got "
+            f"simulator={self._name}: set simulator=solid, or contact=prescribed"
+        )
+
     @property
     def _name(self) -> str:
         return type(self).__module__.rpartition(".")[2]

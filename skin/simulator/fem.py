@@ -12,7 +12,8 @@ from skin.errors import InputError
 from skin.layout.base import Sensors
 from skin.simulator._assembly import Constraint, Structure
 from skin.simulator._frames import flatten
-from skin.simulator._operator import Operator, cache_folder, cached
+from skin.simulator._operator import Operator, cached
+from skin.simulator._store import folder
 from skin.simulator.base import AbstractSimulator, Response
 
 __all__ = ["PlatesAndBeams", "Reading"]
@@ -69,7 +70,7 @@ class PlatesAndBeams(AbstractSimulator):
             raise InputError(f"simulator.reading must be {' or '.join(get_args(Reading))}, got {reading}")
         self.reading, self.constraint = reading, constraint
         self.shape = body.shape
-        self.operator: Operator = cached(Structure(body, constraint), sensors, cache_folder(cache))
+        self.operator: Operator = cached(Structure(body, constraint), sensors, folder(cache))
         force = self.operator.applied if reading == "equation10" else self.operator.carried
         rows = np.concatenate([self.operator.sensor, self.operator.surface, force])
         self.register_buffer("transfer", torch.from_numpy(rows.T.copy()).float())

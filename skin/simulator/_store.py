@@ -1,0 +1,93 @@
+"""Arrays that took long to compute, kept on disk under a hash of all that they depend on."""
+
+import hashlib
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import platformdirs
+
+__all__ = ["folder", "hashed", "kept", "place"]
+
+
+def folder(given: str | Path | None) -> Path:
+    """Return where arrays are kept: as given, else by the variable SKIN_CACHE, else the user's cache."""
+    return Path(given or os.environ.get("SKIN_CACHE") or platformdirs.user_cache_dir("skin")).expanduser()
+
+
+def hashed(content: Mapping[str, Any], sources: Iterable[Path]) -> str:
+    """Hash what arrays depend on, and the code that computes them.
+
+    Mechanics that changed must not be answered from a file that the old mechanics wrote.
+    """
+    code = [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources]
+    return hashlib.sha256(json.dumps([content, code], sort_keys=True).encode()).hexdigest()
+
+
+def kept(
+    path: Path,
+    key: str,
+    shapes: Mapping[str, Sequence[int]],
+    build: Callable[[], Mapping[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """Return named float64 arrays from their file, or build them and write it.
+
+    A file that is damaged, foreign or of another shape is rebuilt; a folder that cannot be written to costs
+    a warning.
+
+    Args:
+        path: x.npz.
+        key: of :func:`hashed`.
+        shapes: of each array.
+        build: computes them.
+    """
+    stored = _load(path, key, shapes)
+    if stored is not None:
+        return stored
+    arrays = dict(build())
+    try:
+        with place(path) as name, open(name, "wb") as file:
+            np.savez(file, allow_pickle=False, **({"key": np.array(key)} | arrays))
+    except OSError as error:
+        warnings.warn(f"the operator cannot be kept in {path.parent}: {error}", RuntimeWarning, stacklevel=3)
+    return arrays
+
+
+class place:  # noqa: N801 - reads as the verb it is
+    """Give a temporary name that becomes ``path`` when all went well: others may read or write it too."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> str:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        handle, self._name = tempfile.mkstemp(dir=self._path.parent, prefix=self._path.stem, suffix=".tmp")
+        os.close(handle)
+        return self._name
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            os.replace(self._name, self._path)
+        else:
+            Path(self._name).unlink(missing_ok=True)
+
+
+def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:
+    """Return the arrays of a file, or None if there is no file or anything about it is wrong."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["key"]) != key:
+                return None
+            arrays = {name: file[name] for name in shapes}
+    except Exception:  # Whatever a broken archive raises, the answer is the same: build it anew.
+        return None
+    sound = all(
+        array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
+        for name, array in arrays.items()
+    )
+    return arrays if sound else None

@@ -1,0 +1,213 @@
+"""Three-dimensional elasticity of a layered body, as one linear operator."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+from skin.layout.base import Sensors
+from skin.material import MATERIALS
+from skin.simulator import _store
+from skin.simulator._elastic import Elastic
+from skin.simulator._footprint import quadrature
+from skin.simulator._frames import flatten
+from skin.simulator._hexahedra import Hexahedra
+from skin.simulator.base import AbstractSimulator, Response
+
+__all__ = ["Solid", "hexahedra", "readings"]
+
+_HERE = Path(__file__).parent
+_SOURCES = [
+    *sorted((_HERE.parent / "body").glob("*.py")),
+    *(_HERE / f"{name}.py" for name in ("_elastic", "_footprint", "_hexahedra", "solid")),
+]
+_INWARDS = 2
+
+
+class Solid(AbstractSimulator):
+    """Layers of nearly incompressible elastic solid, glued to something hard.
+
+    A sensor reads the force n . sigma . n that pushes on its footprint across its normal, so a tilted one
+    feels shear, and all feel their neighbourhood. Linear: no large strain (see the summary of each data set).
+
+    Reads 1000 Pa spread evenly over a sheet to 0.2 % in its middle; tests/simulator/test_solid.py and
+    ``make physics`` hold the rest.
+
+    Args:
+        body: sheet or arm.
+        sensors: where the sensors are and which way they face.
+        divisions: rows of elements in each layer.
+        poisson: name of a material -> nu to take in place of its own, for those that no solid can have.
+        cache: folder of operators kept from earlier runs; None means the variable SKIN_CACHE, else the
+            user's cache.
+
+    Raises:
+        InputError: a material with nu >= 0.5, a name that no material has, no row of elements, or a mesh
+            finer than memory allows.
+    """
+
+    feels_shear: ClassVar[bool] = True
+    transfer: Tensor
+    along: Tensor
+
+    def __init__(
+        self,
+        body: AbstractBody,
+        sensors: Sensors,
+        divisions: int = 3,
+        poisson: Mapping[str, float] | None = None,
+        cache: str | Path | None = None,
+    ) -> None:
+        super().__init__()
+        self.shape, self._area = body.shape, float(np.prod(body.cell))
+        self._mesh = hexahedra(body, divisions, poisson or {})
+        self._folder = _store.folder(cache)
+        self._key = _store.hashed(_content(body, self._mesh), _SOURCES)
+        rows = self._operator(sensors)
+        # (3, rows, cells) -> a pressure's cells times this gives all rows for each axis of the load.
+        self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
+        self._sensors = len(sensors)
+
+    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+        """Return the response to pressure (..., H, W), Pa, and drag (..., 2), with D_s and D_t."""
+        cells = flatten(pressure, self.shape, self.transfer.dtype)
+        felt = cells @ self.transfer[_INWARDS, :, : 3 * self._sensors]
+        if drag is not None:
+            for axis in (0, 1):
+                part = cells @ self.transfer[axis, :, : 3 * self._sensors]
+                felt = felt + drag[..., axis, None].to(part) * part
+        readings, sensor, surface = felt.chunk(3, dim=-1)
+        return Response(readings, torch.stack([sensor, surface], dim=-1))
+
+    def motion(self, pressure: Tensor) -> Tensor:
+        """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m."""
+        cells = flatten(pressure, self.shape, self.transfer.dtype)
+        count = self._sensors
+        rows = self.transfer[_INWARDS]
+        along = cells @ rows[:, 3 * count :]
+        inwards = cells @ rows[:, count : 2 * count]
+        return torch.stack([*along.chunk(2, dim=-1), inwards], dim=-1)
+
+    def compliance(self) -> Tensor:
+        """Return C (cells, cells), m/Pa: how far each cell's surface moves inwards under 1 Pa on each cell.
+
+        A cell's motion is the mean of its corners'. Symmetric. Solved for once, then kept on disk.
+        """
+        loads = self._mesh.loads(_INWARDS)
+        compliance = loads.T @ self.influence(_INWARDS) / self._area
+        return torch.from_numpy((compliance + compliance.T) / 2)
+
+    def influence(self, axis: int) -> np.ndarray:
+        """Return how every node moves under 1 Pa on each cell along an axis, (3 N, cells), m/Pa."""
+        return self._elastic.influence(axis, self._folder / f"influence-{self._key}-{axis}.npy")
+
+    def of(self, sensors: Sensors) -> np.ndarray:
+        """Return what other sensors read of 1 Pa on each cell along x, y and inwards, (3, S, cells), N/Pa.
+
+        Exact, whatever their places: read from :meth:`influence`, so a layout costs milliseconds.
+        """
+        rows = readings(self._mesh, sensors)
+        return np.stack([_read(rows, self.influence(axis)) for axis in range(3)])
+
+    @cached_property
+    def _elastic(self) -> Elastic:
+        return Elastic(self._mesh)
+
+    def _operator(self, sensors: Sensors) -> np.ndarray:
+        """Return readings, D_s, D_t and motions along x and y over the cells, (3, 5 S, cells)."""
+        about = {
+            "body": self._key,
+            "positions": sensors.positions.tolist(),
+            "normals": sensors.normals.tolist(),
+            "footprint": sensors.footprint,
+        }
+        key = _store.hashed(about, _SOURCES)
+        shape = (3, 5 * len(sensors), self.shape[0] * self.shape[1])
+
+        def build() -> dict[str, np.ndarray]:
+            rows = sp.vstack([readings(self._mesh, sensors), *_motions(self._mesh, sensors)]).tocsr()
+            return {"rows": self._elastic.transfer(rows)}
+
+        return _store.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
+
+
+def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) -> Hexahedra:
+    """Return a body's elements: its cells, ``divisions`` rows to each layer.
+
+    Args:
+        body: sheet or arm.
+        divisions: of each layer.
+        poisson: name of a material -> nu in place of its own.
+
+    Raises:
+        InputError: as of :class:`Solid`.
+    """
+    if type(divisions) is not int or divisions < 1:
+        raise InputError(
+            f"simulator.divisions must be a whole number of at least 1, got {divisions}: as in "
+            "simulator.divisions=3"
+        )
+    ratios = _ratios(body, poisson)
+    depths, young, ratio = [0.0], [], []
+    for number in reversed(range(len(body.layers))):
+        layer = body.layers[number]
+        depths += list(depths[-1] + layer.thickness * np.arange(1, divisions + 1) / divisions)
+        young += [layer.material.young * body.moduli[number]] * divisions
+        ratio += [ratios[number]] * divisions
+    x, y = (np.linspace(0, body.size[axis], body.cells[axis] + 1) for axis in (0, 1))
+    return Hexahedra((x, y, np.array(depths)), np.stack(young), np.array(ratio), body.place, body.frame)
+
+
+def readings(mesh: Hexahedra, sensors: Sensors) -> sp.csr_matrix:
+    """Return rows (S, 3 N) that read the force that pushes on each sensor across its normal, N."""
+    points, areas, owner = quadrature(sensors, mesh.lines)
+    sums = sp.csr_matrix((-areas, (owner, np.arange(len(owner)))), shape=(len(sensors), len(points)))
+    return (sums @ mesh.stress(points, sensors.normals[owner])).tocsr()
+
+
+def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
+    """Return rows (S, 3 N) that read D_s, D_t and how far each sensor moves along x and y, m."""
+    places = sensors.positions
+    above = places * np.array([1.0, 1.0, 0.0])
+    x, y, inwards = (np.tile(axis, (len(places), 1)) for axis in np.eye(3))
+    return [mesh.motion(*one) for one in ((places, inwards), (above, inwards), (places, x), (places, y))]
+
+
+def _read(rows: sp.csr_matrix, influence: np.ndarray) -> np.ndarray:
+    """Return rows @ influence, of which only the lines that rows touch are read from disk."""
+    used = np.unique(rows.indices)
+    return np.asarray(rows[:, used] @ influence[used])
+
+
+def _ratios(body: AbstractBody, poisson: Mapping[str, float]) -> list[float]:
+    names = {layer.material.name for layer in body.layers}
+    if unknown := sorted(set(poisson) - names - {material.name for material in MATERIALS}):
+        raise InputError(
+            f"simulator.poisson names {unknown[0]}, but the body is made of {', '.join(sorted(names))}"
+        )
+    ratios = [float(poisson.get(layer.material.name, layer.material.poisson)) for layer in body.layers]
+    for layer, ratio in zip(body.layers, ratios, strict=True):
+        if not -1 < ratio < 0.5:
+            raise InputError(
+                f"{layer.material.name} has Poisson's ratio {ratio:g}, but no isotropic solid is beyond "
+                f"-1 < nu < 0.5: give simulator.poisson={{{layer.material.name}: 0.49}}, or simulator=fem"
+            )
+    return ratios
+
+
+def _content(body: AbstractBody, mesh: Hexahedra) -> dict[str, Any]:
+    """Return all that the body's operators depend on."""
+    space = np.concatenate([mesh.nodes, *mesh.frame(np.zeros((1, 3)))])
+    return {
+        "lines": [line.tolist() for line in mesh.lines],
+        "young": mesh.young.tolist(),
+        "poisson": mesh.poisson.tolist(),
+        "nodes": space.tolist(),
+    }

@@ -1,0 +1,169 @@
+"""The solid obeys the laws of elasticity that a few elements can show; make physics shows the rest."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse.linalg import spsolve
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.base import Sensors
+from skin.simulator._elastic import Elastic
+from skin.simulator._hexahedra import Hexahedra
+from skin.simulator.solid import Solid, hexahedra, readings
+
+LAYERS = [
+    {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+SHEET = Sheet([0.12, 0.12], [12, 12], LAYERS)
+FOOTPRINT = (0.01, 0.01)
+
+
+def sensors(*places, normals=(0.0, 0.0, 1.0)):
+    return Sensors(np.array(places, dtype=float), FOOTPRINT, np.array(normals, dtype=float))
+
+
+MIDDLE = sensors((0.06, 0.06, 0.005))
+
+
+def solid(where=MIDDLE, body=SHEET, **settings):
+    return Solid(body, where, **{"divisions": 2} | settings)
+
+
+def bent(points):
+    """Move a chart's points smoothly and unevenly: no element stays a box."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.stack([x + 0.2 * y * x, y + 0.1 * x * x - 0.1 * z, -z + 0.3 * x * z], axis=-1)
+
+
+def identity(points):
+    return np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3))
+
+
+def test_patch():
+    """A uniform strain is exact on distorted elements: no force inside, the same stress everywhere."""
+    lines = tuple(np.sort(np.random.default_rng(seed).random(5)) for seed in range(3))
+    mesh = Hexahedra(lines, np.full((4, 4, 4), 2e5), np.full(4, 0.49), bent, identity)
+    strain = np.array([[1.0, 0.3, -0.2], [0.3, -0.4, 0.5], [-0.2, 0.5, 0.7]]) * 1e-3
+    moved = (mesh.nodes @ strain).ravel()
+    inner = np.zeros((5, 5, 5), dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    forces = (mesh.stiffness() @ moved).reshape(-1, 3)
+    assert np.abs(forces[inner.ravel()]).max() < 1e-12 * np.abs(forces).max()
+    lam, mu = mesh.lame[0][0], mesh.lame[1][0]
+    stress = lam * np.trace(strain) * np.eye(3) + 2 * mu * strain
+    points = np.random.default_rng(3).uniform(np.array(lines)[:, 0], np.array(lines)[:, -1], (20, 3))
+    for n, m in np.random.default_rng(4).normal(size=(5, 2, 3)):
+        rows = mesh.stress(points, np.tile(n, (20, 1)), np.tile(m, (20, 1)))
+        assert rows @ moved == pytest.approx(n @ stress @ m, rel=1e-9)
+    down = mesh.motion(points, np.tile([0, 0, 1.0], (20, 1))) @ moved
+    assert down == pytest.approx(_interpolated(mesh, points, strain), rel=1e-12)
+
+
+def _interpolated(mesh, points, strain):
+    """Return the third component of a uniform strain's motion where trilinear elements put chart points."""
+    values = bent(np.stack(np.meshgrid(*mesh.lines, indexing="ij"), axis=-1)) @ strain
+    return RegularGridInterpolator(mesh.lines, values)(points)[:, 2]
+
+
+def test_even_pressure_reaches_the_middle():
+    wide = Sheet([0.24, 0.24], [24, 24], LAYERS)
+    felt = solid(sensors((0.12, 0.12, 0.005), (0.12, 0.12, 0.012)), wide)(torch.full(wide.shape, 1e3))
+    assert felt.readings.numpy() == pytest.approx(0.1, rel=2e-3)
+
+
+def test_the_table_pushes_back():
+    mesh = hexahedra(SHEET, 2, {})
+    for axis in range(3):
+        load = mesh.loads(axis) @ np.random.default_rng(axis).random(144)
+        moved = Elastic(mesh).solve(load[:, None])[:, 0]
+        total = (mesh.stiffness() @ moved)[mesh.held].reshape(-1, 3).sum(axis=0)
+        assert total == pytest.approx(-load.reshape(-1, 3).sum(axis=0), rel=1e-9, abs=1e-15)
+
+
+def test_the_operator_is_a_direct_solve():
+    mesh = hexahedra(SHEET, 2, {})
+    free = np.flatnonzero(~mesh.held)
+    where = sensors((0.031, 0.052, 0.005), (0.09, 0.03, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
+    pressure = 1e4 * np.random.default_rng(0).random(144)
+    load = mesh.loads(2) @ pressure - 0.4 * mesh.loads(0) @ pressure
+    moved = np.zeros(len(load))
+    moved[free] = spsolve(mesh.stiffness()[free][:, free].tocsc(), load[free])
+    frame, drag = torch.from_numpy(pressure).reshape(12, 12), torch.tensor([-0.4, 0.0])
+    felt = solid(where)(frame, drag).readings.numpy()
+    assert felt == pytest.approx(readings(mesh, where) @ moved, rel=2e-6)
+
+
+def test_forces_are_mutual():
+    """Maxwell and Betti: cell a moves under cell b as cell b does under cell a."""
+    mesh = hexahedra(SHEET, 2, {})
+    loads = mesh.loads(2)
+    compliance = loads.T @ Elastic(mesh).solve(loads.toarray())
+    assert np.abs(compliance - compliance.T).max() < 1e-10 * np.abs(compliance).max()
+    kept = solid().compliance().numpy() * np.prod(SHEET.cell)
+    assert kept == pytest.approx(compliance, rel=1e-4, abs=1e-6 * float(np.abs(compliance).max()))
+    assert np.linalg.eigvalsh(kept)[0] > 0
+
+
+def test_a_tilted_sensor_feels_shear():
+    """Traction q along x adds 2 q sin cos to what pushes across a plane leaning along x, in a wide sheet."""
+    wide, angle = Sheet([0.24, 0.24], [24, 24], LAYERS), np.deg2rad(30)
+    place = (0.12, 0.12, 0.0025)
+    where = sensors(place, place, normals=[(np.sin(angle), 0, np.cos(angle)), (0, 0, 1)])
+    skin = solid(where, wide)
+    nothing = torch.full(wide.shape, 1e3)
+    pushed = skin(nothing).readings.double()
+    dragged = skin(nothing, torch.tensor([0.5, 0.0])).readings.double()
+    # The traction pushes the surface along +x; on the plane across n it pulls where n leans into the motion.
+    change = (dragged - pushed).numpy() / (1e3 * 1e-4)
+    assert change[0] == pytest.approx(2 * 0.5 * np.sin(angle) * np.cos(angle), rel=0.03)
+    assert change[1] == pytest.approx(0, abs=0.01)
+
+
+def test_a_layout_needs_no_further_solve():
+    where = sensors((0.031, 0.052, 0.005), (0.09, 0.03, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
+    skin = solid(where)
+    direct = skin.transfer[:, :, :2].transpose(1, 2).numpy()
+    assert skin.of(where) == pytest.approx(direct, rel=1e-4, abs=1e-6 * float(np.abs(direct).max()))
+
+
+def test_sensors_move_as_the_skin_does():
+    skin, frame = solid(), torch.zeros(SHEET.shape)
+    frame[5:7, 5:7] = 1e4
+    motion, response = skin.motion(frame), skin(frame)
+    assert response.displacement is not None
+    torch.testing.assert_close(motion[:, 2], response.displacement[:, 0])
+    assert 0 < response.displacement[0, 0] < response.displacement[0, 1]
+
+
+def test_a_modulus_that_varies_is_felt():
+    varied = Sheet([0.12, 0.12], [12, 12], LAYERS, variation=0.3)
+    frame = torch.full(SHEET.shape, 1e3)
+    assert not torch.allclose(solid(body=varied)(frame).readings, solid()(frame).readings, rtol=1e-3)
+
+
+def test_operators_are_kept(tmp_path, monkeypatch):
+    first = solid(cache=tmp_path)
+    monkeypatch.setattr(Elastic, "transfer", None)
+    assert torch.equal(solid(cache=tmp_path).transfer, first.transfer)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"divisions": 0}, r"divisions must be .* got 0"),
+        ({"poisson": {"muscle": 0.5}}, r"muscle has Poisson's ratio 0\.5.*poisson=\{muscle: 0\.49\}"),
+        ({"poisson": {"mussel": 0.4}}, r"names mussel, but the body is made of EcoFlex 00-30, muscle"),
+    ],
+)
+def test_what_no_solid_can_be(settings, reason):
+    with pytest.raises(InputError, match=reason):
+        solid(**settings)
+
+
+def test_the_measured_ratio_of_dragon_skin_is_refused_by_name():
+    body = Sheet([0.12, 0.12], [12, 12], [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}])
+    with pytest.raises(InputError, match=r"Dragon Skin 10 Medium has Poisson's ratio 0\.54"):
+        solid(sensors((0.06, 0.06, 0.0)), body)

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.optim.lr_scheduler import OneCycleLR
 
-from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
 from skin.labels import Task
 from skin.model._activation import activation as activation_of
@@ -23,15 +22,19 @@ MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 
 
 def probabilities(logits: Tensor, task: Task) -> Tensor:
-    """Return the probability of each label, (B, L), from logits (B, L)."""
-    return logits.softmax(dim=-1) if task.kind == "exclusive" else logits.sigmoid()
+    """Return the probability of each label, (B, L), from logits (B, L); of a direction the mean cosines."""
+    if task.kind == "exclusive":
+        return logits.softmax(dim=-1)
+    chances = logits.sigmoid()
+    return torch.cat([chances[:, :-2], 2 * chances[:, -2:] - 1], dim=1) if task.direction else chances
 
 
 class TouchClassifier(pl.LightningModule):
     """Dense layers on the embedding of a window, and how they learn.
 
     Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
-    per epoch. Labels that mean nothing because the task's gate is shut count in neither.
+    per epoch. Labels that mean nothing, because the task's gate is shut or a touch has no direction, count in
+    neither.
 
     Numbers about the whole window, where the representation gives such (``Frames.summary``), pass two dense
     layers of their own and join the embedding.
@@ -46,9 +49,6 @@ class TouchClassifier(pl.LightningModule):
             nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
         dropout: share of the embedding and of the first dense layer that is dropped in training.
         summary: how many numbers about the whole window there are; 0: none.
-
-    Raises:
-        InputError: the task is of a kind that has no loss here.
     """
 
     def __init__(
@@ -63,8 +63,6 @@ class TouchClassifier(pl.LightningModule):
         summary: int = 0,
     ) -> None:
         super().__init__()
-        if task.kind not in ("binary", "exclusive"):
-            raise InputError(f"networks learn binary and exclusive labels, got a task of kind {task.kind}")
         self.fusion = fusion
         self.summary = _Summary(summary, fusion.width, activation) if summary else None
         widths = [fusion.width * (2 if summary else 1), *hidden]
@@ -87,17 +85,17 @@ class TouchClassifier(pl.LightningModule):
         return torch.cat([embedding, self.summary(frames.summary)], dim=1)
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1.
+        """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1, or the cosines of a direction.
 
-        Where the task has a gate (report, 4.2), the mean is over the labels that mean something: those of a
-        window without touch have no loss and no gradient, but for the gate itself.
+        Where the task has a gate (report, 4.2) or a direction, the mean is over the labels that mean
+        something: those of a window without touch have no loss and no gradient, but for the gate itself.
         """
         if self.task.kind == "exclusive":
             return F.cross_entropy(logits, labels)
-        if self.task.gate is None:
+        if self.task.gate is None and not self.task.direction:
             return F.binary_cross_entropy_with_logits(logits, labels)
         counts = self.task.counts(labels)
-        return F.binary_cross_entropy_with_logits(logits[counts], labels[counts])
+        return F.binary_cross_entropy_with_logits(logits[counts], self.task.shares(labels)[counts])
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         frames, labels = batch
@@ -115,7 +113,7 @@ class TouchClassifier(pl.LightningModule):
         counts = self.task.counts(labels)
         right = ((logits > 0) == (labels > 0.5)) & counts
         shares = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
-        each = dict(zip(self.task.names, shares, strict=True))
+        each = dict(zip(self.task.binary, shares, strict=False))
         overall = torch.stack([each[name] for name in self.task.gated]).mean()
         return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in each.items()}
 

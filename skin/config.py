@@ -42,6 +42,7 @@ class Data:
     batch_size: int
     # Runs of old have none of these.
     stream: bool = False
+    direction: bool = False
     augment: dict[str, Any] = field(default_factory=dict)
 
 

@@ -49,6 +49,11 @@ class TouchData(pl.LightningDataModule):
         super().__init__()
         if batch_size < 1:
             raise InputError(f"a batch needs at least one gesture, got {batch_size}: set data.batch_size=64")
+        if augmentation is not None and augmentation.reverse and device.task.direction:
+            raise InputError(
+                "a touch that runs backwards slides the other way: set data.augment.reverse=false where "
+                "data.direction=true"
+            )
         self.device, self.batch_size, self.seed = device, batch_size, seed
         self._make = representation
         # One that changes nothing is none: it draws nothing.

@@ -131,6 +131,7 @@ def _named(column: str, values: dict[str, float]) -> dict[str, float]:
 def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
     columns: dict[str, np.ndarray] = {}
     for name, label, chance in zip(task.names, _labels(touches).T, chances.T, strict=True):
-        columns |= {name: label.to(torch.int8).numpy(), f"p_{name}": chance.numpy()}
+        known = label.to(torch.int8) if name in task.binary else label
+        columns |= {name: known.numpy(), f"p_{name}": chance.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)

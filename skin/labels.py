@@ -8,9 +8,20 @@ from torch import Tensor
 
 from skin.errors import InputError
 
-__all__ = ["TOUCH", "TOUCH_OR_NOT", "Measures", "Task", "Thresholds", "measure", "movie_labels"]
+__all__ = [
+    "TOUCH",
+    "TOUCH_OR_NOT",
+    "TOUCH_SLIDING",
+    "Measures",
+    "Task",
+    "Thresholds",
+    "measure",
+    "movie_labels",
+    "sliding",
+]
 
 _PART = 256
+_STRAIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -19,39 +30,57 @@ class Task:
 
     Attributes:
         names: one name per label, in the order of the label tensor's last axis.
-        kind: ``binary`` (each label holds or not by itself), ``exclusive`` (exactly one holds) or
-            ``direction``.
+        kind: ``binary`` (each label holds or not by itself) or ``exclusive`` (exactly one holds).
         gate: the label without which the others mean nothing (report, 4.2), such as ``touch``; None: all
             labels always mean something.
+        direction: the last two labels are no binary ones but the cosines of a direction with x and y, -1 to
+            1. Both are 0 where a touch has none; they mean nothing there.
 
     Raises:
-        ValueError: a gate that is no label, or of labels that are not binary.
+        ValueError: a gate that is no label, or a gate or a direction beside labels that are not binary.
     """
 
     names: tuple[str, ...]
-    kind: Literal["binary", "exclusive", "direction"] = "binary"
+    kind: Literal["binary", "exclusive"] = "binary"
     gate: str | None = None
+    direction: bool = False
 
     def __post_init__(self) -> None:
-        if self.gate is not None and (self.kind != "binary" or self.gate not in self.names):
+        if self.gate is not None and (self.kind != "binary" or self.gate not in self.binary):
             raise ValueError(f"{self.gate} is no gate of the {self.kind} labels {self.names}")
+        if self.direction and (self.kind != "binary" or len(self.names) < 3):
+            raise ValueError(f"a direction stands behind binary labels, got {self.kind} {self.names}")
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
+    def binary(self) -> tuple[str, ...]:
+        """The names of all labels but a direction's."""
+        return self.names[:-2] if self.direction else self.names
+
+    @property
     def gated(self) -> tuple[str, ...]:
-        """The names of all labels but the gate."""
-        return tuple(name for name in self.names if name != self.gate)
+        """The names of all labels but the gate and a direction's."""
+        return tuple(name for name in self.binary if name != self.gate)
 
     def counts(self, labels: Tensor) -> Tensor:
-        """Return which of the labels (B, L) mean something, bool: all of them, unless a gate is shut."""
-        if self.gate is None:
-            return torch.ones_like(labels, dtype=torch.bool)
-        gate = self.names.index(self.gate)
-        counts = (labels[:, gate : gate + 1] > 0.5).repeat(1, len(self))
-        counts[:, gate] = True
+        """Return which of the labels (B, L) mean something, bool; a shut gate or no direction: nothing."""
+        counts = torch.ones_like(labels, dtype=torch.bool)
+        if self.gate is not None:
+            gate = self.names.index(self.gate)
+            counts = (labels[:, gate : gate + 1] > 0.5).repeat(1, len(self))
+            counts[:, gate] = True
+        if self.direction:
+            counts[:, -2:] &= (labels[:, -2:] != 0).any(dim=1, keepdim=True)
         return counts
+
+    def shares(self, labels: Tensor) -> Tensor:
+        """Return labels (B, L) as what a probability should be on average, 0 to 1: cosines c as (1 + c) / 2.
+
+        The mean of c has the least cross-entropy then, as the share of true cases has it of a binary label.
+        """
+        return torch.cat([labels[:, :-2], (1 + labels[:, -2:]) / 2], dim=1) if self.direction else labels
 
 
 TOUCH = Task(("big", "dynamic", "press", "dangerous"))
@@ -59,6 +88,25 @@ TOUCH = Task(("big", "dynamic", "press", "dangerous"))
 
 TOUCH_OR_NOT = Task((*TOUCH.names, "touch"), gate="touch")
 """The same with the report's fifth label (section 4.2); where it is 0 the other four are 0 too."""
+
+TOUCH_SLIDING = Task((*TOUCH.names, "slide_x", "slide_y"), direction=True)
+"""The four binary labels and the direction of sliding, as :func:`sliding` gives it."""
+
+
+def sliding(net: Tensor, way: Tensor) -> Tensor:
+    """Return the cosines (B, 2) of the directions in which touches slide; 0, 0 where they have none.
+
+    It is the direction from where a touch begins to where it ends. A path that leads less than half its
+    length away, because it was turned at the edges, goes to and fro: it has no direction, like one that
+    stands still.
+
+    Args:
+        net: (B, 2), m, from the first place to the last.
+        way: (B,), m, the length of the path.
+    """
+    far = torch.linalg.vector_norm(net, dim=1)
+    straight = (far > 0) & (far >= _STRAIGHT * way)
+    return net / far.where(straight, 1)[:, None] * straight[:, None]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """How good probabilities are: per label, and overall as the report counts it."""
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -15,15 +16,15 @@ from torchmetrics.functional.classification import (
 
 from skin.labels import Task
 
-__all__ = ["confusion", "metrics", "recall_at"]
+__all__ = ["angles", "confusion", "metrics", "recall_at"]
 
 
 def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate: float) -> dict[str, float]:
     """Return accuracy, balanced accuracy, calibration error and recalls.
 
     Args:
-        probabilities: (B, L).
-        labels: (B, L), 0 or 1.
+        probabilities: (B, L); of a direction the mean cosines.
+        labels: (B, L), 0 or 1; of a direction the cosines.
         task: what the labels mean.
         false_alarm_rate: share of false alarms at which the recall of ``dangerous`` is read.
 
@@ -31,14 +32,16 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
         ``<label>/accuracy``, ``/balanced_accuracy`` and ``/ece`` for each label of a binary task,
         ``dangerous/recall``, and ``overall/accuracy``: the mean of the labels' accuracies (report, 3.2); an
         exclusive task has only this. Where the task has a gate, the other labels are measured on the touches
-        in which it is open, and the gate itself is no part of the overall.
+        in which it is open, and the gate itself is no part of the overall. Where it has a direction, there
+        are ``direction/degrees``, the mean size of the error, and ``direction/accuracy``, the share of errors
+        up to 45 degrees, of the touches that have one (blind guesses: 90 and .25); no part of the overall.
     """
     if task.kind == "exclusive":
         right = multiclass_accuracy(probabilities, labels.argmax(1), len(task), average="micro")
         return {"overall/accuracy": float(right)}
     values: dict[str, float] = {}
     pairs = _pairs(probabilities, labels, task)
-    for name, (chance, label) in zip(task.names, pairs, strict=True):
+    for name, (chance, label) in zip(task.binary, pairs, strict=True):
         recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
         values[f"{name}/accuracy"] = float(((chance > 0.5) == (label > 0)).float().mean())
         values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
@@ -48,7 +51,22 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
     for metric in ("accuracy", "balanced_accuracy", "ece"):
         each = [values[f"{name}/{metric}"] for name in task.gated]
         values[f"overall/{metric}"] = sum(each) / len(each)
+    if task.direction:
+        degrees = angles(probabilities, labels, task)
+        values["direction/degrees"] = float(degrees.mean())
+        values["direction/accuracy"] = float((degrees <= 45).float().mean())
     return values
+
+
+def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
+    """Return the angles (B',) between predicted and true directions, degrees, of the touches that have one.
+
+    Cosines of 0 and 0 say nothing: 90 degrees, as a blind guess is wrong on average.
+    """
+    rows = task.counts(labels)[:, -1]
+    (x, y), (cos, sin) = probabilities[rows, -2:].double().T, labels[rows, -2:].double().T
+    angle = torch.atan2(x * sin - y * cos, x * cos + y * sin).abs() * 180 / math.pi
+    return angle.where((x != 0) | (y != 0), 90)
 
 
 def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
@@ -66,7 +84,7 @@ def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
 def confusion(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:
     """Return counts (L, 2, 2) of probabilities and labels (B, L): true class down, predicted across.
 
-    With a task that has a gate, each label is counted where it means something.
+    With a task that has a gate, each label is counted where it means something. A direction has no counts.
     """
     pairs = _pairs(probabilities, labels, task)
     return torch.stack([binary_confusion_matrix(chance, label) for chance, label in pairs])
@@ -75,5 +93,6 @@ def confusion(probabilities: Tensor, labels: Tensor, task: Task | None = None) -
 def _pairs(probabilities: Tensor, labels: Tensor, task: Task | None) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield the probabilities and labels (B',) of each label, of the touches in which it means something."""
     counts = torch.ones_like(labels, dtype=torch.bool) if task is None else task.counts(labels)
-    for chance, label, counted in zip(probabilities.T, labels.long().T, counts.T, strict=True):
-        yield chance[counted], label[counted]
+    last = probabilities.shape[1] if task is None else len(task.binary)
+    for i in range(last):
+        yield probabilities[counts[:, i], i], labels[counts[:, i], i].long()

@@ -119,6 +119,8 @@ def probe(device: AbstractDevice, settings: Settings, learner: Network | None) -
     A simulated device draws new touches for every seed, of which no training has any; of another device the
     train and test splits are taken, once. Embeddings see the readings of all touches, but no label.
     """
+    if device.task.direction:
+        raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
     for seed in settings.seeds if isinstance(device, Simulated) else settings.seeds[:1]:
         touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
         for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):

@@ -101,6 +101,7 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
             "gestures": config.data.gestures,
             "fresh": config.data.fresh,
             "stream": config.data.stream,
+            "direction": config.data.direction,
         }
     else:
         choices.pop("simulator", None)
@@ -122,5 +123,5 @@ def _write(report: Report, task: Task, folder: Path) -> None:
     """Write what a person will open: predictions, and confusion matrices as a picture."""
     pq.write_table(report.predictions, folder / "predictions.parquet")
     if report.confusion is not None:
-        named = dict(zip(task.names, report.confusion.numpy(), strict=True))
+        named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
         save(confusions(named, ("no", "yes")), folder / "confusion.png")

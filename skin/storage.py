@@ -110,9 +110,11 @@ def _numbered(name: str, count: int) -> list[str]:
 def _columns(about: dict[str, Any]) -> dict[str, pa.DataType]:
     """Return the name and type of every column, in order."""
     task, sensors = about["task"], len(about["positions"])
-    label = pa.float32() if task["kind"] == "direction" else pa.int8()
     columns = {"simulation": pa.int32(), "frame": pa.int32()}
-    columns |= dict.fromkeys(task["names"] if about["labelled"] else [], label)
+    if about["labelled"]:
+        cosines = 2 if task.get("direction") else 0  # recordings of old do not say
+        kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
+        columns |= dict(zip(task["names"], kinds, strict=True))
     names = _numbered("reading", sensors) + ["force"] * about["force"]
     if about["displacement"]:
         names += _numbered("D_s", sensors) + _numbered("D_t", sensors)

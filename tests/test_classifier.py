@@ -8,9 +8,8 @@ from hydra.utils import instantiate
 
 from skin.classifier import TouchClassifier, probabilities
 from skin.datamodule import TouchData
-from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
-from skin.labels import TOUCH, TOUCH_OR_NOT, Task
+from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 from skin.layout.scattered import Scattered
 from skin.recording import Touches
 from skin.representation.base import Frames
@@ -136,9 +135,25 @@ def test_exclusive_accuracy_counts_the_largest(monkeypatch):
     assert values["accuracy"].item() == 0.5
 
 
-def test_a_direction_is_refused():
-    with pytest.raises(InputError, match="direction"):
-        classifier(Task(("x", "y"), "direction"))
+def test_a_direction_is_learnt_as_mean_cosines():
+    """The least loss is where the answer is the mean of the labels; what has none pulls nowhere."""
+    network = classifier(TOUCH_SLIDING)
+    angle = torch.tensor([0.3, 0.9, 2.0, 0.0])
+    slides = torch.stack([angle.cos(), angle.sin()], 1) * torch.tensor([1.0, 1.0, 1.0, 0.0])[:, None]
+    labels = torch.cat([torch.tensor([[0.0, 1.0, 1.0, 0.0]]).repeat(4, 1), slides], dim=1)
+    logits = torch.zeros(6, requires_grad=True)
+    optimizer = torch.optim.LBFGS([logits], max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimizer.zero_grad()
+        # the four binary labels alone would run off to infinity
+        loss = network.loss(logits.expand(4, 6), labels) + 1e-3 * logits[:4].square().sum()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    said = probabilities(logits.detach()[None], TOUCH_SLIDING)[0]
+    torch.testing.assert_close(said[-2:], slides[:3].mean(dim=0), atol=1e-3, rtol=0)
 
 
 def test_a_summary_joins_the_embedding():

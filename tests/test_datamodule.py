@@ -5,8 +5,10 @@ from functools import partial
 import pytest
 import torch
 
+from skin.augmentation import Augmentation
 from skin.datamodule import TouchData
 from skin.errors import InputError
+from skin.labels import TOUCH_SLIDING
 from skin.recording import Touches
 from skin.representation.readings import Readings
 
@@ -118,3 +120,9 @@ def test_what_cannot_be_batched_is_refused(make):
     readings = torch.zeros(1, 6, 2)
     with pytest.raises(InputError, match="without labels"):
         make().frames(Touches(readings, readings == 0, torch.rand(2, 3), None, 10.0))
+
+
+def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made_up_device):
+    made_up_device.task = TOUCH_SLIDING
+    with pytest.raises(InputError, match=r"set data.augment.reverse=false"):
+        TouchData(made_up_device, Readings, augmentation=Augmentation(reverse=True))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.labels import TOUCH, TOUCH_OR_NOT, Task, Thresholds, measure, movie_labels
+from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task, Thresholds, measure, movie_labels, sliding
 
 CELL = (0.01, 0.02)
 # Two sensors on a sheet of 10 x 10 cells: one over a whole cell, one over four quarters.
@@ -112,3 +112,22 @@ def test_a_shut_gate_silences_the_other_labels():
 def test_a_gate_is_one_of_the_binary_labels(kind):
     with pytest.raises(ValueError, match="no gate"):
         Task(("poke", "touch"), kind, gate="touched" if kind == "binary" else "touch")
+
+
+def test_a_direction_is_from_the_first_place_to_the_last():
+    net = torch.tensor([[0.03, 0.04], [0.0, -0.02], [0.01, 0.0], [0.0099, 0.0], [0.0, 0.0]])
+    way = torch.tensor([0.05, 0.03, 0.02, 0.02, 0.0])
+    expected = torch.tensor([[0.6, 0.8], [0.0, -1.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    torch.testing.assert_close(sliding(net, way), expected)
+
+
+def test_a_touch_without_a_direction_counts_in_the_other_labels_only():
+    given = torch.tensor([[1.0, 1.0, 0.0, 1.0, 0.6, -0.8], [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
+    assert TOUCH_SLIDING.counts(given).tolist() == [[True] * 6, [True] * 4 + [False] * 2]
+    assert TOUCH_SLIDING.binary == TOUCH_SLIDING.gated == TOUCH.names
+    torch.testing.assert_close(TOUCH_SLIDING.shares(given)[0], torch.tensor([1.0, 1.0, 0.0, 1.0, 0.8, 0.1]))
+
+
+def test_a_direction_stands_behind_binary_labels():
+    with pytest.raises(ValueError, match="a direction stands behind binary labels"):
+        Task(("poke", "x", "y"), "exclusive", direction=True)

@@ -1,11 +1,13 @@
 """Metrics against scikit-learn and against counting."""
 
+import math
+
 import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
-from skin.labels import TOUCH, TOUCH_OR_NOT, Task
-from skin.metrics import confusion, metrics, recall_at
+from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
+from skin.metrics import angles, confusion, metrics, recall_at
 
 
 @pytest.fixture
@@ -79,3 +81,26 @@ def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
     counts = confusion(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
     assert counts.sum(dim=(1, 2)).tolist() == [int(touched.sum())] * 4 + [400]
     assert torch.equal(counts[:4], confusion(chances[touched], labels[touched, :4]))
+
+
+def test_angles_are_measured_on_touches_that_have_a_direction(scored):
+    chances, labels = scored
+    truth, error = torch.linspace(-3, 3, 400), torch.linspace(-4, 4, 400)
+    slides = torch.stack([truth.cos(), truth.sin()], dim=1)
+    slides[::3] = 0
+    said = 0.3 * torch.stack([(truth + error).cos(), (truth + error).sin()], dim=1)
+    found = metrics(torch.cat([chances, said], 1), torch.cat([labels, slides], 1), TOUCH_SLIDING, 0.02)
+    # The short way round; -3 + -4 and 3 + 4 pass behind the back.
+    sizes = [min(abs(one), 2 * math.pi - abs(one)) for n, one in enumerate(error.tolist()) if n % 3]
+    assert found["direction/degrees"] == pytest.approx(math.degrees(sum(sizes) / len(sizes)), rel=1e-5)
+    within = sum(size <= math.pi / 4 for size in sizes) / len(sizes)
+    assert found["direction/accuracy"] == pytest.approx(within)
+    alone = metrics(chances, labels, TOUCH, 0.02)
+    assert {name: found[name] for name in alone} == alone
+    assert len(found) == len(alone) + 2
+
+
+def test_saying_no_direction_is_as_wrong_as_a_blind_guess():
+    labels = torch.tensor([[1.0, 0.0]]).repeat(1, 3)[:, :6]
+    said = torch.zeros(1, 6)
+    assert angles(said, labels, TOUCH_SLIDING).tolist() == [90.0]

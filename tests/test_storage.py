@@ -61,8 +61,10 @@ def variants() -> dict[str, Recording]:
         "unlabelled": replace(full, touches=replace(full.touches, labels=None)),
         "direction": replace(
             full,
-            task=Task(("cos", "sin"), "direction"),
-            touches=replace(full.touches, labels=torch.rand(BATCH, 2) - 0.5),
+            task=Task(("dynamic", "cos", "sin"), direction=True),
+            touches=replace(
+                full.touches, labels=torch.cat([torch.rand(BATCH, 1).round(), torch.rand(BATCH, 2) - 0.5], 1)
+            ),
         ),
     }
 
@@ -154,3 +156,13 @@ def test_other_units_are_refused(tmp_path):
     beside.write_text(beside.read_text().replace('"reading": "N"', '"reading": "kgf"'))
     with pytest.raises(InputError, match=r"has the units .*kgf"):
         read(path)
+
+
+def test_recordings_from_before_directions_are_read(tmp_path):
+    kept = recording()
+    path = write(kept, tmp_path / "x.csv")
+    beside = path.with_name("x.csv.json")
+    about = json.loads(beside.read_text())
+    del about["task"]["direction"]
+    beside.write_text(json.dumps(about))
+    assert same(read(path), kept)

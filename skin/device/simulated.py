@@ -11,17 +11,18 @@ from skin import __version__
 from skin.body.base import AbstractBody
 from skin.device._threads import in_threads
 from skin.device._tracking import tracker
+from skin.device._truth import true_readings, true_sensors
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.imperfection import Imperfection
-from skin.labels import TOUCH, TOUCH_OR_NOT
+from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout, Sensors
 from skin.recording import Recording, Touches, join
 from skin.simulator.base import AbstractSimulator
 from skin.streams import Stream, generator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
-from skin.touch.sampler import Movie, TouchSampler, balanced
+from skin.touch.sampler import TouchSampler, balanced
 from skin.touch.stream import Strip, draw_timeline, touched
 
 __all__ = ["Simulated"]
@@ -47,6 +48,7 @@ class Simulated(AbstractDevice):
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
         stream: touches are windows of streams of gestures with idle gaps between them: a window shows part
             of a gesture, a whole one or none, and has the label ``touch`` too. Each split has its own.
+        direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
         gain_spread, offset, noise, ... quantum: as in :class:`skin.imperfection.Imperfection`.
@@ -70,6 +72,7 @@ class Simulated(AbstractDevice):
     padded: bool = True
     fresh: bool = False
     stream: bool = False
+    direction: bool = False
     data_seed: int = 0
     seed: int = 0
     gain_spread: float = 0.05
@@ -94,9 +97,15 @@ class Simulated(AbstractDevice):
         for name, least in (("gestures", 10), ("test_gestures", 1), ("position_error", 0)):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
+        if self.stream and self.direction:
+            raise InputError(
+                "a window of a stream shows a part of a path, not where the whole leads: give either "
+                "data.direction=true or data.stream=true"
+            )
+        self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
+        self.size = self.body.size
         self.sensors = self.layout.sensors(self.body)
-        true = self._true_sensors()
+        true = true_sensors(self)
         self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded)
         self.window = self.sampler.settings.window
         self.model = self.simulator(self.body, true)
@@ -107,12 +116,6 @@ class Simulated(AbstractDevice):
         self.constants = self.imperfection.constants(len(self.sensors), drawn)
         self.tracker = tracker(self.track, self)
         self._kept: dict[str, Recording] = {}
-
-    def _true_sensors(self) -> Sensors:
-        moves = generator(Stream.POSITION, self.seed).standard_normal((len(self.sensors), 2))
-        positions = self.sensors.positions.copy()
-        positions[:, :2] = np.clip(positions[:, :2] + self.position_error * moves, 0, self.size)
-        return replace(self.sensors, positions=positions)
 
     def replace(self, **changes: Any) -> "Simulated":
         """Return a device with other settings, such as ``seed=3`` for another device of the same kind."""
@@ -180,7 +183,8 @@ class Simulated(AbstractDevice):
     @torch.no_grad()
     def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
         movie = self.sampler.sample(len(wanted), generator(stream, *key), wanted)
-        return self._felt(self._true(movie, complete), generator(Stream.NOISE, self.seed, stream, *key))
+        true = true_readings(self, movie, complete)
+        return self._felt(true, generator(Stream.NOISE, self.seed, stream, *key))
 
     @torch.no_grad()
     def _windows(self, part: slice, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
@@ -190,7 +194,7 @@ class Simulated(AbstractDevice):
         starts = np.cumsum(draw.integers(*settings.stride, count, endpoint=True)) - settings.stride[0]
         length = int(starts[-1]) + self.window
         timeline = draw_timeline(self.sampler, length, settings.gap, draw)
-        true = Strip.of(timeline, self._true(timeline.movie, complete))
+        true = Strip.of(timeline, true_readings(self, timeline.movie, complete))
         if self.randomise:
             return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
         return self._felt_strip(true, noise).cut(torch.from_numpy(starts), self.window)
@@ -208,7 +212,7 @@ class Simulated(AbstractDevice):
             return self.replace(randomise=False).strip(frames, gap, number)
         key = Stream.TEST, 1, number
         timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
-        true = Strip.of(timeline, self._true(timeline.movie, complete=False))
+        true = Strip.of(timeline, true_readings(self, timeline.movie, complete=False))
         return self._felt_strip(true, generator(Stream.NOISE, self.seed, *key))
 
     def _felt_strip(self, true: Strip, noise: np.random.Generator) -> Strip:
@@ -225,16 +229,6 @@ class Simulated(AbstractDevice):
         clipped = {"clipped": self.imperfection.clipped(force, constants).float()}
         touches = replace(true.touches, readings=readings, valid=valid)
         return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
-
-    def _true(self, movie: Movie, complete: bool) -> Recording:
-        """Return the readings of gestures before any imperfection."""
-        readings, displacement = movie.respond(self.model, displacement=complete)
-        positions = torch.from_numpy(self.sensors.positions).float()
-        valid = torch.ones_like(readings, dtype=torch.bool)
-        motion = self.tracker.known(movie)
-        touches = Touches(readings, valid, positions, movie.labels, float(self.rate), motion)
-        about = TOUCH, self.size, self.sensors.footprint
-        return Recording(touches, *about, movie.force, displacement, movie.parameters)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
         return {

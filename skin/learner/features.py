@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostingRegressor
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from skin.bearing import bearings
 from skin.errors import InputError
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
@@ -28,7 +29,8 @@ class Features(AbstractLearner):
     """Measures about 130 numbers on a touch and boosts decision trees on them, one ensemble per label.
 
     What a practitioner would try first; a network that does not beat it is not worth its cost. The
-    measurements know no sensor by number, so it takes any layout.
+    measurements know no sensor by number, so it takes any layout. Where the task has a direction, signed
+    measurements (:mod:`skin.bearing`) join them, and trees of least squares learn its cosines.
 
     Args:
         rounds: most trees per label; fewer if the validation loss stops falling.
@@ -48,7 +50,7 @@ class Features(AbstractLearner):
             "early_stopping": True,
         }
         self._fitted: dict[str, np.ndarray] | None = None
-        self._models: list[HistGradientBoostingClassifier] = []
+        self._models: list[HistGradientBoostingClassifier | HistGradientBoostingRegressor] = []
         self._task: Task | None = None
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
@@ -58,15 +60,15 @@ class Features(AbstractLearner):
             touches = data.touches(split)
             if touches.labels is None:
                 raise InputError("touches without labels cannot be learnt from: record them with labels")
-            table |= {split: _matrix(touches), f"{split}_labels": touches.labels.cpu().numpy()}
+            table |= {split: _matrix(touches, data.task), f"{split}_labels": touches.labels.cpu().numpy()}
         self._grow(table, data.task)
 
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L), for touches of any layout."""
+        """Return the probability of each label, (B, L), for touches of any layout; of a direction cosines."""
         if self._task is None:
             raise RuntimeError("fit or load the learner first")
-        matrix = _matrix(touches)
-        columns = [model.predict_proba(matrix)[:, 1] for model in self._models]
+        matrix = _matrix(touches, self._task)
+        columns = [_told(model, matrix) for model in self._models]
         result = torch.from_numpy(np.stack(columns, axis=1)).to(torch.float32)
         return result / result.sum(dim=1, keepdim=True) if self._task.kind == "exclusive" else result
 
@@ -84,6 +86,9 @@ class Features(AbstractLearner):
     def load(self, data: "TouchData", path: Path) -> None:
         """Grow the trees again from what ``save`` wrote; takes some seconds."""
         with np.load(path, allow_pickle=False) as table:
+            if table["train_labels"].shape[1] != len(data.task):
+                known = table["train_labels"].shape[1]
+                raise RuntimeError(f"it has learnt {known} labels, not {', '.join(data.task.names)}")
             self._grow(dict(table), data.task)
 
     def _grow(self, table: dict[str, np.ndarray], task: Task) -> None:
@@ -99,7 +104,8 @@ class Features(AbstractLearner):
             truth = table["train_labels"][rows, label]
             if len(np.unique(truth)) < 2:
                 raise InputError(f"all training touches have the same label {name}: give more touches")
-            model = HistGradientBoostingClassifier(**self._settings)
+            kind = HistGradientBoostingClassifier if name in task.binary else HistGradientBoostingRegressor
+            model = kind(**self._settings)
             validation = {
                 "X_val": table["validation"][held],
                 "y_val": table["validation_labels"][held, label],
@@ -113,7 +119,17 @@ class Features(AbstractLearner):
         self.parameters = sum(tree.get_n_leaf_nodes() for tree in trees)
 
 
-def _matrix(touches: Touches) -> np.ndarray:
+def _told(
+    model: HistGradientBoostingClassifier | HistGradientBoostingRegressor, matrix: np.ndarray
+) -> np.ndarray:
+    """Return the probability (B,) that trees give, or the cosine."""
+    if isinstance(model, HistGradientBoostingRegressor):
+        return model.predict(matrix).clip(-1, 1)
+    return model.predict_proba(matrix)[:, 1]
+
+
+def _matrix(touches: Touches, task: Task) -> np.ndarray:
     """Return the measurements as (B, D), float32."""
-    columns = measurements(touches.to("cpu")).values()
-    return torch.stack([column.to(torch.float32) for column in columns], dim=1).numpy()
+    here = touches.to("cpu")
+    columns = measurements(here) | (bearings(here) if task.direction else {})
+    return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()

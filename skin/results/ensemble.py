@@ -62,9 +62,15 @@ class _Known:
 
 
 def decisions(chances: Tensor, task: Task) -> Tensor:
-    """Return what members decide, (M, B, L), 0 or 1, from their probabilities (M, B, L)."""
+    """Return what members decide, (M, B, L), 0 or 1, from their probabilities (M, B, L).
+
+    Of a direction, cosines of length 1.
+    """
     if task.kind == "exclusive":
         return torch.nn.functional.one_hot(chances.argmax(-1), chances.shape[-1]).float()
+    if task.direction:
+        whole = torch.nn.functional.normalize(chances[..., -2:], dim=-1)
+        return torch.cat([(chances[..., :-2] > 0.5).float(), whole], dim=-1)
     return (chances > 0.5).float()
 
 
@@ -82,10 +88,13 @@ def average(chances: Tensor, task: Task) -> Tensor:
 
 
 def disagreement(chances: Tensor, task: Task) -> dict[str, float]:
-    """Return the shares of touches on which members (M, B, L) differ: per label, and ``any`` of them."""
-    decided = decisions(chances, task)
+    """Return the shares of touches on which members (M, B, L) differ: per label, and ``any`` of them.
+
+    A direction is left out: no two members say the same.
+    """
+    decided = decisions(chances, task)[..., : len(task.binary)]
     differs = decided.amax(0) != decided.amin(0)
-    shares = dict(zip(task.names, differs.float().mean(0).tolist(), strict=True))
+    shares = dict(zip(task.binary, differs.float().mean(0).tolist(), strict=True))
     return shares | {"any": float(differs.any(1).float().mean())}
 
 

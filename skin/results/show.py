@@ -14,7 +14,7 @@ _WIDEST = 200
 
 
 def report(found: Report, title: str, console: Console | None = None) -> None:
-    """Print one line per label and one column per set of touches, accuracies in per cent.
+    """Print one line per label and one column per set of touches, accuracies in per cent, errors in degrees.
 
     Args:
         found: what an evaluation found.
@@ -24,12 +24,13 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
     console = console or Console()
     columns = list(dict.fromkeys(name.split("/")[0] for name in found.metrics))
     lines = dict.fromkeys(
-        name.split("/", 1)[1] for name in found.metrics if name.endswith(("/accuracy", "/recall"))
+        name.split("/", 1)[1] for name in found.metrics if name.endswith(("/accuracy", "/recall", "/degrees"))
     )
     table = Table("", *columns, title=title)
     for line in lines:
-        shares = (found.metrics.get(f"{column}/{line}") for column in columns)
-        table.add_row(line, *("" if share is None else f"{100 * share:.1f}" for share in shares))
+        values = (found.metrics.get(f"{column}/{line}") for column in columns)
+        unit = 1 if line.endswith("/degrees") else 100
+        table.add_row(line, *("" if value is None else f"{unit * value:.1f}" for value in values))
     console.print(table)
     for column, reason in found.cannot.items():
         console.print(f"{column}: {reason}", markup=False)

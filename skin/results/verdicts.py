@@ -1,5 +1,7 @@
 """What an evaluation found, as a page and its matrices; verdicts where nobody knows the truth."""
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,9 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
         if row.endswith(("/accuracy", "/recall")):
             shares = (found.metrics.get(f"{column}/{row}") for column in columns)
             lines.append(f"| {row} | {' | '.join('' if x is None else f'{100 * x:.1f}' for x in shares)} |")
+        if row.endswith("/degrees"):
+            sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
+            lines.append(f"| {row} | {' | '.join('' if x is None else f'{x:.1f}°' for x in sizes)} |")
     lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
     if found.confusion is not None:
         lines += [
@@ -38,7 +43,7 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
             "| label | no, said no | no, said yes | yes, said no | yes, said yes |",
             "|---" * 5 + "|",
         ]
-        for name, counts in zip(task.names, found.confusion.numpy().astype(int), strict=True):
+        for name, counts in zip(task.binary, found.confusion.numpy().astype(int), strict=True):
             lines.append(f"| {name} | {' | '.join(map(str, counts.ravel().tolist()))} |")
     return "\n".join(lines) + "\n"
 
@@ -47,7 +52,7 @@ def publish(path: Path, found: Report, task: Task, title: str, about: str) -> li
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
     written = [whole(page(found, task, title, about), path)]
     if found.confusion is not None:
-        named = dict(zip(task.names, found.confusion.numpy(), strict=True))
+        named = dict(zip(task.binary, found.confusion.numpy(), strict=True))
         written.append(save(confusions(named, ("no", "yes")), path.with_suffix(".png")))
     return written
 
@@ -56,7 +61,7 @@ def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
     """Write the probability of each label, gesture by gesture, where nobody knows the truth.
 
     Args:
-        chances: (B, L).
+        chances: (B, L); of a direction the mean cosines.
         task: the labels.
         path: x.csv.
 
@@ -73,11 +78,19 @@ def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
         f"gesture {number}: "
         + ", ".join(
             f"{'' if chance > 0.5 else 'not '}{name} ({chance:.2f})"
-            for name, chance in zip(task.names, row, strict=True)
+            for name, chance in zip(task.binary, row, strict=False)
         )
+        + (_slide(row, task) if task.direction else "")
         for number, row in enumerate(chances.tolist())
     ]
     return "\n".join(said), path
+
+
+def _slide(row: Sequence[float], task: Task) -> str:
+    """Return where a touch slides that is said to be dynamic: 0° along x, 90° along y."""
+    if row[task.names.index("dynamic")] <= 0.5:
+        return ""
+    return f", sliding towards {math.degrees(math.atan2(row[-1], row[-2])):.0f}°"
 
 
 def whole(text: str, path: Path) -> Path:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.labels import TOUCH, measure
+from skin.labels import TOUCH, measure, sliding
 from skin.simulator.base import AbstractSimulator, Response
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, fold, heading
 from skin.touch.shapes import Shapes
@@ -19,18 +19,8 @@ __all__ = ["Movie", "TouchSampler", "balanced", "join"]
 
 _ATTEMPTS = 50
 _AHEAD = 64
-_PARAMETERS = (
-    "shape",
-    "angle",
-    "duration",
-    "onset",
-    "direction",
-    "speed",
-    "peak",
-    "force",
-    "area",
-    "draws",
-)
+_DRAWN = ("shape", "angle", "duration", "onset", "direction", "speed", "peak")
+_FOUND = ("force", "area", "draws", "net_x", "net_y")
 
 
 @dataclass(frozen=True)
@@ -44,7 +34,8 @@ class Movie:
         labels: (B, 4), 0 or 1, float32, in the order of ``skin.labels.TOUCH``.
         parameters: (B,) each: shape (index), angle (rad), duration and onset (frames), direction (rad), speed
             (m per frame), peak (highest cell pressure, Pa), force (N, all cells at full force), area (largest
-            share of the sheet in contact), draws (how many were drawn until one had the wanted labels).
+            share of the sheet in contact), draws (how many were drawn until one had the wanted labels), net_x
+            and net_y (m, from the first place of the path to its last).
         drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
             times the direction of motion, 0 where nothing slides; None: no friction.
     """
@@ -77,6 +68,13 @@ class Movie:
     def force(self) -> Tensor:
         """Applied force, (B, T), N."""
         return self.parameters["force"][:, None] * self.scale
+
+    @property
+    def slides(self) -> Tensor:
+        """Cosines of the directions in which touches slide, (B, 2), as ``skin.labels.sliding`` gives them."""
+        known = self.parameters
+        net = torch.stack([known["net_x"], known["net_y"]], dim=1)
+        return sliding(net, known["speed"] * (known["duration"] - 1))
 
     def pressure(self) -> Tensor:
         """Return the dense movie, (B, T, H, W), Pa."""
@@ -228,8 +226,10 @@ class TouchSampler:
         force = gestures["peak"] * cell / highest
         frames *= torch.from_numpy(force / cell).float()[torch.from_numpy(owner), None, None]
         measures = measure(frames, shown, shares, self.footprints, body.cell, settings.thresholds.contact)
-        parameters = gestures | {"force": force, "area": measures.area.numpy()}
-        known = {name: torch.from_numpy(parameters[name]).float() for name in _PARAMETERS}
+        net = way[first + counts - 1] - way[first]
+        found = dict(zip(_FOUND, (force, measures.area.numpy(), gestures["draws"], *net.T), strict=True))
+        parameters = {name: gestures[name] for name in _DRAWN} | found
+        known = {name: torch.from_numpy(values).float() for name, values in parameters.items()}
         drag = torch.from_numpy(settings.shear * heading(way, first)).float() if settings.shear else None
         return Movie(frames, shown, shares, measures.labels(settings.thresholds), known, drag)
 

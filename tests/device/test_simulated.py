@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
+from skin.device._truth import true_sensors
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.labels import movie_labels
@@ -116,7 +117,7 @@ def test_position_error_moves_the_sensors_and_not_what_is_reported(plain):
     moved = device(position_error=0.005, **PERFECT)
     assert torch.equal(moved.touches("test").positions, plain.touches("test").positions)
     assert not torch.equal(moved.touches("test").readings, device(**PERFECT).touches("test").readings)
-    true = device(position_error=0.05)._true_sensors().positions
+    true = true_sensors(device(position_error=0.05)).positions
     assert (true >= 0).all()
     assert (true[:, :2] <= BODY.size).all()
 
@@ -172,3 +173,23 @@ def test_bad_settings_are_refused(changes, message):
 def test_friction_that_nothing_feels_is_refused_at_the_door():
     with pytest.raises(InputError, match=r"got simulator=naive: set simulator=solid, or touch.shear=0"):
         device(touch={"shear": 0.5})
+
+
+def test_the_direction_of_sliding_is_a_label_that_changes_nothing_else(plain):
+    sliding = device(direction=True)
+    for split in ("train", "test"):
+        one, other = plain.touches(split), sliding.touches(split)
+        assert torch.equal(one.readings, other.readings)
+        assert torch.equal(one.labels, other.labels[:, :4])
+        assert sliding.task.counts(other.labels)[:, -1].any()
+    known = sliding.recording("test")
+    assert known.task.names[-2:] == ("slide_x", "slide_y")
+    slides = known.touches.labels[:, -2:]
+    net = torch.stack([known.parameters["net_x"], known.parameters["net_y"]], dim=1)
+    some = (slides != 0).any(dim=1)
+    torch.testing.assert_close(slides[some], torch.nn.functional.normalize(net[some], dim=1))
+
+
+def test_a_stream_tells_no_direction():
+    with pytest.raises(InputError, match=r"give either data.direction=true or data.stream=true"):
+        device(direction=True, stream=True)

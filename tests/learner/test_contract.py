@@ -8,6 +8,11 @@ import torch
 from hydra.utils import instantiate
 
 from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.labels import TOUCH_SLIDING
+from skin.learner.rules import Rules
+from skin.metrics import metrics
+from skin.recording import Touches
 
 OPTIONS = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "learner").glob("*.yaml"))
 CHEAP = {
@@ -103,3 +108,47 @@ def test_nothing_is_told_before_it_has_learnt(made, tmp_path):
         make().probabilities(device.touches("test"))
     with pytest.raises(RuntimeError, match="fit or load"):
         make().save(tmp_path)
+
+
+class Sliding:
+    """Yields bumps that slide over 16 sensors, 6 mm a frame, every way; each fourth one goes nowhere."""
+
+    task, size, rate = TOUCH_SLIDING, (0.16, 0.16), 10.0
+
+    def touches(self, split: str, epoch: int = 0) -> Touches:
+        """Return 320 touches to train on, 80 else."""
+        generator = torch.Generator().manual_seed(sum(map(ord, split)))
+        count = 320 if split == "train" else 80
+        angle = 2 * torch.pi * torch.rand(count, generator=generator)
+        goes = (torch.arange(count) % 4 > 0).float()
+        cosines = torch.stack([angle.cos(), angle.sin()], dim=1) * goes[:, None]
+        places = torch.cartesian_prod(torch.linspace(0.02, 0.14, 4), torch.linspace(0.02, 0.14, 4))
+        middle = 0.08 + 0.02 * torch.randn(count, 1, 2, generator=generator)
+        way = middle + 0.006 * (torch.arange(10) - 4.5)[:, None] * cosines[:, None]
+        readings = 3 * torch.exp(-((torch.cdist(way, places[None]) / 0.03) ** 2))
+        readings[:, :2] = readings[:, -2:] = 0
+        labels = torch.rand(count, 4, generator=generator).round()
+        labels[:, 1] = goes
+        positions = torch.cat([places, torch.full((16, 1), 0.005)], dim=1)
+        labels = torch.cat([labels, cosines], dim=1)
+        return Touches(readings, torch.ones_like(readings, dtype=torch.bool), positions, labels, self.rate)
+
+
+def test_a_direction_is_learnt_or_refused_by_name(made, configured, tmp_path):
+    device = Sliding()
+    learner = made[0]()
+    data = TouchData(device, instantiate(configured("representation=readings").representation), 32)
+    if isinstance(learner, Rules):
+        with pytest.raises(InputError, match=r"got big, .*slide_x, slide_y: use learner=features"):
+            learner.fit(data)
+        return
+    learner.fit(data)
+    touches = device.touches("test")
+    result = learner.probabilities(touches)
+    assert result.shape == (80, 6)
+    found = metrics(result, touches.labels, device.task, 0.02)
+    assert found["direction/degrees"] < 30
+    assert found["direction/accuracy"] > 0.8
+    other = made[0]()
+    other.load(data, learner.save(tmp_path))
+    assert torch.equal(other.probabilities(touches), result)

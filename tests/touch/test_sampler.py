@@ -232,3 +232,31 @@ def test_rows_and_joined_movies_keep_their_drag():
     rows = torch.tensor([5, 2, 19])
     for part in (movie[rows], join([movie[rows[:1]], movie[rows[1:]]])):
         assert torch.equal(part.drag[part.index], movie.drag[movie.index[rows]])
+
+
+def test_net_is_from_the_first_place_to_the_last(sampled):
+    """The centre of pressure of a rigid shape moves as its place does; cells of 5 to 8 mm blur it."""
+    source, movie, _ = sampled
+    x, y = (
+        (torch.arange(count) + 0.5) * cell
+        for count, cell in zip(source.body.cells, source.body.cell, strict=True)
+    )
+    moved = []
+    for index, scale in zip(movie.index, movie.scale, strict=True):
+        ends = movie.frames[index[scale > 0][[0, -1]]].double()
+        total = ends.sum((1, 2))
+        centre = torch.stack([(ends.sum(1) * x).sum(1), (ends.sum(2) * y).sum(1)], 1) / total[:, None]
+        moved.append(centre[1] - centre[0])
+    net = torch.stack([movie.parameters["net_x"], movie.parameters["net_y"]], dim=1)
+    torch.testing.assert_close(net, torch.stack(moved).float(), atol=2e-3, rtol=0)
+
+
+def test_slides_have_a_direction_unless_they_go_to_and_fro(sampled):
+    _, movie, _ = sampled
+    length = torch.linalg.vector_norm(movie.slides, dim=1)
+    dynamic = movie.labels[:, 1] == 1
+    assert (length[~dynamic] == 0).all()
+    known = movie.parameters
+    straight = torch.hypot(known["net_x"], known["net_y"]) >= 0.5 * known["speed"] * (known["duration"] - 1)
+    torch.testing.assert_close(length[dynamic], straight[dynamic].float())
+    assert 0.3 < length[dynamic].mean() < 0.9

@@ -1,0 +1,46 @@
+"""What is true of a simulated device, before any imperfection: where its sensors are and what they read."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from skin.labels import TOUCH
+from skin.layout.base import Sensors
+from skin.recording import Recording, Touches
+from skin.streams import Stream, generator
+from skin.touch.sampler import Movie
+
+if TYPE_CHECKING:
+    from skin.device.simulated import Simulated
+
+__all__ = ["true_readings", "true_sensors"]
+
+
+def true_sensors(device: "Simulated") -> Sensors:
+    """Return the sensors where they are, which is not quite where touches say."""
+    moves = generator(Stream.POSITION, device.seed).standard_normal((len(device.sensors), 2))
+    positions = device.sensors.positions.copy()
+    positions[:, :2] = np.clip(positions[:, :2] + device.position_error * moves, 0, device.size)
+    return replace(device.sensors, positions=positions)
+
+
+def true_readings(device: "Simulated", movie: Movie, complete: bool) -> Recording:
+    """Return gestures as perfect sensors read them.
+
+    Args:
+        device: its body, sensors, simulator and labels.
+        movie: of the gestures.
+        complete: with the displacements.
+    """
+    readings, displacement = movie.respond(device.model, displacement=complete)
+    positions = torch.from_numpy(device.sensors.positions).float()
+    valid = torch.ones_like(readings, dtype=torch.bool)
+    labels = torch.cat([movie.labels, movie.slides], dim=1) if device.direction else movie.labels
+    motion = device.tracker.known(movie)
+    touches = Touches(readings, valid, positions, labels, float(device.rate), motion)
+    # A stream's windows have labels of their own.
+    task = TOUCH if device.stream else device.task
+    about = task, device.size, device.sensors.footprint
+    return Recording(touches, *about, movie.force, displacement, movie.parameters)

@@ -8,9 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from omegaconf import DictConfig
-
-from skin.config import command, plain
+from skin.config import DictConfig, command, plain
 from skin.errors import InputError
 
 

@@ -7,9 +7,7 @@ experiments/calibrate.py session=demo.csv calibrate.demo=true makes a session.
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
-from skin.config import ROOT, command, plain
+from skin.config import ROOT, DictConfig, command, plain
 from skin.errors import InputError
 
 if TYPE_CHECKING:

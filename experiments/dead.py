@@ -7,9 +7,7 @@ python experiments/train.py -m experiment=temporal_graph row=dead representation
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
-from skin.config import ROOT, command, plain
+from skin.config import ROOT, DictConfig, command, plain
 
 
 @command("dead")

@@ -3,10 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
-from skin.config import ROOT, command, plain
+from skin.config import ROOT, DictConfig, command, overrides, plain
 from skin.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,8 +61,8 @@ def _encoder(config: DictConfig) -> tuple[DictConfig, "Network"]:
     quiet()
     store = Store.open(config.tracking)
     run = find(store, config.run)
-    overrides = [one for one in HydraConfig.get().overrides.task if not one.startswith("embeddings.")]
-    config = changed(configuration(store, run), config, overrides)
+    given = [one for one in overrides() if not one.startswith("embeddings.")]
+    config = changed(configuration(store, run), config, given)
     learner = build_learner(config)
     if not isinstance(learner, Network):
         raise InputError(

@@ -7,9 +7,7 @@ import signal
 from contextlib import suppress
 from types import FrameType
 
-from omegaconf import DictConfig
-
-from skin.config import command, plain
+from skin.config import DictConfig, command, plain
 from skin.errors import InputError
 
 _FORMATS = ("text", "binary")

@@ -6,10 +6,7 @@ Writes evaluation_<device>.md and .png into out=, and an MLflow run of its own.
 
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
-from skin.config import ROOT, command
+from skin.config import ROOT, DictConfig, command, overrides
 
 
 @command("evaluate")
@@ -28,8 +25,8 @@ def main(config: DictConfig) -> None:
     quiet()
     store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
     run = find(store, config.run)
-    overrides = list(HydraConfig.get().overrides.task)
-    config = changed(configuration(store, run), config, overrides)
+    given = overrides()
+    config = changed(configuration(store, run), config, given)
     device, learner = build_device(config), build_learner(config)
     shapes = device.blank() if isinstance(device, Serial) else device
     restore(store, run, learner, build_data(config, shapes))
@@ -37,7 +34,7 @@ def main(config: DictConfig) -> None:
         device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     name = f"evaluation_{config.device['_target_'].split('.')[-2]}"
     title = f"{run.info.run_name} ({run.info.run_id})"
-    tags = {"evaluated": run.info.run_id, "overrides": " ".join(overrides)}
+    tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         if isinstance(device, Serial) and device.touches("test").labels is None:
             chances = learner.probabilities(device.touches("test"))
@@ -47,7 +44,7 @@ def main(config: DictConfig) -> None:
             return
         found = evaluate(learner, device, config.evaluation)
         conclude(store, evaluation, found, device.task, {})
-        about = f"Run {title}, evaluated with `{' '.join(overrides)}`, {len(found.predictions)} gestures."
+        about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
         written = publish(folder / f"{name}.md", found, device.task, run.info.run_name, about)
         for path in written:
             store.client.log_artifact(evaluation.info.run_id, str(path))

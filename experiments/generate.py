@@ -1,8 +1,6 @@
 """Write simulated touches to a file: python experiments/generate.py n=1000 out=touches.parquet"""
 
-from omegaconf import DictConfig, OmegaConf
-
-from skin.config import command, fingerprint, plain
+from skin.config import DictConfig, command, fingerprint, plain
 from skin.errors import InputError
 
 
@@ -16,11 +14,18 @@ def main(config: DictConfig) -> None:
 
     from dataclasses import replace
 
+    from omegaconf import OmegaConf
+
     from skin.build import build_device
+    from skin.device.recording import Recorded
+    from skin.device.simulated import Simulated
     from skin.storage import write
     from skin.summary import line
 
-    recording = build_device(config).recording()
+    device = build_device(config)
+    if not isinstance(device, Simulated | Recorded):
+        raise InputError("only simulated touches are generated: leave out device=")
+    recording = device.recording()
     # Where the touches go does not change them.
     source = OmegaConf.masked_copy(config, [key for key in config if key != "out"])
     about = {"config_hash": fingerprint(source), "config": plain(source)}

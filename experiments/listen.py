@@ -3,9 +3,7 @@
 import signal
 from contextlib import suppress
 
-from omegaconf import DictConfig
-
-from skin.config import command, plain
+from skin.config import DictConfig, command, plain
 from skin.errors import InputError
 
 _KEYS = ("baudrate", "format", "limits", "timeout")

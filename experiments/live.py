@@ -8,10 +8,7 @@ import sys
 from contextlib import ExitStack
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
-from skin.config import command, plain
+from skin.config import DictConfig, command, overrides, plain
 from skin.live.verdict import Patience
 
 
@@ -42,10 +39,10 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: Patience) -> None
     torch.set_num_threads(config.tracking.threads or 1)
     store, said = Store.open(config.tracking), Console(stderr=True)
     run = find(store, config.run)
-    stored, overrides = configuration(store, run), list(HydraConfig.get().overrides.task)
-    device = build_device(changed(stored, config, overrides))
+    stored, given = configuration(store, run), overrides()
+    device = build_device(changed(stored, config, given))
     # What it learned from stays, whatever is watched.
-    learnt = changed(stored, config, [one for one in overrides if not one.startswith(("device=", "device."))])
+    learnt = changed(stored, config, [one for one in given if not one.startswith(("device=", "device."))])
     said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
     of = start.trained(store, run, learnt)
     engine = start.engine(of, patience, live["touch"])

@@ -8,9 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from omegaconf import DictConfig
-
-from skin.config import command
+from skin.config import DictConfig, command
 from skin.errors import InputError
 
 

@@ -6,10 +6,7 @@ rows=all takes the newest finished runs of every row on simulator=, on whole tou
 
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
-from skin.config import ROOT, command, plain
+from skin.config import ROOT, DictConfig, command, overrides, plain
 from skin.course import Course
 
 
@@ -26,11 +23,9 @@ def main(config: DictConfig) -> None:
     quiet()
     store = Store.open(config.tracking)
     runs = newest(store, config.data.name, config.rows) if config.rows else [find(store, config.run)]
-    overrides = HydraConfig.get().overrides.task
+    given = overrides()
     for run in runs:
-        print(
-            try_run(store, run, config, course, overrides, ROOT / Path(config.out).expanduser()), flush=True
-        )
+        print(try_run(store, run, config, course, given, ROOT / Path(config.out).expanduser()), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,6 @@
 """Train one configuration, or a sweep of them with -m; every run is logged to MLflow."""
 
-from omegaconf import DictConfig
-
-from skin.config import command
+from skin.config import DictConfig, command
 
 
 @command()

@@ -3,6 +3,7 @@
 Only Hydra is imported here: ``--help`` and a mistyped key must not pay for torch.
 """
 
+from skin import interrupt  # isort: skip
 import hashlib
 import json
 import sys
@@ -14,15 +15,27 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, InstantiationException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from skin import __version__
 from skin.errors import InputError
+from skin.refusal import Refused, refusal, sentence
 
-__all__ = ["CONF", "ROOT", "Config", "checked", "command", "fingerprint", "plain"]
+__all__ = [
+    "CONF",
+    "ROOT",
+    "Config",
+    "DictConfig",
+    "checked",
+    "command",
+    "fingerprint",
+    "interrupt",
+    "overrides",
+    "plain",
+]
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
@@ -126,7 +139,7 @@ def checked(config: DictConfig) -> DictConfig:
     try:
         whole = OmegaConf.merge(OmegaConf.structured(Config), config)
     except OmegaConfBaseException as error:
-        raise InputError(_sentence(error)) from error
+        raise InputError(sentence(error)) from error
     assert isinstance(whole, DictConfig)
     OmegaConf.set_readonly(whole, True)
     return whole
@@ -141,7 +154,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
     try:
         return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
-        raise InputError(_sentence(error)) from error
+        raise InputError(sentence(error)) from error
 
 
 def fingerprint(config: DictConfig) -> str:
@@ -152,6 +165,11 @@ def fingerprint(config: DictConfig) -> str:
     files = {value: _digest(value) for value in _strings(content) if _file(value)}
     text = json.dumps([content, files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def overrides() -> list[str]:
+    """Return what the command line of a running command asks for."""
+    return list(HydraConfig.get().overrides.task)
 
 
 def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
@@ -172,10 +190,12 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             try:
                 return task(checked(config))
             except (HydraException, OmegaConfBaseException, InputError, TypeError) as error:
-                refusal = _refusal(error)
-                if refusal is None or HydraConfig.get().mode == RunMode.MULTIRUN:
-                    raise refusal or error from error
-                print(refusal, file=sys.stderr)
+                refused = refusal(error)
+                if refused is None:
+                    raise
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise Refused(str(refused)) from error
+                print(refused, file=sys.stderr)
                 sys.exit(2)
 
         composed = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(job)
@@ -194,28 +214,6 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         return main
 
     return decorate
-
-
-def _refusal(error: Exception) -> InputError | None:
-    """Return the sentence for a person, or None where the error is ours and deserves its traceback."""
-    if isinstance(error, InputError):
-        return error
-    cause = error.__cause__ if isinstance(error, InstantiationException) else None
-    if isinstance(cause, InputError):
-        return cause
-    reason = cause or error
-    if isinstance(reason, TypeError) and "argument" not in str(reason):
-        return None
-    if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
-        return None
-    return InputError(_sentence(reason))
-
-
-def _sentence(error: BaseException) -> str:
-    """Return what an error says, on one line; OmegaConf adds lines about its own objects."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    kept = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
-    return "; ".join(kept)
 
 
 def _strings(value: Any) -> Iterator[str]:

@@ -54,6 +54,7 @@ def train(config: DictConfig) -> bool:
         return False
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
+    learner.check(data)
     name = f"{config.row} {identity['simulator']} {config.seed}"
     with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)

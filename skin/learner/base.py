@@ -27,6 +27,9 @@ class AbstractLearner(ABC):
     parameters: int
     seconds_per_epoch: float
 
+    def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
+        """Raise InputError where it could not be fitted, before anything is logged."""
+
     @abstractmethod
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Learn from the training split of ``data``, choosing by its validation split only."""

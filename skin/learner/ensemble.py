@@ -47,6 +47,11 @@ class Ensemble(AbstractLearner):
             raise InputError("learner=ensemble has no member: set learner.copies.network=1 or more")
         self._members = [make(seed=1000 * seed + number) for number, make in enumerate(makers)]
 
+    def check(self, data: "TouchData") -> None:
+        """Ask every member."""
+        for member in self._members:
+            member.check(data)
+
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train one member after the other; the last one's training is logged."""
         for member in self._members[:-1]:

@@ -62,6 +62,11 @@ class Network(AbstractLearner):
         self._data: TouchData | None = None
         self._classifier: TouchClassifier | None = None
 
+    def check(self, data: "TouchData") -> None:
+        """Build the network for nothing: choices that do not fit, or missing weights, show at once."""
+        with torch.random.fork_rng():
+            self.build(data)
+
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train on the training split; validation chooses the epoch.
 

@@ -46,8 +46,9 @@ ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 
-reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke, SEEDS=3)
-	$(BIN)/python experiments/reproduce_table.py --budget $(BUDGET) --seeds $(SEEDS)
+reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
+	$(BIN)/python experiments/reproduce_table.py --budget $(BUDGET) --seeds $(SEEDS) \
+		$(if $(SIMULATORS),--simulators $(SIMULATORS))
 
 clean:  ## remove what the targets made, but keep results and runs
 	rm -rf $(VENV) $(PEERS) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

@@ -16,8 +16,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--budget", choices=BUDGETS, default="full")
     parser.add_argument("--seeds", type=_count, default=1, help="runs per row: seeds 0, 1, ...")
+    parser.add_argument("--simulators", help="such as solid, or naive,fem,solid; default: as the sweep says")
     arguments = parser.parse_args()
     overrides = [f"sweep={BUDGETS[arguments.budget]}", "seed=" + ",".join(map(str, range(arguments.seeds)))]
+    overrides += [f"simulator={arguments.simulators}"] if arguments.simulators else []
     code = _sweep(["-m", *overrides])
     missing = report(overrides, ROOT / "results" / ("" if arguments.budget == "full" else arguments.budget))
     sys.exit(code or (1 if missing else 0))
@@ -44,8 +46,9 @@ def report(overrides: list[str], folder: Path) -> int:
     write(as_csv(lines), folder / "table.csv")
     title = "Accuracy on the test gestures in per cent (the report's in brackets)"
     write(markdown(grid(lines), title), folder / "table.md")
-    skin = next(config for config in entries.rows if config.data.name == "fem")
-    pictures = [*draw_runs(cells, store, folder), *draw_skin(build_device(skin), folder)]
+    skin = {config.data.name: config for config in reversed(entries.rows)}
+    name = "fem" if "fem" in skin else simulators[-1]
+    pictures = [*draw_runs(cells, store, folder), *draw_skin(build_device(skin[name]), folder, name)]
     results(lines, title)
     print(f"{folder / 'table.md'}, {folder / 'table.csv'} and {len(pictures)} figures beside them")
     return sum(cell.missing for cell in cells)

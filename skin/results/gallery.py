@@ -48,8 +48,8 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
     return paths
 
 
-def draw_skin(device: Simulated, folder: Path) -> list[Path]:
-    """Draw figures 2, 3, 4, 10 and 11 from the gestures of a finite-element skin."""
+def draw_skin(device: Simulated, folder: Path, name: str = "fem") -> list[Path]:
+    """Draw figures 2, 3, 4, 10 and 11 from the gestures of a skin whose simulator has a name."""
     recording = device.recording("test")
     touches, drawn = recording.touches, recording.parameters
     assert touches.labels is not None
@@ -61,7 +61,7 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
 
     movie = device.sampler.sample(64, np.random.default_rng(0))
     chosen = int((movie.labels[:, 1:].all(1) & (movie.labels[:, 0] == 0)).nonzero()[0])
-    simulators = {"naive": Naive(device.body, device.sensors), "fem": device.model}
+    simulators = {"naive": Naive(device.body, device.sensors), name: device.model}
     readings = {name: movie.respond(model).readings[chosen] for name, model in simulators.items()}
 
     blurred = drawn["shape"] == device.sampler.shapes.names.index("blurred_disc")
@@ -72,7 +72,7 @@ def draw_skin(device: Simulated, folder: Path) -> list[Path]:
         _overview(device, folder),
         *_hand(device, folder),
         figures.save(image, folder / "figure04_interpolations.png"),
-        figures.save(figures.traces(readings, device.rate), folder / "figure10_naive_fem.png"),
+        figures.save(figures.traces(readings, device.rate), folder / f"figure10_naive_{name}.png"),
         figures.save(
             figures.force_and_reading(recording.force[four], touches.readings[four], device.rate),
             folder / "figure11_force_reading.png",

@@ -12,7 +12,7 @@ from skin.device.simulated import Simulated
 from skin.streams import Stream, generator
 from skin.touch.sampler import balanced
 
-__all__ = ["Converter", "Gesture", "gestures", "in_time"]
+__all__ = ["Converter", "Gesture", "alike", "gestures", "in_time"]
 
 _BATCH = 16  # every combination of the labels once
 _EDGE = 0.25  # of a frame, in which force rises and falls
@@ -25,10 +25,12 @@ class Gesture:
     Attributes:
         labels: name -> 0 or 1.
         force: true readings, (T, S), N, at the model's rate.
+        applied: what presses on the skin altogether, (T,), N.
     """
 
     labels: Mapping[str, int]
     force: np.ndarray
+    applied: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -69,14 +71,24 @@ def gestures(device: Simulated, seed: int = 0) -> Iterator[Gesture]:
             yield from ready
 
 
-@torch.no_grad()
+def alike(device: Simulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
+    """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``skin.labels.TOUCH``."""
+    return _drawn(device, labels, generator(Stream.TEST, 5, seed))
+
+
 def _batch(device: Simulated, seed: int, number: int) -> list[Gesture]:
     draw = generator(Stream.TEST, 2, seed, number)
-    movie = device.sampler.sample(_BATCH, draw, balanced(_BATCH, draw))
+    return _drawn(device, balanced(_BATCH, draw), draw)
+
+
+@torch.no_grad()
+def _drawn(device: Simulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
+    movie = device.sampler.sample(len(labels), draw, labels)
     readings = movie.respond(device.model, displacement=False).readings.double().numpy()
-    names, labels = device.task.names, movie.labels.int().tolist()
+    names, found, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
     return [
-        Gesture(dict(zip(names, row, strict=True)), one) for row, one in zip(labels, readings, strict=True)
+        Gesture(dict(zip(names, row, strict=True)), one, applied)
+        for row, one, applied in zip(found, readings, force, strict=True)
     ]
 
 

@@ -1,14 +1,16 @@
 """The same presses, simulated and recorded, side by side (report, figures 11 and 12)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from skin.calibration.bench import Bench
+from skin.calibration import gauge, session
+from skin.calibration.bench import Bench, bench
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.recording import Touches
@@ -16,7 +18,7 @@ from skin.results.figures import save
 from skin.session.reduction import highest
 from skin.streams import Stream, generator
 
-__all__ = ["Comparison", "Press", "compare", "figure", "page", "touches"]
+__all__ = ["Comparison", "Press", "Verdicts", "agreement", "compare", "figure", "page", "read", "touches"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,59 @@ class Comparison:
     presses: Sequence[Press]
 
 
+@dataclass(frozen=True)
+class Verdicts:
+    """What a run says of both sides.
+
+    Attributes:
+        names: of the labels.
+        simulated, recorded: (B, L), bool.
+        truth: (B, L), bool; None where nobody knows.
+    """
+
+    names: Sequence[str]
+    simulated: np.ndarray
+    recorded: np.ndarray
+    truth: np.ndarray | None = None
+
+
+def agreement(verdicts: Verdicts | None, things: str) -> list[str]:
+    """Return lines on how often a run says the same of both sides, and how often what is true."""
+    if verdicts is None:
+        return []
+    lines = []
+    for number, name in enumerate(verdicts.names):
+        sides = verdicts.simulated[:, number], verdicts.recorded[:, number]
+        same = int((sides[0] == sides[1]).sum())
+        line = f"- the run says the same of `{name}` on {same} of {len(sides[0])} {things}"
+        if verdicts.truth is not None:
+            right = [int((side == verdicts.truth[:, number]).sum()) for side in sides]
+            line += f", and is right on {right[0]} simulated and {right[1]} recorded ones"
+        lines.append(line)
+    return lines
+
+
+def read(device: Simulated, path: str, presses: str | None, settings: Mapping[str, Any]) -> "Comparison":
+    """Return the presses of a session beside their simulation.
+
+    Args:
+        device: as in :func:`compare`.
+        path: of the session.
+        presses: the gauge's file; None: in the session.
+        settings: ``conf/compare.yaml`` under ``compare``.
+
+    Raises:
+        InputError: files that cannot be used, or that do not fit each other.
+    """
+    shape = settings["indenter"], settings["radius"]
+    said = session.read(path, *shape, settings["unit"])
+    rows = None if presses is None else gauge.read(presses, *shape, settings["delay"])
+    found = compare(device, bench(device, said, rows), settings["scale"])
+    if not found.presses:
+        raise InputError("no press has frames in the session: check the clocks, see compare.delay")
+    return found
+
+
 def compare(device: Simulated, bench: Bench, scale: float | None) -> Comparison:
     """Simulate a session's presses on a device, and compare reading by reading.
 
@@ -70,19 +125,19 @@ def compare(device: Simulated, bench: Bench, scale: float | None) -> Comparison:
     Raises:
         InputError: nobody knows what a count is worth.
     """
-    session, known = bench.session, device.imperfection.calibration
-    if scale is None and known is not None and session.unit != "N":
+    said, known = bench.session, device.imperfection.calibration
+    if scale is None and known is not None and said.unit != "N":
         scale = known.scale
-    if scale is None and session.unit != "N":
+    if scale is None and said.unit != "N":
         raise InputError(
             "the session is in counts: give device.calibration=FILE.yaml, or compare.scale=0.039"
         )
     noise = generator(Stream.NOISE, device.seed, Stream.TEST, 4)
-    true, time = torch.from_numpy(bench.true)[None].float(), torch.from_numpy(session.time).float()
-    said = device.imperfection.raw(true, device.constants, noise, time)[0].double().numpy()
-    recorded = session.raw * (1.0 if scale is None else scale)
+    true, time = torch.from_numpy(bench.true)[None].float(), torch.from_numpy(said.time).float()
+    felt = device.imperfection.raw(true, device.constants, noise, time)[0].double().numpy()
+    recorded = said.raw * (1.0 if scale is None else scale)
     idle = bench.idle
-    simulated, recorded = (values - np.nanmedian(values[idle], axis=0) for values in (said, recorded))
+    simulated, recorded = (values - np.nanmedian(values[idle], axis=0) for values in (felt, recorded))
     valid = ~device.constants.dead.numpy() & np.isfinite(recorded[idle]).any(axis=0)
     found = Comparison(bench, simulated, recorded, valid, [])
     presses = [_press(found, number) for number in range(len(bench.gauge))]
@@ -119,12 +174,12 @@ def touches(found: Comparison, positions: np.ndarray, rate: float, window: int) 
     return both[0], both[1]
 
 
-def page(found: Comparison, verdicts: Sequence[tuple[str, int]] | None, about: str) -> str:
+def page(found: Comparison, verdicts: Verdicts | None, about: str) -> str:
     """Return a page in Markdown.
 
     Args:
         found: the comparison.
-        verdicts: label -> presses on which a run says the same of both; None without a run.
+        verdicts: of a run; None without one.
         about: a sentence on where this came from.
     """
     presses = found.presses
@@ -148,8 +203,7 @@ def page(found: Comparison, verdicts: Sequence[tuple[str, int]] | None, about: s
         f"- largest reading per applied force: {np.median(shares[0]):.1%} simulated, "
         f"{np.median(shares[1]):.1%} recorded (the report's skin: about 5 %)",
     ]
-    for name, same in verdicts or ():
-        lines.append(f"- the run says the same of `{name}` on {same} of {len(presses)} presses")
+    lines += agreement(verdicts, "presses")
     lines += [
         "",
         "| press | sensor | force, N | simulated, N | recorded, N | ratio | RMSE, N |",

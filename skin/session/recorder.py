@@ -75,6 +75,7 @@ def _about(device: Serial, header: Header | None) -> dict[str, Any]:
         "size": list(device.size),
         "rate": device.rate,
         "window": device.window,
+        "labels": device.labels,
         "calibration": device.calibration,
     }
 

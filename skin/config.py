@@ -101,6 +101,7 @@ class Config:
     trainer: dict[str, Any]
     evaluation: Evaluation
     tracking: Tracking
+    contact: dict[str, Any] | None = None  # runs of old have none
     # What a command other than training adds.
     run: str | None = None
     n: int | None = None

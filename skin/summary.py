@@ -19,14 +19,15 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
     Returns:
         gestures; acceptance (share of draws kept); force (N: quantiles .05, .5, .95 and the largest);
         strain_over_30_percent and strain_over_100_percent; clipped and clipped_dangerous (gestures in which
-        a sensor passes the clip, of all and of the dangerous ones).
+        a sensor passes the clip, of all and of the dangerous ones); unconverged (frames whose pressure was
+        not found, so that their gestures were drawn again), where it had to be.
     """
     known, labels = recording.parameters, recording.touches.labels
     assert labels is not None
     strain = known["peak"] / body.layers[-1].material.young
     force = torch.quantile(known["force"], torch.tensor([0.05, 0.5, 0.95, 1.0]))
     dangerous = labels[:, recording.task.names.index("dangerous")] > 0.5
-    return {
+    summary = {
         "gestures": len(recording),
         "acceptance": len(recording) / float(known["draws"].sum()),
         "force": dict(zip(("q05", "q50", "q95", "largest"), force.tolist(), strict=True)),
@@ -35,15 +36,19 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
         "clipped": float(known["clipped"].mean()),
         "clipped_dangerous": float(known["clipped"][dangerous].mean()) if dangerous.any() else 0.0,
     }
+    if "unconverged" in known:
+        summary["unconverged"] = int(known["unconverged"].sum())
+    return summary
 
 
 def line(summary: dict[str, Any]) -> str:
     """Return a summary in one line."""
     force = summary["force"]
+    solved = f"; {summary['unconverged']} frames not solved" if "unconverged" in summary else ""
     return (
         f"{summary['gestures']} gestures, {summary['acceptance']:.0%} of draws kept; force median "
         f"{force['q50']:.0f} N (5 to 95 %: {force['q05']:.0f} to {force['q95']:.0f} N, largest "
         f"{force['largest']:.0f} N); strain over 30 % in {summary['strain_over_30_percent']:.0%}, "
         f"over 100 % in {summary['strain_over_100_percent']:.0%}; clipped {summary['clipped']:.0%} "
-        f"({summary['clipped_dangerous']:.0%} of dangerous)"
+        f"({summary['clipped_dangerous']:.0%} of dangerous){solved}"
     )

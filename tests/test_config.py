@@ -13,7 +13,7 @@ from skin.build import build_device, build_learner
 from skin.config import CONF, ROOT, checked, fingerprint, plain
 from skin.errors import InputError
 
-GROUPS = ("body", "layout", "simulator", "device", "representation", "model", "fusion", "learner")
+GROUPS = ("body", "layout", "simulator", "contact", "device", "representation", "model", "fusion", "learner")
 ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 TRAIN = ROOT / "experiments" / "train.py"

@@ -146,7 +146,11 @@ class _State:
         # Cells that have left took their part of the sum with them.
         along = (along - (along.sum(1) / self.count)[:, None]).where(self.touches, 0)
         answer = along @ self.compliance
-        length = (inside * along).sum(1) / (along * answer).sum(1).clamp(min=torch.finfo(along.dtype).tiny)
+        curvature = (along * answer).sum(1)
+        # A single cell in contact has no direction; the dent of a cell alone tells what a joining one needs.
+        length = torch.where(
+            self.count > 1, (inside * along).sum(1) / curvature, 1 / self.compliance.diagonal().mean()
+        )
 
         trial = self.pressure - length[:, None] * along
         joins = self.allowed & ~self.touches & (self.error < 0)

@@ -78,7 +78,8 @@ def _estimated(device: "Simulated") -> Tracker:
     body = replace(device.body, variation=0.0)
     model = device.simulator(body, device.sensors)
     # Not the device's own sampler: its labels know where the sensors truly are.
-    sampler = TouchSampler(body, body.footprints(device.sensors), device.touch, device.padded)
+    contact = device.contact and device.contact(body, model)
+    sampler = TouchSampler(body, body.footprints(device.sensors), device.touch, device.padded, contact)
     randomness = generator(Stream.TRACKING, device.data_seed)
     with torch.no_grad():
         movie = sampler.sample(_GESTURES, randomness)

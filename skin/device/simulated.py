@@ -9,6 +9,7 @@ import torch
 
 from skin import __version__
 from skin.body.base import AbstractBody
+from skin.contact.base import AbstractContact
 from skin.device._threads import in_threads
 from skin.device._tracking import tracker
 from skin.device._truth import true_readings, true_sensors
@@ -41,6 +42,7 @@ class Simulated(AbstractDevice):
         body: the sheet.
         layout: where the sensors are.
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
+        contact: ``contact(body, simulator)`` makes pressure of them; None: their pictures are it.
         touch: difficulty of the gestures (``conf/touch.yaml``).
         gestures: the budget.
         test_gestures: how many gestures ``test`` has.
@@ -66,6 +68,7 @@ class Simulated(AbstractDevice):
     body: AbstractBody
     layout: AbstractLayout
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
+    contact: Callable[[AbstractBody, AbstractSimulator], AbstractContact] | None = None
     touch: Mapping[str, Any] | GestureSettings | None = None
     gestures: int = 4038
     test_gestures: int = 4000
@@ -106,9 +109,10 @@ class Simulated(AbstractDevice):
         self.size = self.body.size
         self.sensors = self.layout.sensors(self.body)
         true = true_sensors(self)
-        self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded)
-        self.window = self.sampler.settings.window
         self.model = self.simulator(self.body, true)
+        contact = self.contact and self.contact(self.body, self.model)
+        self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded, contact)
+        self.window = self.sampler.settings.window
         if self.sampler.settings.shear:
             self.model.refuse_drag()
         self.imperfection = Imperfection.of(self)

@@ -9,18 +9,22 @@ import torch
 from torch import Tensor
 
 from skin.body.base import AbstractBody
+from skin.contact.base import AbstractContact, Ground, Pressed
+from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
 from skin.labels import TOUCH, measure, sliding
 from skin.simulator.base import AbstractSimulator, Response
-from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, fold, heading
+from skin.touch._strokes import course
+from skin.touch._tally import Tally
+from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
 from skin.touch.shapes import Shapes
 
 __all__ = ["Movie", "TouchSampler", "balanced", "join"]
 
 _ATTEMPTS = 50
 _AHEAD = 64
-_DRAWN = ("shape", "angle", "duration", "onset", "direction", "speed", "peak")
-_FOUND = ("force", "area", "draws", "net_x", "net_y")
+_DRAWN = ("shape", "angle", "duration", "onset", "direction", "speed")
+_FOUND = ("peak", "force", "area", "draws", "net_x", "net_y")
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,8 @@ class Movie:
         parameters: (B,) each: shape (index), angle (rad), duration and onset (frames), direction (rad), speed
             (m per frame), peak (highest cell pressure, Pa), force (N, all cells at full force), area (largest
             share of the sheet in contact), draws (how many were drawn until one had the wanted labels), net_x
-            and net_y (m, from the first place of the path to its last).
+            and net_y (m, from the first place of the path to its last); and where pressure is solved for,
+            unconverged (frames of all its draws that were not found).
         drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
             times the direction of motion, 0 where nothing slides; None: no friction.
     """
@@ -125,6 +130,7 @@ class TouchSampler:
         footprints: (S, H * W), area weights of each sensor that sum to 1 (``AbstractBody.footprints``).
         settings: the difficulty, as ``conf/touch.yaml`` gives it.
         padded: gestures begin at a random frame of the window, not at its first.
+        contact: what pressure they make; None: their pictures are it.
 
     Raises:
         InputError: settings or pictures that cannot be used.
@@ -136,12 +142,14 @@ class TouchSampler:
         footprints: np.ndarray,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
+        contact: AbstractContact | None = None,
     ) -> None:
         self.body = body
         self.settings = GestureSettings.of(settings)
         self.padded = padded
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
         self.shapes = Shapes(self.settings.shapes, body, self.settings.thresholds.contact)
+        self.contact = contact or Prescribed()
 
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
@@ -158,13 +166,14 @@ class TouchSampler:
         wanted = balanced(count, generator) if labels is None else labels
         redraws = self.settings.redraws
         pending = np.arange(count)
+        tally = Tally.of(count)
         found: list[np.ndarray] = []
         movies: list[Movie] = []
-        for attempt in range(_ATTEMPTS):
-            if not len(pending):
-                return join(movies)[torch.from_numpy(np.concatenate(found).argsort())]
+        while len(pending):
+            if tally.draws[pending].min() >= _ATTEMPTS * redraws:
+                raise self._never(wanted[pending[0]])
             gestures = draw_gestures(wanted, self.settings, self.shapes, self.padded, generator)
-            tried = 0
+            tried, hopeless = 0, []
             while tried < redraws and len(pending):
                 # The last few gestures try several paths at once: a round costs more than what it draws.
                 ahead = min(redraws - tried, max(1, _AHEAD // len(pending)))
@@ -172,72 +181,64 @@ class TouchSampler:
                 chance = generator.random((ahead, count, 5))
                 # Sorted by scale, because frames of one texture level are rendered together.
                 pending = pending[np.argsort(gestures["scale"][pending], kind="stable")]
-                chosen, movie = self._round(pending, wanted, gestures, chance)
-                movie.parameters["draws"] += attempt * redraws + tried
+                tried += ahead
+                chosen, given_up, movie = self._round(pending, wanted, gestures, chance, tally)
                 movies.append(movie)
                 found.append(pending[chosen])
-                pending = pending[~chosen]
-                tried += ahead
-        raise _never(wanted[pending[0]], self.settings)
+                hopeless.append(pending[given_up])
+                pending = pending[~chosen & ~given_up]
+            pending = np.concatenate([pending, *hopeless])
+        tally.warn()
+        return join(movies)[torch.from_numpy(np.concatenate(found).argsort())]
 
     def _round(
-        self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray
-    ) -> tuple[np.ndarray, Movie]:
-        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture.
+        self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: Tally
+    ) -> tuple[np.ndarray, np.ndarray, Movie]:
+        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture, and count.
 
         Returns:
-            Which of the pending found a path with the wanted labels, bool, and the movie of those paths.
+            Which of the pending found a path with the wanted labels, bool, which need not look for another,
+            bool, and the movie of those paths.
         """
         ahead = len(chance)
         rows = np.repeat(pending, ahead)
         turns = np.tile(np.arange(ahead), len(pending))
         body = {name: values[rows] for name, values in gestures.items()}
         path = draw_paths(wanted[rows], body, self.settings, self.body.size, chance[turns, rows])
-        movie = self._press(body | path | {"draws": turns + 1})
-        right = (movie.labels.numpy() == wanted[rows]).all(axis=1).reshape(-1, ahead)
+        drawn = tally.draws[rows] + turns + 1
+        movie, pressed = self._press(body | path | {"draws": drawn}, wanted[rows])
+        right = ((movie.labels.numpy() == wanted[rows]).all(axis=1) & ~pressed.refused).reshape(-1, ahead)
         chosen = right.any(axis=1)
         first = np.arange(len(pending)) * ahead + right.argmax(axis=1)
-        return chosen, movie[torch.from_numpy(first[chosen])]
+        tally.draws[pending] += ahead
+        if pressed.unconverged is not None:
+            tally.unconverged[pending] += pressed.unconverged.reshape(-1, ahead).sum(axis=1)
+            movie.parameters["unconverged"] = torch.from_numpy(tally.unconverged[rows]).float()
+        given_up = pressed.hopeless.reshape(-1, ahead).any(axis=1) & ~chosen
+        return chosen, given_up, movie[torch.from_numpy(first[chosen])]
 
-    def _press(self, gestures: Draws) -> Movie:
+    def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, Pressed]:
         """Return the movie of gestures (B,), with the labels that it gives."""
-        body, settings = self.body, self.settings
-        duration, onset, sliding = gestures["duration"], gestures["onset"], gestures["speed"] > 0
-        time = np.arange(settings.window) - onset[:, None]
-        rise = duration[:, None] // settings.ramp + 1
-        scale = np.clip(np.minimum(time + 1, duration[:, None] - time) / rise, 0, 1)
-
-        counts = np.where(sliding, duration, 1)
-        first = np.cumsum(counts) - counts
-        index = first[:, None] + np.clip(time, 0, counts[:, None] - 1)
-        owner = np.repeat(np.arange(len(counts)), counts)
-        step = (np.arange(len(owner)) - first[owner])[:, None]
-        velocity = gestures["speed"] * np.stack(
-            [np.cos(gestures["direction"]), np.sin(gestures["direction"])]
+        settings = self.settings
+        taken = course(gestures, wanted, settings, self.contact.proportional)
+        pressed = self.contact.press(taken.strokes, Ground(self.shapes, self.footprints, settings))
+        shown, shares = taken.strokes.index, taken.strokes.profile
+        measures = measure(
+            pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
-        way = fold(gestures["start"][owner] + step * velocity.T[owner], gestures["room"][owner])
-        shape, angle, size = (gestures[name][owner] for name in ("shape", "angle", "scale"))
-        frames = self.shapes.render(shape, angle, size, way - gestures["low"][owner])
+        values = pressed.peak, pressed.force, measures.area.numpy(), gestures["draws"], *taken.net.T
+        parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
+        known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
+        pull = settings.shear * heading(taken.way, taken.first) if settings.shear else None
+        drag = None if pull is None else torch.from_numpy(pull).float()
+        labels = measures.labels(settings.thresholds)
+        return Movie(pressed.frames, shown, shares, labels, known, drag), pressed
 
-        # Equation 2: the drawn peak is the largest cell of the whole movie.
-        shown, shares = torch.from_numpy(index), torch.from_numpy(scale).float()
-        highest = (frames.flatten(1).amax(1)[shown] * shares).amax(1).double().numpy()
-        cell = body.cell[0] * body.cell[1]
-        force = gestures["peak"] * cell / highest
-        frames *= torch.from_numpy(force / cell).float()[torch.from_numpy(owner), None, None]
-        measures = measure(frames, shown, shares, self.footprints, body.cell, settings.thresholds.contact)
-        net = way[first + counts - 1] - way[first]
-        found = dict(zip(_FOUND, (force, measures.area.numpy(), gestures["draws"], *net.T), strict=True))
-        parameters = {name: gestures[name] for name in _DRAWN} | found
-        known = {name: torch.from_numpy(values).float() for name, values in parameters.items()}
-        drag = torch.from_numpy(settings.shear * heading(way, first)).float() if settings.shear else None
-        return Movie(frames, shown, shares, measures.labels(settings.thresholds), known, drag)
-
-
-def _never(labels: np.ndarray, settings: GestureSettings) -> InputError:
-    names = ", ".join(name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))
-    return InputError(
-        f"no gesture in {_ATTEMPTS * settings.redraws} draws was {names}: on this sheet, with these sensors, "
-        "the ranges under touch rule it out; sensors far apart hardly feel a small dangerous touch, so raise "
-        "touch.small_area or touch.dangerous_peak, or add sensors"
-    )
+    def _never(self, labels: np.ndarray) -> InputError:
+        names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))
+        return InputError(
+            f"no gesture in {_ATTEMPTS * self.settings.redraws} draws was {', '.join(names)}: on this sheet, "
+            "with these sensors, the ranges under touch rule it out; sensors far apart hardly feel a small "
+            "dangerous touch, so raise touch.small_area or touch.dangerous_peak, or add sensors"
+            f"{self.contact.advice}"
+        )

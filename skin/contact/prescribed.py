@@ -1,0 +1,41 @@
+"""Pressure as the report has it: the picture of an object is its pressure."""
+
+from typing import final
+
+import numpy as np
+import torch
+
+from skin.body.base import AbstractBody
+from skin.contact.base import AbstractContact, Ground, Pressed, Strokes
+from skin.simulator.base import AbstractSimulator
+
+__all__ = ["Prescribed"]
+
+
+@final
+class Prescribed(AbstractContact):
+    """The object's grey-scale picture is its pressure, whatever the skin does (report, equations 1 and 2).
+
+    Choose it for the report's gestures, for a simulator without mechanics, and for objects softer than the
+    skin, which press alike everywhere.
+
+    Args:
+        body, simulator: not asked: the skin has no say.
+    """
+
+    proportional = True
+
+    def __init__(self, body: AbstractBody | None = None, simulator: AbstractSimulator | None = None) -> None:
+        del body, simulator
+
+    def press(self, strokes: Strokes, ground: Ground) -> Pressed:
+        """Return pictures at the force at which the gesture's highest cell has the wanted pressure."""
+        frames = ground.shapes.render(strokes.shape, strokes.angle, strokes.scale, strokes.place)
+        # Equation 2: the drawn peak is the largest cell of the whole movie.
+        highest = (frames.flatten(1).amax(1)[strokes.index] * strokes.profile).amax(1).double().numpy()
+        width, height = ground.shapes.body.cell
+        force = strokes.peak * (width * height) / highest
+        owner = torch.from_numpy(strokes.owner)
+        frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
+        none = np.zeros(len(force), bool)
+        return Pressed(frames, force, strokes.peak, none, none)

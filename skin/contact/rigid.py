@@ -1,0 +1,144 @@
+"""Rigid objects: the picture is their height, and the skin decides on the pressure."""
+
+from typing import final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.contact._force import Found, seek
+from skin.contact._grain import with_grain
+from skin.contact._unilateral import Equilibrium, solve
+from skin.contact.base import AbstractContact, Ground, Pressed, Strokes
+from skin.errors import InputError
+from skin.simulator.base import AbstractSimulator
+
+__all__ = ["Rigid"]
+
+
+@final
+class Rigid(AbstractContact):
+    """A rigid object, its picture a map of heights, is pressed into the skin, without friction.
+
+    White touches first. The rest lies lower by up to ``relief``; where the picture is black there is no
+    object. Its outline is rounded by an arc of radius ``fillet``, because a sharp edge presses without bound.
+    It stays upright. A fist is then a picture taken from below whose knuckles are white; with ``relief: 0``
+    it is a stamp with the outline of a fist. Heights do not grow with the picture's size.
+
+    The pressure p fulfils p >= 0 and sum(p) = force / cell, and the surface follows the object where p > 0:
+    min p' C p / 2 + g' p, with C the compliance of the surface and g the gap to the object. The force is
+    sought at which the highest cell has the drawn pressure; where classes are wrong there, nearer to the end
+    of the pressure's range that mends them (:mod:`skin.contact._force`). A frame that is not found to
+    ``tolerance`` is never used: its gesture is drawn again, and counted.
+
+    Choose it for hard objects, and to see what the pictures' prescribed pressure is worth. Peaks lie where
+    the skin makes them: at the edges of flat objects, in the middle of round ones.
+
+    Args:
+        body: the skin.
+        simulator: gives the compliance of its surface.
+        relief: height of white above black, m.
+        fillet: radius of the rounded outline, m.
+        tolerance: largest gap under pressure, or overlap, as a share of the largest deflection.
+        iterations: at which a frame is given up.
+
+    Raises:
+        InputError: a simulator that has no surface to press on, or settings that cannot be used.
+    """
+
+    proportional = False
+    advice = "; a rigid object touches less than its picture shows: lower contact.relief"
+
+    def __init__(
+        self,
+        body: AbstractBody,
+        simulator: AbstractSimulator,
+        relief: float = 0.004,
+        fillet: float = 0.005,
+        tolerance: float = 1e-4,
+        iterations: int = 200,
+    ) -> None:
+        for name, value, least in (
+            ("relief", relief, 0.0),
+            ("fillet", fillet, 0.0),
+            ("tolerance", tolerance, 1e-5),  # what single precision resolves
+            ("iterations", iterations, 1),
+        ):
+            if not least <= value < np.inf:
+                raise InputError(f"contact.{name} must be at least {least:g}, got {value}")
+        self.relief, self.fillet = relief, fillet
+        self.tolerance, self.iterations = tolerance, iterations
+        self.compliance = with_grain(simulator.compliance().detach().cpu().double(), body).float()
+
+    def press(self, strokes: Strokes, ground: Ground) -> Pressed:
+        """Return the pressure at the force that gives the wanted classes, if there is one."""
+        body = ground.shapes.body
+        cell = body.cell[0] * body.cell[1]
+        gap = self.gap(strokes, ground)
+        full = np.zeros(len(strokes.peak))
+        np.maximum.at(full, strokes.owner, strokes.share)
+        telling = _telling(strokes, full, gap, ground.footprints)
+        found, lost = self._sought(strokes, gap, telling, ground)
+        force = found.load / full
+        refused = np.isnan(force)
+
+        solved = np.flatnonzero(~refused[strokes.owner])
+        rows, owner = torch.from_numpy(solved), torch.from_numpy(strokes.owner[solved])
+        totals = torch.from_numpy(force[strokes.owner[solved]] * strokes.share[solved] / cell)
+        # A touch that stands still begins with what it was at its strongest.
+        stands = (strokes.place[solved] == strokes.place[telling][strokes.owner[solved]]).all(axis=1)
+        start = found.pressure[owner] * torch.from_numpy(stands)[:, None]
+        states = solve(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
+        missed = strokes.owner[solved][(states.residual > self.tolerance).numpy()]
+        lost += np.bincount(missed, minlength=len(force))
+
+        frames = gap.isfinite().float()
+        shares = torch.from_numpy(strokes.share).float()[:, None]
+        frames[rows] = states.pressure
+        highest = np.zeros(len(force))
+        np.maximum.at(highest, strokes.owner[solved], states.pressure.amax(1).double().numpy())
+        frames = (frames / shares).view(-1, *body.shape)
+        # Other places of a path, or the mesh under a small object, may raise the peak beyond its range.
+        settings = ground.settings
+        dangerous = strokes.wanted[:, 3]
+        refused |= highest > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
+        refused |= lost > 0
+        return Pressed(frames, force, highest, refused, found.area, lost)
+
+    def gap(self, strokes: Strokes, ground: Ground) -> Tensor:
+        """Return how far the object is above each cell when its highest point touches, (U, H * W), m.
+
+        Infinite where there is no object.
+        """
+        solids = ground.shapes.solids(strokes.shape, strokes.angle, strokes.scale, strokes.place)
+        lower = self.relief * (1 - solids.grey)
+        inward = (self.fillet - solids.rim).clamp(min=0, max=self.fillet)
+        lower += self.fillet - (self.fillet**2 - inward**2).clamp(min=0).sqrt()
+        lower = lower.where(solids.inside, torch.inf).flatten(1)
+        return lower - lower.amin(1, keepdim=True)
+
+    def _sought(
+        self, strokes: Strokes, gap: Tensor, telling: np.ndarray, ground: Ground
+    ) -> tuple[Found, np.ndarray]:
+        """Return the loads of each gesture's telling frame, and how many of these were not found."""
+        own = gap[torch.from_numpy(telling)]
+        cell = ground.shapes.body.cell[0] * ground.shapes.body.cell[1]
+
+        def solved(rows: np.ndarray, load: np.ndarray, start: Tensor) -> tuple[Equilibrium, np.ndarray]:
+            total = torch.from_numpy(load / cell)
+            state = solve(
+                self.compliance, own[torch.from_numpy(rows)], total, start, self.tolerance, self.iterations
+            )
+            return state, (state.residual > self.tolerance).numpy()
+
+        found = seek(solved, own.isfinite().float(), strokes.peak, strokes.wanted[:, [0, 3]], ground)
+        return found, found.failed.astype(np.int64)
+
+
+def _telling(strokes: Strokes, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
+    """Return the frame of each gesture that covers a sensor best, of those under its largest force, (B,)."""
+    cover = (gap.isfinite().float() @ footprints.T).amax(1).double().numpy()
+    strongest = strokes.share >= full[strokes.owner] * (1 - 1e-9)
+    order = np.lexsort((-cover, ~strongest, strokes.owner))
+    return order[np.searchsorted(strokes.owner[order], np.arange(len(full)))]

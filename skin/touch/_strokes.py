@@ -1,0 +1,72 @@
+"""From drawn gestures to the frames that they show: where, and under what part of their force."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from skin.contact.base import Strokes
+from skin.touch.gesture import Draws, GestureSettings, fold
+
+__all__ = ["Course", "course"]
+
+
+class Course(NamedTuple):
+    """Strokes and the way that they take.
+
+    Attributes:
+        strokes: the frames (U,) of gestures (B,).
+        way: (U, 2), where each frame is within its room, m.
+        first: (B,), the first frame of each gesture.
+        net: (B, 2), from its first place to its last, m.
+    """
+
+    strokes: Strokes
+    way: np.ndarray
+    first: np.ndarray
+    net: np.ndarray
+
+
+def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, proportional: bool) -> Course:
+    """Return the distinct frames of gestures.
+
+    A sliding touch has one per step. One that stands still has a single one, or, where pressure is not
+    proportional to force, one per level of its force.
+
+    Args:
+        gestures: what ``draw_gestures`` and ``draw_paths`` gave, (B, ...).
+        wanted: (B, 4), bool, the wanted labels.
+        settings: the difficulty.
+        proportional: twice the force is twice the pressure.
+    """
+    duration, onset, sliding = gestures["duration"], gestures["onset"], gestures["speed"] > 0
+    time = np.arange(settings.window) - onset[:, None]
+    rise = duration[:, None] // settings.ramp + 1
+    level = np.clip(np.minimum(time + 1, duration[:, None] - time), 0, rise)
+    scale = level / rise
+
+    highest = level.max(axis=1)
+    counts = np.where(sliding, duration, 1 if proportional else highest)
+    first = np.cumsum(counts) - counts
+    shown = np.where(sliding[:, None], time, level - 1)
+    index = first[:, None] + np.clip(shown, 0, counts[:, None] - 1)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    step = np.arange(len(owner)) - first[owner]
+    velocity = gestures["speed"] * np.stack([np.cos(gestures["direction"]), np.sin(gestures["direction"])])
+    way = fold(gestures["start"][owner] + step[:, None] * velocity.T[owner], gestures["room"][owner])
+
+    share = np.zeros(len(owner))
+    np.maximum.at(share, index, scale)
+    strokes = Strokes(
+        owner,
+        gestures["shape"][owner],
+        gestures["angle"][owner],
+        gestures["scale"][owner],
+        way - gestures["low"][owner],
+        share,
+        torch.from_numpy(index),
+        torch.from_numpy(scale).float(),
+        gestures["peak"],
+        wanted,
+    )
+    return Course(strokes, way, first, way[first + counts - 1] - way[first])

@@ -19,7 +19,8 @@ from skin.config import ROOT
 from skin.results.table import write
 
 HERE = Path(__file__).parent
-PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "PyNiteFEA")
+SIMULATORS = ("naive", "fem", "solid")
+PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "scikit-fem", "PyNiteFEA")
 
 
 def main() -> None:
@@ -35,19 +36,19 @@ def main() -> None:
         "versions": {name: version(name) for name in PACKAGES},
     }
     say("generation, device, live")
-    figures["generation"] = {name: _own("generation", name, str(repeats)) for name in ("naive", "fem")}
+    figures["generation"] = {name: _own("generation", name, str(repeats)) for name in SIMULATORS}
     figures["device"] = {"decode_core_share": decode_core_share()}
     figures["live"] = _own("live", "1000")
     say("operator")
-    built = mechanics.build_seconds(repeats)
-    figures["operator"] = {name: {"build_seconds": value} for name, value in built.items()}
-    say("peers of the finite-element skin: about a minute and a half")
-    fem = figures["generation"]["fem"]
-    frames = round(GESTURES * fem["frames_per_second"] / fem["gestures_per_second"])
-    fem["ratio_to_pynite"] = mechanics.pynite_seconds_per_frame(repeats) * fem["frames_per_second"]
-    fem["ratio_to_direct_solve"] = (
-        mechanics.direct_seconds_per_frame(frames, repeats) * fem["frames_per_second"]
-    )
+    figures["operator"] = {name: _own("building", name, str(repeats)) for name in SIMULATORS}
+    say("peers of the finite-element skins: about two minutes")
+    pynite = mechanics.pynite_seconds_per_frame(repeats)
+    for name in SIMULATORS[1:]:
+        own = figures["generation"][name]
+        frames = round(GESTURES * own["frames_per_second"] / own["gestures_per_second"])
+        direct = mechanics.direct_seconds_per_frame(name, frames, repeats)
+        own["ratio_to_pynite"] = pynite * own["frames_per_second"]
+        own["ratio_to_direct_solve"] = direct * own["frames_per_second"]
     say("start")
     command = [sys.executable, str(HERE / "train.py"), "--help"]
     help_seconds = seconds(lambda: subprocess.run(command, capture_output=True, check=True), repeats)

@@ -4,7 +4,6 @@ python experiments/benchmarks/generation.py fem 3
 """
 
 import json
-import resource
 import sys
 import time
 from pathlib import Path
@@ -15,7 +14,7 @@ if __name__ == "__main__":
 
 import numpy as np
 
-from benchmarks.setting import configuration
+from benchmarks.setting import configuration, peak_memory
 from skin.build import build_device
 from skin.device.simulated import Simulated
 
@@ -42,20 +41,8 @@ def measure(simulator: str, repeats: int) -> dict[str, float]:
     return {
         "gestures_per_second": speed,
         "frames_per_second": speed * len(movie.frames) / len(movie),
-        "peak_memory_bytes": _peak_memory(),
+        "peak_memory_bytes": peak_memory(),
     }
-
-
-def _peak_memory() -> int:
-    """Return the largest resident set of this process, bytes.
-
-    Linux hands ru_maxrss on from the process that started this one; VmHWM is our own.
-    """
-    status = Path("/proc/self/status")
-    if status.is_file():
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return int(line.split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 if __name__ == "__main__":

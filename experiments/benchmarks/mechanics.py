@@ -1,53 +1,53 @@
-"""How long the finite-element skin takes to build, and its peers to answer one frame."""
+"""How long the peers of the finite-element skins take to answer one frame."""
+
+from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import SuperLU, splu
 
 from benchmarks.setting import configuration, seconds
 from skin.build import build_device
 from skin.device.simulated import Simulated
 from skin.simulator import _pynite
 from skin.simulator._assembly import Structure
-from skin.simulator._operator import build
-from skin.simulator.naive import Naive
+from skin.simulator.solid import hexahedra
 
-__all__ = ["build_seconds", "direct_seconds_per_frame", "pynite_seconds_per_frame"]
+__all__ = ["direct_seconds_per_frame", "pynite_seconds_per_frame"]
 
 FRAMES = 20  # of the direct solve
 
 
-def build_seconds(repeats: int) -> dict[str, float]:
-    """Return how long each simulator takes to build with nothing cached, s (median)."""
-    device = _device()
-    structure = Structure(device.body)
-    return {
-        "naive": seconds(lambda: Naive(device.body, device.sensors), repeats),
-        "fem": seconds(lambda: build(structure, device.sensors), repeats),
-    }
-
-
-def direct_seconds_per_frame(gestures_frames: int, repeats: int) -> float:
+def direct_seconds_per_frame(simulator: str, gestures_frames: int, repeats: int) -> float:
     """Return the seconds per frame of one factorisation and a solve for every frame of a data set.
 
     Args:
+        simulator: ``fem``, or ``solid``: scikit-fem's elements without an operator.
         gestures_frames: over how many frames the factorisation is shared.
         repeats: of which the median counts.
     """
-    structure = Structure(_device().body)
-    load = structure.load()
+    stiffness, load = _system(simulator)
     pressures = _pressures()
 
-    def factorise():
+    def factorise() -> SuperLU:
         return splu(
-            structure.stiffness(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+            stiffness(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
     factors = factorise()
     solving = seconds(lambda: [factors.solve(load @ frame) for frame in pressures], repeats) / len(pressures)
     return solving + seconds(factorise, repeats) / gestures_frames
+
+
+def _system(simulator: str) -> tuple[Callable[[], csc_matrix], csc_matrix]:
+    """Return what assembles the stiffness of the default skin, and the load of its cells."""
+    if simulator == "fem":
+        structure = Structure(_device().body)
+        return structure.stiffness, structure.load()
+    settings = configuration("simulator=solid").simulator
+    mesh = hexahedra(_device().body, settings.divisions, settings.poisson)
+    free = ~mesh.held
+    return lambda: mesh.stiffness()[free][:, free].tocsc(), mesh.loads(2)[free]
 
 
 def pynite_seconds_per_frame(repeats: int) -> float:

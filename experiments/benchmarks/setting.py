@@ -1,7 +1,10 @@
 """What every measurement starts from: the default configuration, and how a figure is taken."""
 
+import resource
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from statistics import median
 
 from hydra import compose, initialize_config_dir
@@ -9,7 +12,7 @@ from omegaconf import DictConfig
 
 from skin.config import CONF, checked
 
-__all__ = ["configuration", "seconds"]
+__all__ = ["configuration", "peak_memory", "seconds"]
 
 
 def configuration(*overrides: str) -> DictConfig:
@@ -27,3 +30,15 @@ def seconds(task: Callable[[], object], repeats: int) -> float:
         task()
         taken.append(time.perf_counter() - began)
     return median(taken)
+
+
+def peak_memory() -> int:
+    """Return the largest resident set of this process, bytes.
+
+    Linux hands ru_maxrss on from the process that started this one; VmHWM is our own.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

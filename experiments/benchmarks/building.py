@@ -1,0 +1,37 @@
+"""How long a simulator takes to build with nothing cached, and its memory; run in a process of its own.
+
+python experiments/benchmarks/building.py solid 3
+"""
+
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from hydra.utils import instantiate
+
+from benchmarks.setting import configuration, peak_memory, seconds
+
+__all__ = ["measure"]
+
+
+def measure(simulator: str, repeats: int) -> dict[str, float]:
+    """Return the seconds to build the default skin's operator (median) and the peak memory, bytes."""
+    config = configuration(f"simulator={simulator}")
+    body, make = instantiate(config.body), instantiate(config.simulator)
+    sensors = instantiate(config.layout).sensors(body)
+
+    def build() -> None:
+        with tempfile.TemporaryDirectory() as empty:
+            os.environ["SKIN_CACHE"] = empty
+            make(body, sensors)
+
+    return {"build_seconds": seconds(build, repeats), "peak_memory_bytes": peak_memory()}
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]))))

@@ -1,4 +1,7 @@
-"""Animate a touch: python experiments/animate.py out=x.gif labels=[big,dynamic,press] shape=hand seed=3"""
+"""Animate a touch: python experiments/animate.py out=x.gif labels=[big,dynamic,press] shape=hand seed=3
+
+out=x.png writes its strongest moment instead.
+"""
 
 from omegaconf import DictConfig
 
@@ -8,15 +11,17 @@ from skin.errors import InputError
 
 @command("animate")
 def main(config: DictConfig) -> None:
-    """Write a GIF of a simulated touch, or of one that a recording holds."""
-    if config.out is None or not config.out.endswith(".gif"):
-        raise InputError(f"an animation is a .gif file, got out={config.out}: add out=touch.gif")
+    """Write a GIF or PNG of a simulated touch, or of one that a recording holds."""
+    if config.out is None or not config.out.endswith((".gif", ".png")):
+        raise InputError(
+            f"an animation is a .gif file, a still a .png file, got out={config.out}: add out=touch.gif"
+        )
 
     from pathlib import Path
 
     from skin.build import build_device
     from skin.device.simulated import Simulated
-    from skin.results.animation import write
+    from skin.results.animation import still, write
     from skin.results.scene import recorded, simulated
 
     device = build_device(config)
@@ -24,7 +29,8 @@ def main(config: DictConfig) -> None:
         scene = simulated(device, list(config.labels), config.shape, config.seed, config.view == "skin3d")
     else:
         scene = recorded(device, config.index)
-    path = write(scene, config.view, Path(config.out).expanduser())
+    path = Path(config.out).expanduser()
+    path = (still if path.suffix == ".png" else write)(scene, config.view, path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")
 
 

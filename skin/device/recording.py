@@ -60,7 +60,7 @@ class Recorded(AbstractDevice):
         self.path, self.split_seed = path, split_seed
         self.sensors = layout.sensors(body)
         self._compare(body)
-        self.task, self.size = self._recording.task, body.size
+        self.body, self.task, self.size = body, self._recording.task, body.size
         touches = self._recording.touches
         self.rate, self.window = touches.rate, touches.readings.shape[1]
 

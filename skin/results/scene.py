@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated
@@ -13,7 +14,7 @@ from skin.errors import InputError
 from skin.labels import TOUCH
 from skin.recording import Touches
 from skin.results.animation import Scene
-from skin.results.surface import deflection
+from skin.results.surface import surface_motion
 
 __all__ = ["recorded", "simulated"]
 
@@ -27,7 +28,7 @@ def simulated(device: Simulated, labels: Sequence[str], shape: str | None, seed:
         labels: those of ``skin.labels.TOUCH`` that hold; the others do not.
         shape: what presses, a name in ``data/shapes`` or the path of a picture; None: any of the device's.
         seed: of the touch.
-        field: solve for the movement of the whole surface too, by plates and beams.
+        field: solve for the movement of the whole surface too (``skin.results.surface.surface_motion``).
 
     Raises:
         InputError: an unknown label, or a shape of which no such touch can be made.
@@ -43,14 +44,14 @@ def simulated(device: Simulated, labels: Sequence[str], shape: str | None, seed:
     readings, _ = device.imperfection.apply(true, device.constants, generator)
     pressure = movie.pressure()[0]
     moved = None
-    if field:
-        frames = torch.from_numpy(deflection(device.body, movie.frames)[:, -1])
-        moved = (frames[movie.index[0]] * movie.scale[0, :, None, None]).numpy()
+    found = surface_motion(device.model, device.body, movie.frames) if field else None
+    if found is not None:
+        moved = found[movie.index[0]] * movie.scale[0, :, None, None].numpy()
     name = device.sampler.shapes.names[int(movie.parameters["shape"][0])]
     positions = np.broadcast_to(device.sensors.positions, (len(pressure), *device.sensors.positions.shape))
     return Scene(
         readings[0].numpy(), positions, device.size, device.rate, _title(name, wanted[0], TOUCH.names),
-        pressure.numpy(), moved,
+        pressure.numpy(), moved, _round(device.body),
     )  # fmt: skip
 
 
@@ -69,7 +70,13 @@ def recorded(device: AbstractDevice, index: int) -> Scene:
     readings = one.readings.where(one.valid, 0)[0].numpy()
     positions = np.broadcast_to(one.positions.numpy(), (1, *readings.shape, 3))[0]
     said = "" if one.labels is None else _title("", one.labels[0].bool().numpy(), device.task.names)
-    return Scene(readings, positions, device.size, one.rate, f"touch {index}{said}")
+    body = _round(device.body) if isinstance(device, Recorded) else None
+    return Scene(readings, positions, device.size, one.rate, f"touch {index}{said}", body=body)
+
+
+def _round(body: AbstractBody) -> AbstractBody | None:
+    """Return a body whose pictures need to know where it is in space."""
+    return None if body.flat else body
 
 
 def _title(name: str, holds: np.ndarray, names: Sequence[str]) -> str:

@@ -9,9 +9,11 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from skin.body.base import AbstractBody
+from skin.errors import InputError
 from skin.simulator._assembly import Constraint, Structure
+from skin.simulator.base import AbstractSimulator
 
-__all__ = ["deflection", "draw_surface", "surface"]
+__all__ = ["deflection", "draw_surface", "surface", "surface_motion"]
 
 
 def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "vertical") -> np.ndarray:
@@ -36,6 +38,25 @@ def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "v
     loads = structure.load() @ pressure.flatten(1).double().numpy().T
     down = -factors.solve(loads).reshape(-1, len(structure.free), len(pressure))[:, structure.free.index(2)]
     return np.moveaxis(down.reshape(*structure.grid, len(pressure)), -1, 0)
+
+
+def surface_motion(model: AbstractSimulator, body: AbstractBody, pressure: Tensor) -> np.ndarray | None:
+    """Return how far the surface moves into the skin, (F, ny + 1, nx + 1), m, or None where nobody knows.
+
+    By the simulator's own compliance if it has one, else by plates and beams if the body is flat.
+
+    Args:
+        model: the simulator.
+        body: what is pressed.
+        pressure: (F, H, W), Pa; friction is left out.
+    """
+    try:
+        compliance = model.compliance()
+    except InputError:
+        return deflection(body, pressure)[:, -1] if body.flat else None
+    cells = (pressure.flatten(1).to(compliance) @ compliance).reshape(pressure.shape).numpy()
+    around = np.pad(cells, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    return (around[:, 1:, 1:] + around[:, :-1, 1:] + around[:, 1:, :-1] + around[:, :-1, :-1]) / 4
 
 
 def draw_surface(

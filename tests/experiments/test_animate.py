@@ -35,9 +35,22 @@ def test_a_drawn_touch_and_a_recorded_one(tmp_path, configured):
     assert sorted(path.name for path in tmp_path.glob("*.gif")) == ["five.gif", "hand.gif"]
 
 
+@pytest.mark.slow
+def test_a_still_of_the_arm(tmp_path):
+    done = run(tmp_path, "body=arm", "out=arm.png", "view=skin3d", "labels=[press]", "shape=disc")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "arm.png: disc: press, 30 frames at 10 Hz\n"
+    with Image.open(tmp_path / "arm.png") as file:
+        assert file.size == (1140, 540)
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
-    [([], "add out=touch.gif"), (["out=x.mp4"], "got out=x.mp4"), (["vieww=flat"], "vieww")],
+    [
+        ([], "add out=touch.gif"),
+        (["out=x.mp4"], "a still a .png file, got out=x.mp4"),
+        (["vieww=flat"], "vieww"),
+    ],
 )
 def test_bad_input_ends_with_a_sentence(tmp_path, overrides, words):
     done = run(tmp_path, *overrides)

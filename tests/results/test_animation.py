@@ -9,6 +9,7 @@ from skin.build import build_device
 from skin.errors import InputError
 from skin.results.animation import VIEWS, Scene, thinning, write
 from skin.results.scene import recorded, simulated
+from skin.storage import write as store
 
 
 def made(frames=6, sensors=7, rate=10.0, **more):
@@ -109,6 +110,25 @@ def test_a_touch_of_another_device_is_taken_by_its_number(made_up_device, tmp_pa
     with pytest.raises(InputError, match="give index=0 to 39"):
         recorded(made_up_device, 40)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("view", ["sensors3d", "skin3d"])
+def test_a_slide_on_the_arm_is_drawn_in_space(view, configured, tmp_path):
+    device = build_device(configured("body=arm", "body.cells=[12,12]", "simulator=naive"))
+    scene = simulated(device, ["press", "dynamic"], "bar", 5, field=True)
+    assert scene.body == device.body
+    assert scene.moved is None
+    shown, _ = frames_of(write(scene, view, tmp_path / "x.gif"))
+    assert len(shown) == 30
+
+
+def test_a_recording_of_an_arm_is_drawn_on_the_arm(configured, tmp_path):
+    made = build_device(configured("body=arm", "simulator=naive", "data.gestures=10"))
+    path = store(made.recording(), tmp_path / "x.parquet")
+    device = build_device(configured("body=arm", "device=recording", f"device.path={path}"))
+    assert recorded(device, 2).body == made.body
+    sheet = build_device(configured("device=recording", f"device.path={path}"))
+    assert recorded(sheet, 2).body is None
 
 
 def test_an_unknown_label_is_refused(configured):

@@ -5,13 +5,17 @@ import pytest
 import torch
 from PIL import Image
 
+from skin.body.arm import Arm
 from skin.body.sheet import Sheet
 from skin.build import build_device
 from skin.layout.base import Sensors
+from skin.layout.grid import Grid
 from skin.results.gallery import draw_skin
-from skin.results.surface import deflection, surface
+from skin.results.surface import deflection, surface, surface_motion
 from skin.simulator._assembly import Structure
 from skin.simulator._operator import build
+from skin.simulator.naive import Naive
+from skin.simulator.solid import Solid
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
@@ -43,6 +47,32 @@ def test_a_single_layer_has_one_face():
     assert moved.shape == (1, 1, 5, 5)
     # strain p / E of 5 mm of 170 kPa
     assert moved.mean() == pytest.approx(0.1 * 0.005, rel=0.1)
+
+
+def test_the_surface_of_a_solid_moves_as_sensors_on_it_do(tmp_path):
+    """A node takes the mean of four cells and a cell that of four nodes: 1 2 1 along x and y, of sensors."""
+    body = Sheet((0.16, 0.08), (16, 8), LAYERS)
+    pressure = torch.zeros(2, 8, 16)
+    pressure[0, 3:5, 10:12] = 40e3
+    steps = np.arange(-1, 2) * 0.01
+    places = np.stack([*np.meshgrid(0.11 + steps, 0.04 + steps), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
+    nu = {"Dragon Skin 10 Medium": 0.45, "EcoFlex 00-30": 0.45}
+    solid = Solid(body, Sensors(places, (0.01, 0.01)), 1, nu, tmp_path)
+    moved = surface_motion(solid, body, pressure)
+    assert moved.shape == (2, 9, 17)
+    assert (moved[1] == 0).all()
+    weights = np.outer([1, 2, 1], [1, 2, 1]).ravel() / 16
+    true = weights @ solid(pressure[0]).displacement[:, 1].numpy()
+    assert moved[0, 4, 11] == pytest.approx(true, rel=1e-4)
+    assert np.unravel_index(moved[0].argmax(), (9, 17)) == (4, 11)
+
+
+def test_without_a_compliance_plates_and_beams_tell_how_a_flat_skin_moves():
+    body, pressure = Sheet((0.04, 0.04), (4, 4), LAYERS[1:]), torch.full((1, 4, 4), 17e3)
+    moved = surface_motion(Naive(body, Grid(2, 2).sensors(body)), body, pressure)
+    np.testing.assert_array_equal(moved, deflection(body, pressure)[:, -1])
+    arm = Arm(radius=0.05, length=0.1, angle=2.0, cells=[4, 4], layers=LAYERS)
+    assert surface_motion(Naive(arm, Grid(2, 2).sensors(arm)), arm, pressure) is None
 
 
 def test_the_map_shows_millimetres():

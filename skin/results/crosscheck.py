@@ -82,7 +82,8 @@ def try_run(
     trials = []
     for name, felt in touches.items():
         assert felt.labels is not None
-        figures = metrics(learner.probabilities(felt), felt.labels, device.task, config.evaluation.false_alarm_rate)
+        rate = config.evaluation.false_alarm_rate
+        figures = metrics(learner.probabilities(felt), felt.labels, device.task, rate)
         labels = {label: figures[f"{label}/accuracy"] for label in ("overall", *device.task.names)}
         trials.append(Trial(config.row, trained, name, str(config.seed), labels))
     return trials

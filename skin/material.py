@@ -7,18 +7,47 @@ from typing import Any
 
 from skin.errors import InputError
 
-__all__ = ["MATERIALS", "Material"]
+__all__ = ["MATERIALS", "Material", "Relaxation"]
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """How stress relaxes under a strain that is held: E(t) = E (1 + strength exp(-t / time)).
+
+    One Maxwell branch beside the elastic one (the standard linear solid); Poisson's ratio stays as it is.
+
+    Attributes:
+        time: tau, s.
+        strength: g, what an instantaneous strain feels beyond the relaxed modulus E, as a share of it.
+
+    Raises:
+        InputError: a time or a strength that is not a positive number.
+    """
+
+    time: float
+    strength: float
+
+    def __post_init__(self) -> None:
+        for key in ("time", "strength"):
+            value = getattr(self, key)
+            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or value <= 0:
+                raise InputError(
+                    f"a material's relaxation.{key} must be a number above 0, got {value!r}: as in "
+                    "relaxation: {time: 0.5, strength: 0.3}, in s and as a share of young"
+                )
 
 
 @dataclass(frozen=True)
 class Material:
-    """A linear elastic material.
+    """A linear elastic material, which may relax.
 
     Attributes:
         name: what it is called; it has no meaning to the mechanics.
-        young: Young's modulus E, Pa.
+        young: Young's modulus E, Pa; of a material that relaxes, that which is left in the end.
         poisson: Poisson's ratio nu. The plate-and-beam model takes -1 < nu < 1, where its shear modulus
             E / 2(1 + nu) and its plate stiffness E / (1 - nu^2) are positive. A solid needs nu < 0.5.
+        relaxation: how stress relaxes; None: not at all.
 
     Raises:
         InputError: a modulus that is not a positive number, or a Poisson's ratio outside (-1, 1).
@@ -27,6 +56,7 @@ class Material:
     name: str
     young: float
     poisson: float
+    relaxation: Relaxation | None = None
 
     def __post_init__(self) -> None:
         for key, unit in (("young", " in Pa"), ("poisson", "")):
@@ -48,13 +78,24 @@ class Material:
         """Shear modulus E / 2(1 + nu), Pa (report, equation 5)."""
         return self.young / (2 * (1 + self.poisson))
 
+    def elastic(self, speed: float) -> "Material":
+        """Return the elastic material that answers loads like exp(``speed`` t), 1/s, as this one does.
+
+        Its modulus is E (1 + g s tau / (1 + s tau)): E at 0, E (1 + g) at infinity.
+        """
+        if self.relaxation is None:
+            return self
+        rest = 1 / (1 + speed * self.relaxation.time)
+        return Material(self.name, self.young * (1 + self.relaxation.strength * (1 - rest)), self.poisson)
+
     @classmethod
     def of(cls, given: "str | Mapping[str, Any] | Material") -> "Material":
         """Return the material that a configuration means.
 
         Args:
-            given: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa) and
-                ``poisson``; what is left out comes from the known material of that name.
+            given: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa),
+                ``poisson`` and ``relaxation`` ({time (s), strength}); what is left out comes from the known
+                material of that name. None of them relaxes.
 
         Raises:
             InputError: the name is unknown and a constant is missing, or a key is mistyped.
@@ -64,10 +105,10 @@ class Material:
         constants = {"name": given} if isinstance(given, str) else given
         if not isinstance(constants, Mapping) or "name" not in constants:
             raise InputError(f"a material is a name or {{name, young, poisson}}, got {given!r}; {_known()}")
-        if unknown := set(constants) - {"name", "young", "poisson"}:
+        if unknown := set(constants) - {"name", "young", "poisson", "relaxation"}:
             raise InputError(
                 f"material {constants['name']}: unknown key {', '.join(sorted(map(str, unknown)))}; "
-                "a material has name, young (Pa) and poisson"
+                "a material has name, young (Pa), poisson and relaxation"
             )
         name = str(constants["name"])
         known = _BY_KEY.get(_key(name))
@@ -78,7 +119,7 @@ class Material:
             poisson = known.poisson if poisson is None else poisson
         if young is None or poisson is None:
             raise InputError(_missing(name, young, poisson))
-        return cls(known.name if known else name, young, poisson)
+        return cls(known.name if known else name, young, poisson, _relaxation(constants.get("relaxation")))
 
 
 MATERIALS = (
@@ -98,6 +139,14 @@ def _key(name: str) -> str:
 
 
 _BY_KEY = {_key(material.name): material for material in MATERIALS}
+
+
+def _relaxation(given: Any) -> Relaxation | None:
+    if given is None:
+        return None
+    if not isinstance(given, Mapping) or set(given) != {"time", "strength"}:
+        raise InputError(f"a material's relaxation is {{time (s), strength}}, got {given!r}")
+    return Relaxation(given["time"], given["strength"])
 
 
 def _known() -> str:

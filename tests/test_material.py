@@ -1,9 +1,11 @@
 """Materials: the report's numbers, and what is refused."""
 
+import math
+
 import pytest
 
 from skin.errors import InputError
-from skin.material import MATERIALS, Material
+from skin.material import MATERIALS, Material, Relaxation
 
 KSI = 6.894757e6
 
@@ -49,8 +51,28 @@ def test_any_material_can_be_given_by_its_constants():
         ({"name": "foam", "young": float("nan"), "poisson": 0.3}, "young must be a number in Pa, got nan"),
         ({"name": "foam", "young": 1e4, "poisson": 1.0}, "between -1 and 1.*got 1"),
         ({"name": "foam", "young": 1e4, "poisson": -1}, "between -1 and 1.*got -1"),
+        ({"name": "EcoFlex 00-30", "relaxation": 0.5}, r"relaxation is \{time \(s\), strength\}, got 0.5"),
+        ({"name": "EcoFlex 00-30", "relaxation": {"time": 0.5}}, "relaxation is"),
+        (
+            {"name": "EcoFlex 00-30", "relaxation": {"time": 0, "strength": 1}},
+            "relaxation.time must be a number above 0, got 0",
+        ),
+        (
+            {"name": "EcoFlex 00-30", "relaxation": {"time": 1, "strength": -0.1}},
+            "relaxation.strength must be a number above 0, got -0.1",
+        ),
     ],
 )
 def test_what_is_no_material_is_refused_by_name(given, says):
     with pytest.raises(InputError, match=says):
         Material.of(given)
+
+
+def test_a_material_relaxes_from_its_instantaneous_modulus_to_its_own():
+    material = Material.of({"name": "EcoFlex 00-30", "relaxation": {"time": 0.5, "strength": 0.3}})
+    assert material.relaxation == Relaxation(0.5, 0.3)
+    assert material.elastic(0.0) == MATERIALS[0]
+    assert material.elastic(math.inf).young == pytest.approx(1.3 * MATERIALS[0].young)
+    # At the speed 1 / tau half of the branch is there: s tau / (1 + s tau) = 1/2.
+    assert material.elastic(2.0).young == pytest.approx(1.15 * MATERIALS[0].young)
+    assert MATERIALS[0].elastic(3.0) is MATERIALS[0]

@@ -6,16 +6,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from skin.errors import InputError
 from skin.labels import TOUCH
 from skin.layout.base import Sensors
 from skin.recording import Recording, Touches
+from skin.simulator._relaxation import Relaxing, relaxes
+from skin.simulator.base import AbstractSimulator
 from skin.streams import Stream, generator
 from skin.touch.sampler import Movie
 
 if TYPE_CHECKING:
     from skin.device.simulated import Simulated
 
-__all__ = ["true_readings", "true_sensors"]
+__all__ = ["true_model", "true_readings", "true_sensors"]
 
 
 def true_sensors(device: "Simulated") -> Sensors:
@@ -24,6 +27,23 @@ def true_sensors(device: "Simulated") -> Sensors:
     positions = device.sensors.positions.copy()
     positions[:, :2] = np.clip(positions[:, :2] + device.position_error * moves, 0, device.size)
     return replace(device.sensors, positions=positions)
+
+
+def true_model(device: "Simulated", sensors: Sensors) -> AbstractSimulator:
+    """Return the device's simulator of its body with sensors, in time where a material relaxes.
+
+    Raises:
+        InputError: materials that relax in streams, or with sensors that are tracked.
+    """
+    if not relaxes(device.body):
+        return device.simulator(device.body, sensors)
+    if device.stream or device.track != "none":
+        what = "data.stream=true" if device.stream else f"device.track={device.track}"
+        raise InputError(
+            f"a skin that relaxes is simulated touch by touch from rest, where it stays, got {what}: leave "
+            "that out, or the materials' relaxation"
+        )
+    return Relaxing(device.simulator, device.body, sensors, device.rate)
 
 
 def true_readings(device: "Simulated", movie: Movie, complete: bool) -> Recording:

@@ -12,7 +12,7 @@ from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.device._threads import in_threads
 from skin.device._tracking import tracker
-from skin.device._truth import true_readings, true_sensors
+from skin.device._truth import true_model, true_readings, true_sensors
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.imperfection import Imperfection
@@ -109,7 +109,7 @@ class Simulated(AbstractDevice):
         self.size = self.body.size
         self.sensors = self.layout.sensors(self.body)
         true = true_sensors(self)
-        self.model = self.simulator(self.body, true)
+        self.model = true_model(self, true)
         contact = self.contact and self.contact(self.body, self.model)
         self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded, contact)
         self.window = self.sampler.settings.window

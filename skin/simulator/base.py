@@ -49,6 +49,44 @@ class AbstractSimulator(nn.Module, ABC):
             InputError: drag, where the simulator feels none.
         """
 
+    def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+        """Return what is linear in the pressure, (..., R): that of which :meth:`read` makes the response.
+
+        Raises:
+            InputError: the simulator has no mechanics.
+        """
+        raise InputError(
+            f"materials relax where there are mechanics, got simulator={self._name}: set simulator=fem or "
+            "simulator=solid, or leave out the materials' relaxation"
+        )
+
+    def read(self, linear: Tensor) -> Response:
+        """Return the response that has these linear parts (..., R)."""
+        raise NotImplementedError
+
+    def play(
+        self,
+        frames: Tensor,
+        index: Tensor,
+        scale: Tensor,
+        drag: Tensor | None = None,
+        displacement: bool = True,
+    ) -> Response:
+        """Return the response to movies, (B, T, ...); each distinct frame is solved for once.
+
+        Args:
+            frames: (U, H, W), Pa.
+            index: (B, T), which frame is shown.
+            scale: (B, T), by what it is multiplied.
+            drag: (U, 2), as of :meth:`forward`.
+            displacement: False leaves it out.
+        """
+        readings, moves = self(frames, drag)
+        shown = readings[index] * scale[..., None]
+        if moves is None or not displacement:
+            return Response(shown, None)
+        return Response(shown, moves[index] * scale[..., None, None])
+
     def refuse_drag(self) -> None:
         """Raise an InputError that says which simulator feels friction, unless this one does."""
         if not self.feels_shear:

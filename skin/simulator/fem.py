@@ -83,10 +83,17 @@ class PlatesAndBeams(AbstractSimulator):
         Raises:
             InputError: drag; only normal forces are felt.
         """
+        return self.read(self.linear(pressure, drag))
+
+    def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+        """Return D_s, D_t and the force that the reading is made of, (..., 3 S)."""
         if drag is not None:
             self.refuse_drag()
-        cells = flatten(pressure, self.shape, self.transfer.dtype)
-        sensor, surface, force = (cells @ self.transfer).chunk(3, dim=-1)
+        return flatten(pressure, self.shape, self.transfer.dtype) @ self.transfer
+
+    def read(self, linear: Tensor) -> Response:
+        """Return the response that has these linear parts (..., 3 S)."""
+        sensor, surface, force = linear.chunk(3, dim=-1)
         displacement = torch.stack([sensor, surface], dim=-1)
         if self.reading == "interface":
             return Response(force, displacement)

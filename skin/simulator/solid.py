@@ -77,13 +77,21 @@ class Solid(AbstractSimulator):
 
     def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa, and drag (..., 2), with D_s and D_t."""
+        return self.read(self.linear(pressure, drag))
+
+    def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+        """Return readings, D_s and D_t, (..., 3 S)."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         felt = cells @ self.transfer[_INWARDS, :, : 3 * self._sensors]
         if drag is not None:
             for axis in (0, 1):
                 part = cells @ self.transfer[axis, :, : 3 * self._sensors]
                 felt = felt + drag[..., axis, None].to(part) * part
-        readings, sensor, surface = felt.chunk(3, dim=-1)
+        return felt
+
+    def read(self, linear: Tensor) -> Response:
+        """Return the response that has these linear parts (..., 3 S)."""
+        readings, sensor, surface = linear.chunk(3, dim=-1)
         return Response(readings, torch.stack([sensor, surface], dim=-1))
 
     def motion(self, pressure: Tensor) -> Tensor:

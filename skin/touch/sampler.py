@@ -92,11 +92,8 @@ class Movie:
         """
         home = next(simulator.buffers(), self.frames).device
         drag = None if self.drag is None else self.drag.to(home)
-        readings, moves = simulator(self.frames.to(home), drag)
         index, scale = self.index.to(home), self.scale.to(home)
-        if not displacement or moves is None:
-            return Response(readings[index] * scale[..., None], None)
-        return Response(readings[index] * scale[..., None], moves[index] * scale[..., None, None])
+        return simulator.play(self.frames.to(home), index, scale, drag, displacement)
 
 
 def join(movies: Sequence[Movie]) -> Movie:
@@ -171,6 +168,7 @@ class TouchSampler:
         movies: list[Movie] = []
         while len(pending):
             if tally.draws[pending].min() >= _ATTEMPTS * redraws:
+                tally.warn()
                 raise self._never(wanted[pending[0]])
             gestures = draw_gestures(wanted, self.settings, self.shapes, self.padded, generator)
             tried, hopeless = 0, []

@@ -1,0 +1,70 @@
+"""What every contact does, whichever it is, from the command line on."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from skin.build import build_device
+from skin.config import CONF, ROOT, checked
+from skin.errors import InputError
+
+OPTIONS = sorted(path.stem for path in (CONF / "contact").glob("*.yaml"))
+SMALL = ("body.cells=[16,16]", "layout=grid", "data.gestures=40", "device.test_gestures=32")
+
+
+@pytest.fixture(scope="module", params=OPTIONS)
+def device(request, configured):
+    return build_device(checked(configured(f"contact={request.param}", "simulator=solid", *SMALL)))
+
+
+def test_touches_are_made_of_pressures_that_carry_their_force(device):
+    movie = device.sampler.sample(32, np.random.default_rng(0))
+    width, height = device.body.cell
+    torch.testing.assert_close(
+        movie.pressure().sum((2, 3)) * width * height, movie.force, rtol=1e-3, atol=1e-3
+    )
+    assert (movie.frames >= 0).all()
+
+
+def test_a_device_draws_the_same_touches_again(device):
+    first, second = (device.replace().recording("test") for _ in range(2))
+    assert torch.equal(first.touches.readings, second.touches.readings)
+    assert torch.equal(first.touches.labels, second.touches.labels)
+
+
+@pytest.mark.parametrize("simulator", ["naive", "fem"])
+def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
+    with pytest.raises(
+        InputError, match=f"simulator={simulator}: set simulator=solid, or contact=prescribed"
+    ):
+        build_device(checked(configured("contact=rigid", f"simulator={simulator}")))
+
+
+def test_the_command_line_says_so_too(tmp_path):
+    command = [sys.executable, "experiments/train.py", "simulator=naive", "contact=rigid"]
+    command.append(f"tracking.uri=sqlite:///{tmp_path}/m.db")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=ROOT)
+    assert done.returncode == 2
+    assert "set simulator=solid" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_rigid_gestures_are_generated(tmp_path):
+    out = tmp_path / "touches.parquet"
+    command = [
+        sys.executable,
+        "experiments/generate.py",
+        "simulator=solid",
+        "contact=rigid",
+        "n=32",
+        *SMALL[:2],
+    ]
+    done = subprocess.run(
+        [*command, f"out={out}"], capture_output=True, text=True, timeout=300, check=False, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    assert "0 frames not solved" in done.stdout
+    assert out.is_file()

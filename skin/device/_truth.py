@@ -52,7 +52,7 @@ def true_readings(device: "Simulated", movie: Movie, complete: bool) -> Recordin
     Args:
         device: its body, sensors, simulator and labels.
         movie: of the gestures.
-        complete: with the displacements.
+        complete: with the displacements and, where mechanics tell it, each gesture's largest ``strain``.
     """
     readings, displacement = movie.respond(device.model, displacement=complete)
     positions = torch.from_numpy(device.sensors.positions).float()
@@ -63,4 +63,6 @@ def true_readings(device: "Simulated", movie: Movie, complete: bool) -> Recordin
     # A stream's windows have labels of their own.
     task = TOUCH if device.stream else device.task
     about = task, device.size, device.sensors.footprint
-    return Recording(touches, *about, movie.force, displacement, movie.parameters)
+    strain = device.model.strain(movie.frames, movie.drag) if complete else None
+    known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
+    return Recording(touches, *about, movie.force, displacement, movie.parameters | known)

@@ -129,14 +129,15 @@ class Simulated(AbstractDevice):
         """Return the touches of a split; fixed ones are drawn once and kept."""
         return self._split(split, epoch, complete=False).touches
 
-    def recording(self, split: Split | None = None, epoch: int = 0) -> Recording:
-        """Return the same touches with the applied force, the displacements and the gestures' parameters.
+    def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
+        """Return the same touches with the applied force and the gestures' parameters.
 
         Args:
             split: None takes the whole budget.
             epoch: matters to ``train`` with fresh gestures.
+            complete: with the displacements and the largest strains, too.
         """
-        recording = self._split(split, epoch, complete=True)
+        recording = self._split(split, epoch, complete)
         return replace(recording, metadata=self._metadata(recording, split, epoch))
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:

@@ -50,7 +50,7 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
 
 def draw_skin(device: Simulated, folder: Path, name: str = "fem") -> list[Path]:
     """Draw figures 2, 3, 4, 10 and 11 from the gestures of a skin whose simulator has a name."""
-    recording = device.recording("test")
+    recording = device.recording("test", complete=False)
     touches, drawn = recording.touches, recording.parameters
     assert touches.labels is not None
     assert recording.force is not None

@@ -162,6 +162,22 @@ class Hexahedra:
             rows = rows + sp.diags_array(weight) @ self._traction(element, local, n, m)
         return rows.tocsr()
 
+    def strain(self, points: np.ndarray) -> list[sp.csr_matrix]:
+        """Return rows (P, 3 N) for each of the strains xx, yy, zz, yz, xz, xy at points, along axes of space.
+
+        Args:
+            points: (P, 3), chart, m.
+        """
+        element, local = self._locate(points)
+        gradient = self._gradients(element, local)
+        rows = []
+        for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)):
+            values = np.zeros_like(gradient)
+            values[:, :, i] += gradient[:, :, j] / 2
+            values[:, :, j] += gradient[:, :, i] / 2
+            rows.append(self._rows(element, values))
+        return rows
+
     def _traction(
         self, element: np.ndarray, local: np.ndarray, n: np.ndarray, m: np.ndarray
     ) -> sp.csr_matrix:

@@ -127,6 +127,13 @@ class AbstractSimulator(nn.Module, ABC):
             f"simulator={self._name}: set simulator=solid, or contact=prescribed"
         )
 
+    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor | None:
+        """Return the largest principal strain of the top layer under pressures (U, H, W), (U,), 1.
+
+        By the linear solution, which holds to about 0.3. None where the simulator has no mechanics.
+        """
+        return None
+
     @property
     def _name(self) -> str:
         return type(self).__module__.rpartition(".")[2]

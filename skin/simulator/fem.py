@@ -1,5 +1,6 @@
 """The report's finite-element skin: plates and beams (report, 2.1.2), as one linear operator."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,6 +15,7 @@ from skin.simulator._assembly import Constraint, Structure
 from skin.simulator._frames import flatten
 from skin.simulator._operator import Operator, cached
 from skin.simulator._store import folder
+from skin.simulator._strain import largest, squeeze
 from skin.simulator.base import AbstractSimulator, Response
 
 __all__ = ["PlatesAndBeams", "Reading"]
@@ -70,7 +72,8 @@ class PlatesAndBeams(AbstractSimulator):
             raise InputError(f"simulator.reading must be {' or '.join(get_args(Reading))}, got {reading}")
         self.reading, self.constraint = reading, constraint
         self.shape = body.shape
-        self.operator: Operator = cached(Structure(body, constraint), sensors, folder(cache))
+        self._structure = Structure(body, constraint)
+        self.operator: Operator = cached(self._structure, sensors, folder(cache))
         force = self.operator.applied if reading == "equation10" else self.operator.carried
         rows = np.concatenate([self.operator.sensor, self.operator.surface, force])
         self.register_buffer("transfer", torch.from_numpy(rows.T.copy()).float())
@@ -102,6 +105,15 @@ class PlatesAndBeams(AbstractSimulator):
         moves = surface.abs() > torch.finfo(surface.dtype).tiny
         share = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
         return Response(share * force, displacement)
+
+    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+        """Return by how much of its thickness the top layer is squeezed where it is most, (U,)."""
+        cells = flatten(pressure, self.shape, self.transfer.dtype)
+        return largest(cells, self._squeeze.to(cells.device))
+
+    @cached_property
+    def _squeeze(self) -> Tensor:
+        return torch.from_numpy(squeeze(self._structure)[None]).float()
 
     def motion(self, pressure: Tensor) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.

@@ -19,6 +19,7 @@ from skin.simulator._elastic import Elastic
 from skin.simulator._footprint import quadrature
 from skin.simulator._frames import flatten
 from skin.simulator._hexahedra import Hexahedra
+from skin.simulator._strain import largest, solid_rows
 from skin.simulator.base import AbstractSimulator, Response
 
 __all__ = ["Solid", "hexahedra", "readings"]
@@ -67,7 +68,7 @@ class Solid(AbstractSimulator):
     ) -> None:
         super().__init__()
         self.shape, self._area = body.shape, float(np.prod(body.cell))
-        self._mesh = hexahedra(body, divisions, poisson or {})
+        self._mesh, self._divisions = hexahedra(body, divisions, poisson or {}), divisions
         self._folder = _store.folder(cache)
         self._key = _store.hashed(_content(body, self._mesh), _SOURCES)
         rows = self._operator(sensors)
@@ -111,6 +112,21 @@ class Solid(AbstractSimulator):
         loads = self._mesh.loads(_INWARDS)
         compliance = loads.T @ self.influence(_INWARDS) / self._area
         return torch.from_numpy((compliance + compliance.T) / 2)
+
+    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+        """Return the largest principal strain of the top layer, (U,); friction counts too."""
+        cells = flatten(pressure, self.shape, self.transfer.dtype)
+        axes, loads = [_INWARDS], [cells]
+        if drag is not None:
+            axes += [0, 1]
+            loads += [cells * drag[:, axis, None].to(cells) for axis in (0, 1)]
+        load, fields = torch.cat(loads, dim=1), [self.influence(axis) for axis in axes]
+
+        def read(rows: sp.csr_matrix) -> np.ndarray:
+            return np.hstack([_read(rows, field) for field in fields])
+
+        strains = solid_rows(self._mesh, self._divisions, read)
+        return torch.stack([largest(load, torch.from_numpy(rows).to(load)) for rows in strains]).amax(0)
 
     def influence(self, axis: int) -> np.ndarray:
         """Return how every node moves under 1 Pa on each cell along an axis, (3 N, cells), m/Pa."""

@@ -51,8 +51,8 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: Patience) -> None
         # As late as this, because from now on frames come.
         source = start.source(device)
         skin = open_.enter_context(source.skin)
-        facts = Facts(run.info.run_name, source.name, of.positions.numpy(), of.device.size, live["top"])
-        board = Board(facts)
+        places, span = of.positions.numpy(), of.window / of.rate
+        board = Board(Facts(run.info.run_name, source.name, places, of.device.size, live["top"], span))
         if config.web:
             said.print(f"page: {open_.enter_context(web.served(board, live['web_port']))}", highlight=False)
         session = Session(skin, source.newtons, engine, board)

@@ -1,8 +1,10 @@
 """Frame to verdict on one core; run in a process of its own.
 
-python experiments/benchmarks/live.py 1000
+python experiments/benchmarks/live.py 1000               # the best row, untrained
+python experiments/benchmarks/live.py 1000 --run latest  # what a run has learnt
 """
 
+import argparse
 import json
 import sys
 import time
@@ -27,20 +29,25 @@ __all__ = ["measure"]
 RATE = 100.0  # Hz, of the device
 ROW = "best_fresh"
 _WARM = 50  # verdicts that are not counted
+_TOUCH = 0.3  # N
 
 
-def measure(frames: int = 1000, row: str = ROW) -> dict[str, float]:
+def measure(
+    frames: int = 1000, row: str = ROW, run: str | None = None, uri: str | None = None
+) -> dict[str, float]:
     """Return the time from a frame at 100 Hz to the verdict on it, ms: median and the 99th percentile.
 
-    One thread, a simulated stream of touches, every frame classified. Weights do not matter to speed, so the
-    network is untrained. ``core_ms`` is the 99th percentile of the core's own time: what is beyond it is the
-    machine's other work.
+    One thread, a simulated stream of touches, every frame classified. ``core_ms`` is the 99th percentile of
+    the core's own time: what is beyond it is the machine's other work.
+
+    Args:
+        frames: of the device that are classified.
+        row: of the table, untrained: weights do not matter to speed.
+        run: a finished run instead, by the beginning of its id, or ``latest``.
+        uri: of the store that holds it; None: the project's own.
     """
     torch.set_num_threads(1)
-    config = configuration("simulator=naive", f"experiment={row}", "data.gestures=10")
-    device = build_device(config)
-    assert isinstance(device, Simulated)
-    engine = _engine(device, config)
+    device, engine = _untrained(row) if run is None else _trained(run, uri)
     taken = np.array([_seconds(engine, frame) for frame in _stream(device, engine, frames + _WARM)])[_WARM:]
     wall, core = 1e3 * taken.T
     return {
@@ -51,13 +58,31 @@ def measure(frames: int = 1000, row: str = ROW) -> dict[str, float]:
     }
 
 
-def _engine(device: Simulated, config) -> Engine:
-    learner, data = build_learner(config), build_data(config, device)
+def _untrained(row: str) -> tuple[Simulated, Engine]:
+    config = configuration("simulator=naive", f"experiment={row}", "data.gestures=10")
+    device, learner = build_device(config), build_learner(config)
+    assert isinstance(device, Simulated)
     assert isinstance(learner, Network)
+    data = build_data(config, device)
     learner.build(data)
-    gate = gates(Threshold(0.3), device.task)["threshold"]
     positions = data.touches("train").positions
-    return Engine(learner, device.task, positions, device.window, device.rate, gate)
+    gate = gates(Threshold(_TOUCH), device.task)["threshold"]
+    return device, Engine(learner, device.task, positions, device.window, device.rate, gate)
+
+
+def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
+    from skin.live import start
+    from skin.live.verdict import Patience
+    from skin.reload import changed, find
+    from skin.reload import configuration as stored
+    from skin.tracking import Store
+
+    config = configuration(*([f"tracking.uri={uri}"] if uri else []))
+    store = Store.open(config.tracking)
+    found = find(store, run)
+    of = start.trained(store, found, changed(stored(store, found), config, []))
+    assert isinstance(of.device, Simulated)
+    return of.device, start.engine(of, Patience(), _TOUCH)
 
 
 def _stream(device: Simulated, engine: Engine, count: int) -> list[Frame]:
@@ -80,5 +105,17 @@ def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
     return time.perf_counter() - wall, time.thread_time() - core
 
 
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("frames", type=int, nargs="?", default=1000)
+    parser.add_argument("--run", help="the beginning of the id of a finished run, or latest")
+    parser.add_argument("--uri", help="of the store that holds it, as in sqlite:///mlflow.db")
+    given = parser.parse_args()
+    print(json.dumps(measure(given.frames, run=given.run, uri=given.uri)))
+
+
 if __name__ == "__main__":
-    print(json.dumps(measure(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)))
+    main()

@@ -24,6 +24,7 @@ class Facts:
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m.
         top: N at the end of the colour scale.
+        window: s that a verdict is about.
     """
 
     title: str
@@ -31,6 +32,7 @@ class Facts:
     positions: np.ndarray
     size: tuple[float, float]
     top: float
+    window: float = 3.0
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,8 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(stor
     emulator = started(tmp_path, "emulate.py", "simulator=naive", f"link={link}", *pace, *faults)
     live = None
     try:
-        until(link.exists, emulator, "the port")
-        scale = re.search(r"device\.scale=(\S+)", (tmp_path / "emulate.py.out").read_text())[1]
+        told = lambda: re.search(r"device\.scale=(\S+)\n", (tmp_path / "emulate.py.out").read_text())  # noqa: E731
+        scale = until(told, emulator, "the port")[1]
         reader = ["device=serial", f"device.port={link}", f"device.scale={scale}", "device.backoff=[0.2,0.5]"]
         live = started(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store)
         said = tmp_path / "live.py.err"

@@ -1,0 +1,73 @@
+"""A real browser, driven over HTTP as the W3C's WebDriver has it: no package is needed for that."""
+
+import json
+import re
+import shutil
+import subprocess
+import urllib.request
+from base64 import b64decode
+from typing import Any
+
+__all__ = ["Browser", "installed"]
+
+_OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
+_PATIENCE = 180  # s
+
+
+def installed() -> tuple[str, str] | None:
+    """Return where Chromium's driver and Chromium are; None where one of them is missing."""
+    driver = shutil.which("chromedriver")
+    binary = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+    return (driver, binary) if driver and binary else None
+
+
+class Browser:
+    """A headless Chromium behind its driver.
+
+    Args:
+        driver: its path.
+        binary: Chromium's path.
+        size: of the window, pixels.
+    """
+
+    def __init__(self, driver: str, binary: str, size: tuple[int, int] = (1100, 860)) -> None:
+        self._process = subprocess.Popen([driver, "--port=0"], stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        found = next(
+            found
+            for line in self._process.stdout
+            if (found := re.search(r"successfully on port (\d+)", line))
+        )
+        self._address = f"http://127.0.0.1:{found[1]}/session"
+        options = [*_OPTIONS, f"--window-size={size[0]},{size[1]}"]
+        chrome = {"goog:chromeOptions": {"binary": binary, "args": options}}
+        made = self._ask("", {"capabilities": {"alwaysMatch": chrome}})
+        self._address += f"/{made['sessionId']}"
+
+    def _ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(
+            self._address + path, data, {"Content-Type": "application/json; charset=utf-8"}
+        )
+        with urllib.request.urlopen(request, timeout=_PATIENCE) as answer:
+            return json.load(answer)["value"]
+
+    def open(self, address: str) -> None:
+        """Go to a page."""
+        self._ask("/url", {"url": address})
+
+    def run(self, script: str) -> Any:
+        """Return what a script returns."""
+        return self._ask("/execute/sync", {"script": script, "args": []})
+
+    def picture(self) -> bytes:
+        """Return the page as a PNG."""
+        return b64decode(self._ask("/screenshot"))
+
+    def close(self) -> None:
+        """End browser and driver."""
+        urllib.request.urlopen(urllib.request.Request(self._address, method="DELETE"), timeout=30).close()
+        self._process.terminate()
+        self._process.wait(30)
+        if self._process.stdout is not None:
+            self._process.stdout.close()

@@ -9,6 +9,7 @@ from torch import Tensor
 from skin.errors import InputError
 
 __all__ = [
+    "OPPOSITE",
     "TOUCH",
     "TOUCH_OR_NOT",
     "TOUCH_SLIDING",
@@ -107,6 +108,10 @@ def sliding(net: Tensor, way: Tensor) -> Tensor:
     far = torch.linalg.vector_norm(net, dim=1)
     straight = (far > 0) & (far >= _STRAIGHT * way)
     return net / far.where(straight, 1)[:, None] * straight[:, None]
+
+
+OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
+"""Label -> what a touch is without it."""
 
 
 @dataclass(frozen=True)

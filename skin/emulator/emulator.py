@@ -18,6 +18,7 @@ from skin.errors import InputError
 from skin.port.binary import encode_frame
 from skin.port.frame import Check
 from skin.port.text import Header, encode_header, encode_line
+from skin.session.takes import sentence
 from skin.streams import Stream, generator
 
 __all__ = ["Emulator", "Settings"]
@@ -212,8 +213,7 @@ class Emulator:
 
     def _announce(self, number: int, gesture: Gesture) -> None:
         t, frames = self._number / self.settings.rate, len(gesture.force) * self.settings.rate
-        words = ", ".join(name if on else f"not {name}" for name, on in gesture.labels.items())
-        self._told(t, f"gesture {number}: {words}")
+        self._told(t, f"gesture {number}: {sentence(gesture.labels)}")
         if self.settings.announce and not self.binary:
             seq = self._number - self._zero
             self._send(encode(Announcement(number, seq, round(frames / self.device.rate), gesture.labels)))

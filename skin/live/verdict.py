@@ -3,11 +3,9 @@
 from dataclasses import dataclass, field
 
 from skin.errors import InputError
+from skin.labels import OPPOSITE
 
-__all__ = ["OPPOSITE", "Debounce", "Patience", "Verdict"]
-
-OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
-"""Label -> what a touch is without it."""
+__all__ = ["Debounce", "Patience", "Verdict"]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Which frames are a gesture, and what its labels are: announced, prompted, or unknown."""
 
+import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,7 +11,7 @@ from threading import Thread
 import numpy as np
 
 from skin.errors import InputError
-from skin.labels import Task
+from skin.labels import OPPOSITE, Task
 from skin.port.frame import Frame
 from skin.session.tap import Tap
 from skin.streams import Stream, generator
@@ -54,8 +55,17 @@ def plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
 
 
 def sentence(labels: Labels) -> str:
-    """Return labels in words."""
-    return ", ".join(name if on else f"not {name}" for name, on in labels.items())
+    """Return labels in words, as ``small, dynamic, press, safe``."""
+    return ", ".join(name if on else OPPOSITE.get(name, f"not {name}") for name, on in labels.items())
+
+
+def _typed() -> Iterator[str]:
+    """Yield the lines that a person types."""
+    rest = b""
+    # Not from sys.stdin: a thread that waits there cannot be left when the program ends.
+    while data := os.read(sys.stdin.fileno(), 1024):
+        *lines, rest = (rest + data).split(b"\n")
+        yield from (line.decode(errors="replace") for line in lines)
 
 
 class AbstractDirector(ABC):
@@ -140,7 +150,8 @@ class Prompted(AbstractDirector):
         length: of a window, s.
         wanted: (number, labels) of the gestures.
         tell: says a sentence to the person.
-        lines: what the person types; None: standard input.
+        lines: what the person types; None: standard input. What is typed before it is asked for counts,
+            unless it comes from a keyboard.
     """
 
     def __init__(
@@ -154,22 +165,34 @@ class Prompted(AbstractDirector):
         self._wanted, self._tell = wanted, tell
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
+        self._over_now = False
+        self._hasty = lines is None and sys.stdin.isatty()
         # A thread, because frames come while a person thinks.
-        Thread(target=self._listen, args=(lines or sys.stdin,), daemon=True).start()
+        Thread(target=self._listen, args=(lines or _typed(),), daemon=True).start()
 
     def _listen(self, lines: Iterator[str]) -> None:
         for line in lines:
             self._typed.put(line.strip().lower())
+        self._hasty = False
         self._typed.put("q")
+
+    def _close(self, frame: Frame) -> Take | None:
+        done = super()._close(frame)
+        # The next one is asked for a frame later, so that what is said of this one is said before.
+        self._over_now = done is not None
+        return done
 
     def show(self, frame: Frame) -> Take | None:
         """As above; a gesture that broke off is asked for again."""
         done = super().show(frame)
         if done is not None and done.broken and done.labels is not None:
+            self._tell("that one broke off: the skin was unplugged or started anew")
             self._ask((done.number, done.labels))
         return done
 
     def _begin(self, frame: Frame) -> Take | None:
+        if self._over_now:
+            return None
         if self._asked is None:
             following = next(self._wanted, None)
             if following is None:
@@ -183,11 +206,17 @@ class Prompted(AbstractDirector):
         number, labels = self._asked or (0, {})
         self._asked = None
         self.over = said == "q"
-        return None if said in ("q", "s") else Take(number, labels, frame.t, frame.segment)
+        if said in ("q", "s"):
+            return None
+        self._tell(f"  now: {self._length:g} s")
+        return Take(number, labels, frame.t, frame.segment)
 
     def _ask(self, asked: tuple[int, Labels]) -> None:
         self._asked = asked
-        self._tell(f"gesture {asked[0]}: {sentence(asked[1])} - Enter and touch, s skips, q ends")
+        # Enter pressed twice is no second gesture.
+        while self._hasty and not self._typed.empty():
+            self._typed.get_nowait()
+        self._tell(f"next: {sentence(asked[1])} - press Enter, then touch; s skips it, q ends")
 
 
 class Continuous(AbstractDirector):

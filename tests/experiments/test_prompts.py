@@ -1,0 +1,186 @@
+"""A person at the keyboard: what is asked for, what Enter, s and q do, and going on after a kill."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+from itertools import count
+from threading import Event, Thread, Timer
+
+import numpy as np
+import pytest
+
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+
+from skin.config import ROOT
+from skin.port.text import Header, encode_header, encode_line
+from skin.session.log import read as read_session
+from skin.storage import read
+
+SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
+PATIENCE = 300.0  # s: machines are busy at times
+PACE = 0.002  # s of the wall for 10 ms of the device
+
+
+@pytest.fixture
+def address():
+    """Return the address of a skin of four sensors at 100 Hz, in N; it serves one reader after the other."""
+    server, stop = socket.create_server(("127.0.0.1", 0)), Event()
+
+    def serve():
+        rng = np.random.default_rng(0)
+        while not stop.is_set():
+            try:
+                device, _ = server.accept()
+            except OSError:
+                return
+            with device:
+                try:
+                    device.sendall(encode_header(Header(n=4, rate=100.0, unit="N")))
+                    for number in count():
+                        values = rng.normal(scale=0.02, size=4) + 2.0 * (number > 600 and number % 100 > 80)
+                        device.sendall(encode_line(values.round(4), number, 10_000 * number))
+                        if stop.wait(PACE):
+                            return
+                except OSError:
+                    continue
+
+    Thread(target=serve, daemon=True).start()
+    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+    stop.set()
+    server.close()
+
+
+class Person:
+    """Somebody who reads what a command says, and types."""
+
+    def __init__(self, process, keyboard):
+        self.process, self._keyboard = process, keyboard
+        self.heard = []
+
+    def until(self, words):
+        """Read on until a line has some words; return it."""
+        for line in self.process.stderr:
+            self.heard.append(line.rstrip())
+            if words in line:
+                return line.strip()
+        raise AssertionError(f"waited in vain for {words!r} after\n" + "\n".join(self.heard))
+
+    def types(self, line):
+        os.write(self._keyboard, line.encode() + b"\n")
+
+
+@contextmanager
+def person_at(folder, script, *arguments):
+    """Start a command on a terminal of its own."""
+    keyboard, terminal = os.openpty()
+    command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
+    with subprocess.Popen(
+        command, cwd=folder, stdin=terminal, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        os.close(terminal)
+        impatience = Timer(PATIENCE, process.kill)
+        impatience.start()
+        try:
+            yield Person(process, keyboard)
+        finally:
+            impatience.cancel()
+            process.kill()
+            os.close(keyboard)
+
+
+def ended(person):
+    """Return exit code and results of a command that ends by itself."""
+    said, errors = person.process.communicate(timeout=300)
+    assert "Traceback" not in errors, errors
+    assert "Fatal" not in errors, errors
+    return person.process.returncode, said
+
+
+@pytest.mark.slow
+def test_recording_with_enter_s_q_and_going_on_after_a_kill(address, tmp_path):
+    command = ["record.py", *SKIN, "out=s.csv", f"device.port={address}", "device.gestures=6"]
+    asked = re.compile(r"next: (big|small), (dynamic|static), (press|tap), (dangerous|safe) - press Enter")
+    with person_at(tmp_path, *command) as person:
+        person.until("keep off")
+        first = person.until("next: ")
+        assert asked.match(first)
+        person.types("")
+        assert person.until("now") == "now: 0.5 s"
+        person.until("1 of 6 gestures")
+        skipped = person.until("next: ")
+        assert skipped != first
+        person.types("s")
+        third = person.until("next: ")
+        assert third not in (first, skipped)
+        # Enter pressed twice is no second gesture.
+        os.write(person._keyboard, b"\n\n\n")
+        person.until("2 of 6 gestures")
+        person.until("next: ")
+        person.process.kill()
+    with person_at(tmp_path, *command) as person:
+        person.until("s.csv has 2 gestures: going on")
+        assert person.until("next: ") == skipped
+        person.types("")
+        person.until("3 of 6 gestures")
+        person.until("next: ")
+        person.types("q")
+        assert ended(person) == (0, "s.parquet: 3 gestures\n")
+    takes = read_session(tmp_path / "s.csv").takes
+    assert sorted(takes) == [0, 1, 2]
+    stored = read(tmp_path / "s.parquet")
+    words = [re.split(r"[ ,]+", line)[1:5] for line in (first, skipped, third)]
+    yes = ("big", "dynamic", "press", "dangerous")
+    assert stored.touches.labels.int().tolist() == [[int(yes[n] == w[n]) for n in range(4)] for w in words]
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_a_prompt_keeps_what_there_is(address, tmp_path):
+    with person_at(tmp_path, "record.py", *SKIN, "out=s.csv", f"device.port={address}") as person:
+        person.until("next: ")
+        person.types("")
+        person.until("1 of 48 gestures")
+        person.until("next: ")
+        person.process.send_signal(signal.SIGINT)
+        assert ended(person) == (0, "s.parquet: 1 gestures\n")
+
+
+@pytest.mark.slow
+def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(address, tmp_path):
+    command = ["record.py", *SKIN, "out=f.csv", f"device.port={address}", "record.free=true"]
+    with person_at(tmp_path, *command) as person:
+        person.until("2 of any gestures")
+        person.process.kill()
+    done = len(read_session(tmp_path / "f.csv").takes)
+    assert done >= 2
+    with person_at(tmp_path, *command, "seconds=5") as person:
+        code, said = ended(person)
+    stored = read(tmp_path / "f.parquet")
+    assert (code, said) == (0, f"f.parquet: {len(stored)} gestures\n")
+    assert len(stored) > done
+    assert stored.touches.labels is None
+
+
+@pytest.mark.slow
+def test_evaluating_a_person(address, tmp_path):
+    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
+    small = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
+    small += ["evaluation.layouts=1", "evaluation.gestures=96"]
+    with person_at(tmp_path, "train.py", "experiment=rules", *SKIN[:-1], *small, *own) as trained:
+        assert ended(trained)[0] == 0, trained.heard
+    there = ["device=serial", f"device.port={address}", "device.labels=prompted", "device.gestures=16"]
+    with person_at(tmp_path, "evaluate.py", *there, f"out={tmp_path}", *own) as person:
+        for number in range(1, 4):
+            person.until("next: ")
+            person.types("")
+            person.until(f"{number}/16: ")
+        person.until("next: ")
+        person.types("q")
+        code, said = ended(person)
+    assert code == 0
+    assert "overall/accuracy" in said
+    page = (tmp_path / "evaluation_serial.md").read_text()
+    assert "3 gestures" in page

@@ -88,7 +88,7 @@ def evaluate(learner: Answers, device: AbstractDevice, settings: Evaluation) -> 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
     """Return the test touches and, where they were simulated, how each was drawn."""
     if isinstance(device, Simulated):
-        recording = device.recording("test")
+        recording = device.recording("test", complete=False)
         return recording.touches, recording.parameters
     return device.touches("test"), {}
 
@@ -106,14 +106,18 @@ def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
 
 
 def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield test touches as as many sensors at other places feel them."""
+    """Yield test touches as as many sensors at other places, that lean as these do, feel them."""
     count = len(device.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
         raise InputError(f"{count} sensors make no grid that could be scattered anew")
     for number in range(settings.layouts):
         layout = Scattered(
-            rows, count // rows, seed=_FIRST_LAYOUT + number, footprint=device.sensors.footprint
+            rows,
+            count // rows,
+            seed=_FIRST_LAYOUT + number,
+            footprint=device.sensors.footprint,
+            normals=device.sensors.normals,
         )
         yield device.replace(layout=layout, test_gestures=settings.gestures).touches("test")
 

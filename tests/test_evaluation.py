@@ -1,12 +1,14 @@
 """Every column is what it says: the same device, unseen devices, unseen layouts, the budget's last tenth."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.errors import InputError
-from skin.evaluation import evaluate
+from skin.evaluation import columns, evaluate
 from skin.labels import TOUCH
 
 SETTINGS = Evaluation(devices=2, layouts=2, gestures=32, false_alarm_rate=0.02)
@@ -54,6 +56,22 @@ def test_unseen_devices_feel_the_same_gestures_each_in_its_own_way(tried):
     assert torch.equal(second.positions, same.positions)
     assert torch.equal(first.labels, second.labels)
     assert not torch.equal(first.readings, second.readings)
+
+
+def test_unseen_layouts_lean_as_the_known_one_does(configured):
+    """As a layout of that seed and tilt does, and unlike one whose sensors face the surface."""
+    solid = "simulator=solid", "simulator.divisions=1", "body.cells=[8,8]", "data.gestures=10"
+    scattered = "layout=scattered", "layout.rows=3", "layout.columns=4"
+    known = build_device(configured(*solid, *scattered, "layout.tilt=0.5"))
+    settings = replace(SETTINGS, layouts=1, gestures=16)
+    (unseen,) = columns(known, settings)["unseen_layout"]
+    for tilt, same in ((0.5, True), (0.0, False)):
+        other = configured(
+            *solid, *scattered, f"layout.tilt={tilt}", "layout.seed=101", "device.test_gestures=16"
+        )
+        touches = build_device(other).touches("test")
+        assert torch.equal(touches.positions, unseen.positions)
+        assert torch.equal(touches.readings, unseen.readings) == same
 
 
 def test_no_unseen_device_is_the_one_of_the_training(device, tried):

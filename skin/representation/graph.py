@@ -69,11 +69,14 @@ def adjacency(
     the line between them where the modulus varies, over that of a strip of length d0 in a skin without
     variation ("other physical information", report, 2.2.1): d0 / d in a skin of uniform layers, whatever w.
 
+    Distances are those along the surface, on a sheet and on an arm alike: a straight line of the chart is the
+    shortest way on a cylinder too, and the strip of skin along it is the one that is stretched.
+
     Args:
         positions: (S, 3), m.
         linked: (S, S), bool, symmetric.
         weight: see above.
-        body: the sheet; only ``stiffness`` needs it.
+        body: whose surface; only ``stiffness`` needs it.
 
     Raises:
         InputError: an unknown weight, or stiffness without a body.
@@ -142,7 +145,7 @@ class Graph(AbstractRepresentation):
         coordinates: append x / size_x and y / size_y as the last two node features of every frame.
         scale: N; readings are divided by it.
         mask: append a node feature that tells whether the reading is valid.
-        body: the sheet as it is believed to be; only ``weight=stiffness`` needs it.
+        body: the skin as it is believed to be; only ``weight=stiffness`` needs it.
 
     Raises:
         InputError: an unknown option, or sensors of which the graph cannot be made.

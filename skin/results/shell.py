@@ -136,7 +136,7 @@ def _stand(axis: Axes3D, shell: _Shell, above: float = 0.0) -> None:
     )
     low, high = reached.min(axis=0), reached.max(axis=0)
     axis.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), zlim=(low[2], high[2]))
-    axis.set_box_aspect(tuple(high - low), zoom=1.3)
+    axis.set_box_aspect(tuple(high - low), zoom=1.15)
     axis.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     axis.set_axis_off()
 

@@ -1,0 +1,101 @@
+"""The arm from end to end: what works on a sheet works on it, in its chart."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from skin.build import build_data, build_device
+from skin.errors import InputError
+from skin.results.moving import change
+from skin.storage import read, write
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+SOLID = (
+    "simulator=solid",
+    "simulator.divisions=1",
+    "body.cells=[10,10]",
+    "layout=grid",
+    "data.gestures=16",
+    "device.test_gestures=16",
+)
+
+
+def run(folder: Path, name: str, *overrides: str) -> subprocess.CompletedProcess:
+    store = f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/artifacts"
+    command = [sys.executable, str(EXPERIMENTS / name), *overrides, *store]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
+
+
+@pytest.mark.slow
+def test_generated_touches_train_and_are_evaluated(tmp_path):
+    arm = "body=arm", "body.angle=2.5", "layout=grid"
+    made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet")
+    assert made.returncode == 0, made.stderr
+    assert read(tmp_path / "arm.parquet").size == pytest.approx((0.125, 0.16))
+    recording = *arm, "device=recording", "device.path=arm.parquet"
+    done = run(tmp_path, "train.py", *recording, "experiment=temporal_graph", "trainer.max_epochs=1")
+    assert done.returncode == 0, done.stderr
+    tried = run(tmp_path, "evaluate.py", "run=latest", f"out={tmp_path}")
+    assert tried.returncode == 0, tried.stderr
+    assert (tmp_path / "evaluation_recording.md").is_file()
+
+
+def test_plates_do_not_bend_and_a_sentence_says_what_does(tmp_path):
+    done = run(tmp_path, "train.py", "body=arm", "simulator=fem")
+    assert done.returncode == 2
+    assert "plates and beams are flat, body=arm is not: set simulator=solid" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("representation", ["image", "interp", "graph", "measured"])
+def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configured, representation):
+    """Touches, labels and pictures live in the chart, so nothing but mechanics can tell the two apart."""
+    shown = []
+    for body in ("sheet", "arm"):
+        config = configured(
+            f"body={body}", "simulator=naive", "data.gestures=16", f"representation={representation}"
+        )
+        device = build_device(config)
+        frames, labels = build_data(config, device).frames(device.touches("holdout"))
+        shown.append([labels, frames.x] + [frames.adjacency] * (representation == "graph"))
+    for sheet, arm in zip(*shown, strict=True):
+        torch.testing.assert_close(arm, sheet)
+
+
+@pytest.mark.parametrize("name", ["x.parquet", "x.csv"])
+def test_a_recording_keeps_the_size_of_the_arm(configured, tmp_path, name):
+    arm = "body=arm", "body.angle=2.5", "layout=grid", "simulator=naive", "data.gestures=12"
+    path = write(build_device(configured(*arm)).recording(), tmp_path / name)
+    recorded = "device=recording", f"device.path={path}", *arm[:3]
+    assert build_device(configured(*recorded)).size == pytest.approx((0.125, 0.16))
+    with pytest.raises(InputError, match=r"of 0.125 x 0.16 m, the body is 0.1 x 0.16 m: add body.angle=2.5 "):
+        build_device(configured(*recorded, "body.angle=2"))
+
+
+def test_a_large_arm_reads_what_a_sheet_reads(configured):
+    """The same skin as a box and as a part of a very large cylinder."""
+    sheet = build_device(configured(*SOLID, "device.noise=0"))
+    large = "body=arm", "body.radius=1000", "body.angle=0.16e-3"
+    arm = build_device(configured(*large, *SOLID, "device.noise=0"))
+    flat, bent = (device.touches("test").readings for device in (sheet, arm))
+    torch.testing.assert_close(bent, flat, rtol=1e-3, atol=1e-3)
+    # ... and of a small one it does not.
+    small = build_device(configured("body=arm", *SOLID, "device.noise=0")).touches("test").readings
+    assert (small - flat).abs().max() > 0.02 * flat.abs().max()
+
+
+def test_sensors_on_the_arm_move_and_graphs_follow_them(configured):
+    graph = "representation=graph", "representation.positions=deformed", "device.track=oracle"
+    config = configured("body=arm", *SOLID, *graph, "fusion=late", "model=gcn")
+    device = build_device(config)
+    found = change(device, 16)
+    assert 1e-4 < found.largest < 1
+    assert min(found.furthest) > 1e-5
+    assert np.isfinite(found.explained).all()
+    frames, _ = build_data(config, device).frames(device.touches("test"))
+    assert frames.adjacency.shape == (16, 30, 25, 25)
+    assert (frames.adjacency[:, 1:] != frames.adjacency[:, :1]).any()

@@ -2,16 +2,13 @@
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks import mechanics, training
 from benchmarks.generation import GESTURES
-from benchmarks.setting import seconds
+from benchmarks.setting import machine, seconds, versions
 from benchmarks.wire import decode_core_share
 from rich.console import Console
 
@@ -32,8 +29,8 @@ def main() -> None:
     repeats, say = arguments.repeats, Console(stderr=True).print
     figures = {
         "repeats": repeats,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}",
-        "versions": {name: version(name) for name in PACKAGES},
+        "machine": machine(),
+        "versions": versions(PACKAGES),
     }
     say("generation, device, live")
     figures["generation"] = {name: _own("generation", name, str(repeats)) for name in SIMULATORS}
@@ -43,11 +40,14 @@ def main() -> None:
     figures["operator"] = {name: _own("building", name, str(repeats)) for name in SIMULATORS}
     say("peers of the finite-element skins: about two minutes")
     pynite = mechanics.pynite_seconds_per_frame(repeats)
+    if pynite is None:
+        say("PyNite is not installed: the ratio to it is left out")
     for name in SIMULATORS[1:]:
         own = figures["generation"][name]
         frames = round(GESTURES * own["frames_per_second"] / own["gestures_per_second"])
         direct = mechanics.direct_seconds_per_frame(name, frames, repeats)
-        own["ratio_to_pynite"] = pynite * own["frames_per_second"]
+        if pynite is not None:
+            own["ratio_to_pynite"] = pynite * own["frames_per_second"]
         own["ratio_to_direct_solve"] = direct * own["frames_per_second"]
     say("start")
     command = [sys.executable, str(HERE / "train.py"), "--help"]
@@ -66,15 +66,6 @@ def _own(module: str, *arguments: str) -> dict[str, float]:
     """Measure in a process of its own, so that its peak memory and its threads are its own."""
     command = [sys.executable, str(HERE / "benchmarks" / f"{module}.py"), *arguments]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-
-
-def _processor() -> str:
-    """Return the processor's name where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """How long the peers of the finite-element skins take to answer one frame."""
 
 from collections.abc import Callable
+from importlib.util import find_spec
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -50,8 +51,13 @@ def _system(simulator: str) -> tuple[Callable[[], csc_matrix], csc_matrix]:
     return lambda: mesh.stiffness()[free][:, free].tocsc(), mesh.loads(2)[free]
 
 
-def pynite_seconds_per_frame(repeats: int) -> float:
-    """Return PyNite's seconds per load case on the same mesh (median); building its model is not counted."""
+def pynite_seconds_per_frame(repeats: int) -> float | None:
+    """Return PyNite's seconds per load case on the same mesh (median); building its model is not counted.
+
+    None where PyNite, a development dependency, is not installed.
+    """
+    if find_spec("Pynite") is None:
+        return None
     structure = Structure(_device().body)
     frame = _pressures()[0].reshape(structure.body.shape)
     models = iter([_pynite.model(structure, frame) for _ in range(repeats + 1)])

@@ -9,7 +9,6 @@ import os
 import subprocess
 import sys
 import time
-import tty
 from dataclasses import dataclass, field
 from functools import partial
 from typing import get_args
@@ -56,6 +55,8 @@ def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[st
         of a short soak, and at the end, bytes; the rate reached, Hz, and how many lines were sent more than
         50 ms late; the shares of a core that reader, with this comparison, and sender took.
     """
+    import tty  # not on Windows, where the rest of this runs
+
     master, slave = os.openpty()
     tty.setraw(slave)
     tally = _Tally(round(seconds * rate), after=min(_MINUTE, seconds / 10))

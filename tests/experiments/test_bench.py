@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from skin.config import ROOT
 
 GENERATION = ROOT / "experiments" / "benchmarks" / "generation.py"
@@ -45,3 +47,22 @@ def test_building_starts_cold_each_time(tmp_path, monkeypatch):
     assert figures["build_seconds"] > 0.02
     assert 1e8 < figures["peak_memory_bytes"] < 1.5e9
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_installed_is_left_out():
+    script = (
+        f"import sys; sys.path.insert(0, {str(ROOT / 'experiments')!r}); sys.modules['Pynite'] = None\n"
+        "import benchmarks.mechanics as mechanics, benchmarks.setting as setting\n"
+        "print(mechanics.pynite_seconds_per_frame(3), *setting.versions(['numpy', 'no-such-package']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert done.stdout.split() == ["None", "numpy"], done.stderr
+
+
+@pytest.mark.slow
+def test_a_verdict_is_timed_by_the_wall_and_by_the_core():
+    command = [sys.executable, str(GENERATION.with_name("live.py")), "30"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    figures = json.loads(done.stdout)
+    assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share"}
+    assert 0 < figures["p50_ms"] <= figures["p99_ms"]

@@ -129,6 +129,7 @@ class Config:
     faults: dict[str, Any] | None = None
     record: dict[str, Any] | None = None
     compare: dict[str, Any] | None = None
+    direction: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

@@ -95,7 +95,8 @@ def _estimated(device: "Simulated") -> Tracker:
 def _motion(simulator: AbstractSimulator, movie: Movie) -> Tensor:
     """Return the motion (B, T, S, 3), m, of sensors under gestures; each distinct frame is solved once."""
     home = next(simulator.buffers(), movie.frames).device
-    motion = simulator.motion(movie.frames.to(home))[movie.index.to(home)]
+    drag = None if movie.drag is None else movie.drag.to(home)
+    motion = simulator.motion(movie.frames.to(home), drag)[movie.index.to(home)]
     return motion * movie.scale.to(home)[..., None, None]
 
 

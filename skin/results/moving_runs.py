@@ -25,7 +25,7 @@ from skin.reload import changed, configuration, restore
 from skin.run import PARENT, train
 from skin.tracking import Store
 
-__all__ = ["LINES", "Settings", "Trial", "conditions", "latest", "train_lines", "try_run"]
+__all__ = ["LINES", "Settings", "Trial", "children_of", "conditions", "latest", "train_lines", "try_run"]
 
 LINES = {
     "layout": [],
@@ -207,7 +207,7 @@ def train_lines(overrides: Sequence[str], seeds: Sequence[int]) -> list[Trial]:
     store = Store.open(next(iter(configs.values())).tracking)
     todo = [one for one in configs.values() if not store.find("FINISHED", fingerprint=fingerprint(one))]
     if todo:
-        with store.run("moving", {"sweep": "moving"}) as parent, _children_of(parent):
+        with store.run("moving", {"sweep": "moving"}) as parent, children_of(parent):
             for config in track(todo, "training", console=Console(stderr=True)):
                 train(config)
     found: dict[str, dict[str, float]] = {}
@@ -218,7 +218,7 @@ def train_lines(overrides: Sequence[str], seeds: Sequence[int]) -> list[Trial]:
 
 
 @contextmanager
-def _children_of(parent: Run) -> Iterator[None]:
+def children_of(parent: Run) -> Iterator[None]:
     """Make trainings in this process children of a run, as those of a sweep are."""
     before = os.environ.get(PARENT)
     os.environ[PARENT] = parent.info.run_id

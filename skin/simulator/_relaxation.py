@@ -106,13 +106,17 @@ class Relaxing(AbstractSimulator):
         """Return the response to pressure (..., H, W), Pa, that has always been there."""
         return self._relaxed(pressure, drag)
 
-    def motion(self, pressure: Tensor) -> Tensor:
+    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return how far sensors move under pressure that has always been there, (..., S, 3), m."""
-        return self._relaxed.motion(pressure)
+        return self._relaxed.motion(pressure, drag)
 
     def compliance(self) -> Tensor:
         """Return the compliance for pressure that has always been there, (H*W, H*W), m/Pa."""
         return self._relaxed.compliance()
+
+    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor | None:
+        """Return the largest strain under pressure that has always been there, (U,): no load has a larger."""
+        return self._relaxed.strain(pressure, drag)
 
     def play(
         self,

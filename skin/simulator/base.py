@@ -103,13 +103,13 @@ class AbstractSimulator(nn.Module, ABC):
                 "forces across the surface: set simulator=solid, or give normals (0, 0, 1)"
             )
 
-    def motion(self, pressure: Tensor) -> Tensor:
+    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
 
-        Positively homogeneous like the response.
+        Positively homogeneous like the response, and with ``drag`` (..., 2) as :meth:`forward` takes it.
 
         Raises:
-            InputError: in this simulator sensors do not move along the sheet.
+            InputError: in this simulator sensors do not move along the sheet, or it feels no drag.
         """
         raise InputError(
             f"sensors that move need a simulator in which they can, got simulator={self._name}: "

@@ -115,12 +115,14 @@ class PlatesAndBeams(AbstractSimulator):
     def _squeeze(self) -> Tensor:
         return torch.from_numpy(squeeze(self._structure)[None]).float()
 
-    def motion(self, pressure: Tensor) -> Tensor:
+    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
 
         Raises:
-            InputError: nodes are held along x and y.
+            InputError: nodes are held along x and y; or drag.
         """
+        if drag is not None:
+            self.refuse_drag()
         if self.constraint != "free":
             raise InputError(
                 "sensors that move need a skin that does, got simulator.constraint="

@@ -82,11 +82,15 @@ class Solid(AbstractSimulator):
 
     def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return readings, D_s and D_t, (..., 3 S)."""
+        return self._rows(pressure, drag, slice(3 * self._sensors))
+
+    def _rows(self, pressure: Tensor, drag: Tensor | None, chosen: slice) -> Tensor:
+        """Return some rows of the operator times the load of pressure and drag."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
-        felt = cells @ self.transfer[_INWARDS, :, : 3 * self._sensors]
+        felt = cells @ self.transfer[_INWARDS, :, chosen]
         if drag is not None:
             for axis in (0, 1):
-                part = cells @ self.transfer[axis, :, : 3 * self._sensors]
+                part = cells @ self.transfer[axis, :, chosen]
                 felt = felt + drag[..., axis, None].to(part) * part
         return felt
 
@@ -95,14 +99,12 @@ class Solid(AbstractSimulator):
         readings, sensor, surface = linear.chunk(3, dim=-1)
         return Response(readings, torch.stack([sensor, surface], dim=-1))
 
-    def motion(self, pressure: Tensor) -> Tensor:
+    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m."""
-        cells = flatten(pressure, self.shape, self.transfer.dtype)
         count = self._sensors
-        rows = self.transfer[_INWARDS]
-        along = cells @ rows[:, 3 * count :]
-        inwards = cells @ rows[:, count : 2 * count]
-        return torch.stack([*along.chunk(2, dim=-1), inwards], dim=-1)
+        moves = self._rows(pressure, drag, slice(count, 5 * count))
+        inwards, _, x, y = moves.chunk(4, dim=-1)
+        return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:
         """Return C (cells, cells), m/Pa: how far each cell's surface moves inwards under 1 Pa on each cell.

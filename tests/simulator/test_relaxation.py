@@ -172,6 +172,7 @@ def test_pressure_that_has_always_been_there_meets_the_relaxed_skin():
     relaxing = Relaxing(PlatesAndBeams, sheet(SLOW, FAST), SENSORS, RATE)
     plain = PlatesAndBeams(sheet(None, None), SENSORS)
     assert torch.equal(relaxing(movie()[0, 10]).readings, plain(movie()[0, 10]).readings)
+    assert torch.equal(relaxing.strain(movie()[0]), plain.strain(movie()[0]))
 
 
 def test_a_slow_load_meets_the_relaxed_skin_and_a_fast_one_the_stiff_one():

@@ -167,3 +167,15 @@ def test_the_measured_ratio_of_dragon_skin_is_refused_by_name():
     body = Sheet([0.12, 0.12], [12, 12], [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}])
     with pytest.raises(InputError, match=r"Dragon Skin 10 Medium has Poisson's ratio 0\.54"):
         solid(sensors((0.06, 0.06, 0.0)), body)
+
+
+def test_sensors_move_with_what_slides_over_them():
+    """Under a drag along x they go along x, and by symmetry neither along y nor deeper."""
+    body = Sheet([0.16, 0.16], [8, 8], LAYERS)
+    solid = Solid(body, Sensors(np.array([[0.08, 0.08, 0.005]]), (0.02, 0.02)), divisions=1)
+    pressure = torch.zeros(1, 8, 8)
+    pressure[:, 3:5, 3:5] = 1e4
+    still, pulled = solid.motion(pressure), solid.motion(pressure, torch.tensor([[0.5, 0.0]]))
+    assert pulled[0, 0, 0] > 1e-6
+    torch.testing.assert_close(pulled[0, 0, 1:], still[0, 0, 1:], atol=1e-8, rtol=1e-4)
+    torch.testing.assert_close(still[0, 0, :2], torch.zeros(2), atol=1e-8, rtol=0)

@@ -1,0 +1,25 @@
+"""What friction and sensors that lean tell of the direction of sliding: python experiments/direction.py
+
+Trains each row on three skins of simulator=solid: upright sensors without friction and with it, tilted ones
+with it. Overrides of the training follow: trainer.max_epochs=30 direction.rows=[gru] layout.path=mine.csv
+"""
+
+from pathlib import Path
+
+from skin.config import ROOT, DictConfig, command, overrides, plain
+
+
+@command("direction")
+def main(config: DictConfig) -> None:
+    """Train what is missing, compare, print and write direction.md and direction.csv."""
+    from skin.console import quiet
+    from skin.results.direction import Settings, comparison, publish, train_lines
+
+    quiet()
+    settings = Settings(**plain(config)["direction"])
+    lines = train_lines(overrides(), settings)
+    publish(Path(config.out).expanduser() if config.out else ROOT / "results", comparison(lines))
+
+
+if __name__ == "__main__":
+    main()

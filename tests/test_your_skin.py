@@ -53,7 +53,7 @@ def run(command: str, home: Path) -> str:
 
 def test_the_page_has_the_files_and_commands_of_the_walk():
     assert sorted(FILES) == ["my-skin/body/mine.yaml", "my-skin/sensors.csv"]
-    assert ["--cfg job" in command for command in COMMANDS] == [True, False, True]
+    assert ["--cfg job" in command for command in COMMANDS] == [True, False, True, False]
 
 
 def test_the_configuration_that_the_page_prints_is_the_users(home):
@@ -73,6 +73,16 @@ def test_the_overrides_of_the_page_describe_the_same_sheet(home):
     assert (body.size, body.thickness) == ((0.15, 0.10), pytest.approx(0.016))
     assert body.layers[1].material.young == 69e3
     assert len(sensors) == 8
+
+
+@pytest.mark.parametrize("line", COMMANDS[3].splitlines())
+def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
+    shown = OmegaConf.create(run(f"{line.partition('  #')[0]} --cfg job", home))
+    body = instantiate(shown.body)
+    assert not body.flat
+    assert shown.simulator._target_ == "skin.simulator.solid.Solid"
+    leaning = instantiate(shown.layout).sensors(body).tilted
+    assert leaning.all() == leaning.any() == ("tilted" in line)
 
 
 @pytest.mark.slow

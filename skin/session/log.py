@@ -119,6 +119,11 @@ class Log:
         values = ",".join(f"{value:.9g}" for value in frame.values.tolist())
         self._line(f"{self._last:.9f},{'' if frame.seq is None else frame.seq},{values}")
 
+    @property
+    def time(self) -> float:
+        """When the last frame came, s since the session began."""
+        return self._last
+
     def close(self) -> None:
         """Let go of the file."""
         os.close(self._file)

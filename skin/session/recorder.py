@@ -26,7 +26,7 @@ def record(
     Args:
         device: where they come from, and which gestures.
         path: x.csv; one that exists is resumed.
-        seconds: of the device's clock; None: no limit.
+        seconds: of the session, an unplugged skin's too; None: no limit.
         free: whatever is done counts, in windows one after the other.
         tell: says a sentence to the person.
     """
@@ -38,6 +38,8 @@ def record(
             log.meaning(meaning)
             for frame in first:
                 log.frame(frame)
+            # By the session's time, because the device's begins anew with each start.
+            begin = log.time - (first[-1].t - first[0].t)
             if log.done:
                 tell(f"{path} has {len(log.done)} gestures: going on")
             director = device.director(tap, meaning, log.done)
@@ -53,7 +55,7 @@ def record(
                 if director.take is not None and director.take is not take:
                     log.begin(director.take, frame)
                 log.frame(frame)
-                late = seconds is not None and frame.t - first[0].t >= seconds
+                late = seconds is not None and log.time - begin >= seconds
                 if late or director.over or (wanted is not None and len(log.done) >= wanted):
                     return
         except (SkinTimeout, SkinDisconnected) as end:

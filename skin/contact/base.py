@@ -81,7 +81,7 @@ class AbstractContact(ABC):
 
     Attributes:
         proportional: twice the force is twice the pressure, so that a touch that stands still is one frame,
-            whatever its time profile.
+            whatever its time profile, and that the centre of pressure moves as the object does.
         advice: what else might help where the wanted labels are never met, to end a sentence with.
     """
 

@@ -19,12 +19,14 @@ class Course(NamedTuple):
         way: (U, 2), where each frame is within its room, m.
         first: (B,), the first frame of each gesture.
         net: (B, 2), from its first place to its last, m.
+        travel: (B,), how far it gets from its first place, m.
     """
 
     strokes: Strokes
     way: np.ndarray
     first: np.ndarray
     net: np.ndarray
+    travel: np.ndarray
 
 
 def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, proportional: bool) -> Course:
@@ -69,4 +71,7 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
         gestures["peak"],
         wanted,
     )
-    return Course(strokes, way, first, way[first + counts - 1] - way[first])
+    from_first = way - way[first[owner]]
+    travel = np.zeros(len(first))
+    np.maximum.at(travel, owner, np.hypot(*from_first.T))
+    return Course(strokes, way, first, from_first[first + counts - 1], travel)

@@ -119,8 +119,9 @@ def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
 class TouchSampler:
     """Draws gestures of wanted labels and renders their movies.
 
-    The label is what the movie gives. Where it differs from the wanted one the path is drawn again (start,
-    direction, speed, peak), up to ``redraws`` times; only then the whole gesture.
+    The label is what the movie gives (docs/adr/0009 for rigid objects that slide). Where it differs from the
+    wanted one the path is drawn again (start, direction, speed, peak), up to ``redraws`` times; only then the
+    whole gesture.
 
     Args:
         body: the sheet.
@@ -224,6 +225,9 @@ class TouchSampler:
         measures = measure(
             pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
+        if not self.contact.proportional:
+            # More of an object comes down as force grows, which moves the centre of pressure though it rests.
+            measures = measures._replace(travel=torch.from_numpy(taken.travel))
         values = pressed.peak, pressed.force, measures.area.numpy(), gestures["draws"], *taken.net.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
         known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}

@@ -8,7 +8,7 @@ SEEDS ?= 1
 PEERS := .venv-peers
 
 .DEFAULT_GOAL := help
-.PHONY: help install test check bench peers ui reproduce-table clean
+.PHONY: help install test check bench physics peers ui reproduce-table clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -31,6 +31,9 @@ check: $(READY)  ## lint, format and types
 
 bench: $(READY)  ## speed and memory, into results/bench.json
 	$(BIN)/python experiments/bench.py
+
+physics: $(READY)  ## hold every law of mechanics against its independent answer
+	$(BIN)/python experiments/verify_physics.py
 
 $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt
 	$(PYTHON) -m venv $(PEERS)

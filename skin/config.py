@@ -130,6 +130,7 @@ class Config:
     record: dict[str, Any] | None = None
     compare: dict[str, Any] | None = None
     direction: dict[str, Any] | None = None
+    physics: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

@@ -1,0 +1,94 @@
+"""What a law finds: our number, the independent one, and how far they may be apart."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["Curve", "Finding", "Law", "Outcome", "Picture", "compared"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One number of ours beside the one it must be.
+
+    Attributes:
+        case: what was looked at.
+        ours: our number.
+        reference: the independent number.
+        error: how far they are apart, relative unless the law says otherwise.
+        tolerance: the largest error that passes.
+    """
+
+    case: str
+    ours: float
+    reference: float
+    error: float
+    tolerance: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the law holds; an error that is no number is a failure."""
+        return bool(math.isfinite(self.error) and self.error <= self.tolerance)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a picture; ``marks`` draws points in place of a line."""
+
+    label: str
+    x: Sequence[float] | np.ndarray
+    y: Sequence[float] | np.ndarray
+    marks: bool = False
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Where a number tells too little.
+
+    Attributes:
+        name: of the file, without its ending.
+        title, x, y: above and beside it.
+        curves: what is drawn.
+        log: whether both axes are logarithmic.
+    """
+
+    name: str
+    title: str
+    x: str
+    y: str
+    curves: Sequence[Curve]
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What checking a law gave: findings, remarks for the page that are judged by nobody, and pictures."""
+
+    findings: Sequence[Finding]
+    remarks: Sequence[str] = ()
+    pictures: Sequence[Picture] = ()
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law and how it is checked.
+
+    Attributes:
+        name: short, lower case; ``laws=`` takes it.
+        statement: what must hold.
+        reference: where the independent answer comes from.
+        check: from whether to be quick (coarser meshes, fewer cases, the same tolerances) to the outcome.
+    """
+
+    name: str
+    statement: str
+    reference: str
+    check: Callable[[bool], Outcome] = field(repr=False)
+
+
+def compared(case: str, ours: float, reference: float, tolerance: float) -> Finding:
+    """Return the finding whose error is relative to the reference."""
+    error = abs(ours - reference) / abs(reference) if reference else abs(ours)
+    return Finding(case, float(ours), float(reference), float(error), tolerance)

@@ -1,0 +1,69 @@
+"""make physics through its command: every law in its quick version, files, exit codes."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from skin.config import ROOT
+from skin.proof.index import LAWS
+
+COMMAND = [sys.executable, str(ROOT / "experiments" / "verify_physics.py")]
+
+
+def run(*overrides: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *overrides], capture_output=True, text=True, check=False, timeout=300)
+
+
+@pytest.mark.slow
+def test_every_law_holds(tmp_path):
+    done = run("physics.quick=true", f"out={tmp_path}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = json.loads((tmp_path / "physics.json").read_text())
+    assert {line["law"] for line in lines} == {law.name for law in LAWS}
+    assert all(line["ok"] and line["error"] <= line["tolerance"] for line in lines)
+    text = (tmp_path / "physics.md").read_text()
+    for law in LAWS:
+        assert f"## {law.name}\n" in text
+    for picture in (tmp_path / "results" / "physics").iterdir():
+        assert f"results/physics/{picture.name}" in text
+
+
+def test_some_laws_leave_the_page_alone():
+    page = ROOT / "docs" / "physics.md"
+    before = page.read_bytes() if page.exists() else None
+    done = run("physics.quick=true", "physics.laws=[confined,naive]")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["confined: holds, 2 numbers", "naive: holds, 1 numbers"]
+    assert (page.read_bytes() if page.exists() else None) == before
+
+
+def test_an_unknown_law_is_refused():
+    done = run("physics.laws=[gravity]")
+    assert done.returncode == 2
+    assert "got gravity" in done.stderr
+    assert "hertz" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_law_that_fails_ends_with_one(tmp_path):
+    """A solid whose stiffness is wrong by a tenth does not pass for the right one."""
+    spoilt = (
+        "import sys; from skin.simulator._hexahedra import Hexahedra;"
+        "right = Hexahedra.stiffness; Hexahedra.stiffness = lambda mesh: 1.1 * right(mesh);"
+        "sys.path.insert(0, 'experiments'); sys.argv[0] = 'verify_physics.py';"
+        "import verify_physics; verify_physics.main()"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        spoilt,
+        "physics.quick=true",
+        "physics.laws=[confined]",
+        f"out={tmp_path}",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)
+    assert done.returncode == 1, done.stderr
+    assert "confined: FAILS" in done.stdout
+    assert "**missed**" in (tmp_path / "physics.md").read_text()

@@ -29,7 +29,10 @@ def quadrature(
     for number, (place, normal) in enumerate(zip(sensors.positions, sensors.normals, strict=True)):
         turned = _turn(normal)
         along = [
-            _pieces(extent / 2, (lines[axis] - place[axis]) / turned[axis, axis])
+            _pieces(
+                extent / 2,
+                *(_crossings(lines[across] - place[across], turned[axis, across]) for across in (axis, 2)),
+            )
             for axis, extent in enumerate(sensors.footprint)
         ]
         (s, ds), (t, dt) = along
@@ -51,8 +54,14 @@ def _turn(normal: np.ndarray) -> np.ndarray:
     )
 
 
-def _pieces(half: float, cuts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _crossings(distances: np.ndarray, slope: float) -> np.ndarray:
+    """Return where a line of some slope has gone some distances; nowhere if it stands still."""
+    return distances / slope if abs(slope) > 1e-9 else np.empty(0)
+
+
+def _pieces(half: float, *crossings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss points between -half and half, by pieces between cuts, and their weights."""
+    cuts = np.concatenate(crossings)
     edges = np.unique(np.concatenate([[-half, half], cuts[np.abs(cuts) < half]]))
     middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     return (middle[:, None] + np.outer(width / 2, _GAUSS)).ravel(), np.repeat(width / 2, 2)

@@ -122,6 +122,15 @@ def test_a_tilted_sensor_feels_shear():
     assert change[1] == pytest.approx(0, abs=0.01)
 
 
+def test_a_sensor_may_stand_on_edge():
+    """In the middle of a wide sheet what pushes sideways is nu / (1 - nu) of the pressure, in each layer."""
+    wide = Sheet([0.24, 0.24], [24, 24], LAYERS)
+    on_edge = sensors((0.12, 0.12, 0.0075), normals=(1.0, 0.0, 0.0))
+    mean = solid(on_edge, wide)(torch.full(wide.shape, 1e3)).readings.item() / 1e-4
+    sideways = 0.25 * 0.499 / 0.501 + 0.75 * 0.49 / 0.51  # the footprint reaches from 2.5 to 12.5 mm
+    assert mean == pytest.approx(1e3 * sideways, rel=0.01)
+
+
 def test_a_layout_needs_no_further_solve():
     where = sensors((0.031, 0.052, 0.005), (0.09, 0.03, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
     skin = solid(where)

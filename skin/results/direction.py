@@ -152,5 +152,10 @@ def publish(folder: Path, told: Sequence[dict[str, str]]) -> None:
     shown = Table(*_HEAD, box=None, pad_edge=False)
     for line in table[1:]:
         shown.add_row(*line)
-    Console().print(shown)
+    console = Console()
+    # A number cut short would be another number: rather let a narrow terminal wrap.
+    console.width = max(
+        console.width, console.measure(shown, options=console.options.update(width=200)).maximum
+    )
+    console.print(shown)
     print(f"{folder / 'direction.md'} and {folder / 'direction.csv'}")

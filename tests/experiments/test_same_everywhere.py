@@ -1,0 +1,112 @@
+"""One stream of the emulator, judged live at a port and from its recording: the same to the last digit."""
+
+import re
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from skin.body.sheet import Sheet
+from skin.config import ROOT
+from skin.device.serial import Serial
+from skin.layout.grid import Grid
+from skin.storage import read
+
+SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
+SMALL = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
+SMALL += ["evaluation.layouts=1", "evaluation.gestures=96"]
+COUNT = 8
+PATIENCE = 300  # s: machines are busy at times
+
+
+def run(folder, script, *overrides):
+    """Run a command with a store of its own and return what it said."""
+    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+    done = subprocess.run(
+        [sys.executable, ROOT / "experiments" / script, *map(str, overrides), *own],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def stream(folder):
+    """Return the bytes that an emulated skin sends for some gestures, and its N per count."""
+    fast = ["port=tcp:0", "emulate.speed=20", f"gestures={COUNT}"]
+    command = [sys.executable, ROOT / "experiments" / "emulate.py", *SKIN, *fast]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
+        port = process.stdout.readline().strip()
+        scale = re.search(r"device\.scale=(\S+)", process.stdout.readline())[1]
+        with socket.create_connection(("127.0.0.1", int(port.rpartition(":")[2])), timeout=PATIENCE) as skin:
+            pieces = iter(lambda: skin.recv(65536), b"")
+            data = b"".join(pieces)
+        process.communicate(timeout=PATIENCE)
+    return data, scale
+
+
+@contextmanager
+def played(data):
+    """Give the address of a port that says the same to whoever comes."""
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve():
+        while True:
+            try:
+                reader, _ = server.accept()
+                with reader:
+                    reader.sendall(data)
+            except OSError:
+                return
+
+    Thread(target=serve, daemon=True).start()
+    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+    server.close()
+
+
+def answers(folder, said):
+    """Return the predictions that the latest evaluation has logged."""
+    files = sorted(Path(folder).glob("a/**/predictions.parquet"), key=lambda path: path.stat().st_mtime)
+    assert "evaluation" in said
+    return pq.read_table(files[-1]).to_pydict()
+
+
+@pytest.mark.slow
+def test_a_skin_at_a_port_and_its_recording_are_judged_alike(tmp_path):
+    run(tmp_path, "train.py", "experiment=rules", *SKIN, *SMALL)
+    data, scale = stream(tmp_path)
+    assert data.count(b"# gesture") == COUNT
+    with played(data) as port:
+        there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]
+        live = answers(
+            tmp_path, run(tmp_path, "evaluate.py", "device=serial", *there, f"out={tmp_path}/live")
+        )
+        said = run(tmp_path, "record.py", *SKIN, "out=s.csv", "device.labels=announced", *there)
+        assert said == f"s.parquet: {COUNT} gestures\n"
+        sheet = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+        direct = Serial(body=sheet, layout=Grid(3, 3), port=port, scale=float(scale), gestures=COUNT)
+        felt = direct.touches("test")
+    stored = read(tmp_path / "s.parquet").touches
+    assert torch.equal(felt.readings, stored.readings)
+    assert torch.equal(felt.valid, stored.valid)
+    assert torch.equal(felt.labels, stored.labels)
+    file = ["device=recording", "device.path=s.parquet", "device.test=all"]
+    again = answers(tmp_path, run(tmp_path, "evaluate.py", *file, f"out={tmp_path}/played"))
+    assert len(next(iter(live.values()))) == COUNT
+    assert again == live
+    text = run(tmp_path, "compare.py", *SKIN, "session=s.csv", "run=latest", f"out={tmp_path}")
+    assert text.startswith("# The same gestures, simulated and recorded")
+    ratio = float(re.search(r"median: (\d\.\d+)", text)[1])
+    assert ratio == pytest.approx(1.0, abs=0.1)
+    assert f"of {COUNT} gestures, and is right on" in text
+    assert text.startswith((tmp_path / "compare.md").read_text())
+    assert (tmp_path / "compare.png").stat().st_size > 10_000

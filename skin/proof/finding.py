@@ -27,10 +27,14 @@ class Finding:
     error: float
     tolerance: float
 
+    def __post_init__(self) -> None:
+        for name in ("ours", "reference", "error"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+
     @property
     def ok(self) -> bool:
         """Whether the law holds; an error that is no number is a failure."""
-        return bool(math.isfinite(self.error) and self.error <= self.tolerance)
+        return math.isfinite(self.error) and self.error <= self.tolerance
 
 
 @dataclass(frozen=True)
@@ -91,4 +95,4 @@ class Law:
 def compared(case: str, ours: float, reference: float, tolerance: float) -> Finding:
     """Return the finding whose error is relative to the reference."""
     error = abs(ours - reference) / abs(reference) if reference else abs(ours)
-    return Finding(case, float(ours), float(reference), float(error), tolerance)
+    return Finding(case, ours, reference, error, tolerance)

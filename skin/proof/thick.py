@@ -1,7 +1,7 @@
 """Laws of a thick soft block, whose middle knows nothing of its ends: forces and rigid objects on it."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,7 @@ def hertz(quick: bool) -> Outcome:
     findings: list[Finding] = []
     remarks, curves = [], []
     for count in (4,) if quick else (4, 6, 8):
-        ground = _Ground(count)
+        ground = _ground(count)
         square = (ground.middles[:, None] ** 2 + ground.middles**2).ravel()
         pressure, approach = ground.press(square / (2 * sphere.radius), force / 4)
         radius = float(np.sqrt(2.5 * (pressure @ square) / pressure.sum()))  # Hertz: <r^2> = 2 a^2 / 5
@@ -121,7 +121,7 @@ def flat_punch(quick: bool) -> Outcome:
     findings: list[Finding] = []
     remarks = []
     for count in (4,) if quick else (4, 6, 8):
-        ground, cell = _Ground(count), _HALF / count
+        ground, cell = _ground(count), _HALF / count
         on = ground.middles < _HALF
         square = np.outer(on, on).ravel()
         circle = (ground.middles[:, None] ** 2 + ground.middles**2).ravel() < _HALF**2
@@ -186,3 +186,6 @@ class _Ground:
             return pressure * np.nan, np.nan
         under = pressure > 0
         return pressure, float(np.mean((self.compliance.numpy() @ pressure + gap)[under]))
+
+
+_ground = cache(_Ground)  # sphere and punches share their blocks

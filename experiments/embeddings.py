@@ -27,7 +27,7 @@ def main(config: DictConfig) -> None:
     from rich.progress import track
 
     from skin.build import build_device
-    from skin.probe import Settings, probe
+    from skin.embedding.probe import Settings, probe
     from skin.results.figures import save
     from skin.results.space import lines, spaces, statements
     from skin.results.table import markdown, write

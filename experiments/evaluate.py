@@ -15,7 +15,7 @@ def main(config: DictConfig) -> None:
     from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
     from skin.device.serial import Serial
-    from skin.evaluation import evaluate
+    from skin.evaluation.report import evaluate
     from skin.reload import changed, configuration, find, restore
     from skin.results.show import report
     from skin.results.verdicts import publish, verdicts

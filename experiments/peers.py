@@ -63,7 +63,7 @@ def main() -> None:
 
 def _compare(config: DictConfig, chosen: Namespace, say: Callable[[str], None]) -> str:
     """Train one peer unless a finished run holds its results already; return what came out."""
-    from skin.peers import learn
+    from skin.peers.runs import learn
     from skin.run import tags
     from skin.tracking import Store
 

@@ -7,7 +7,7 @@ rows=all takes the newest finished runs of every row on simulator=, on whole tou
 from pathlib import Path
 
 from skin.config import ROOT, DictConfig, command, overrides, plain
-from skin.course import Course
+from skin.evaluation.course import Course
 
 
 @command("stream")

@@ -28,8 +28,8 @@ def build_device(config: DictConfig) -> AbstractDevice:
 def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
     """Return the batches of a device's touches, shown as the representation does."""
     # Here, because it brings Lightning, which takes seconds and which commands without training do not need.
-    from skin.augmentation import Augmentation
     from skin.datamodule import TouchData
+    from skin.signal.augmentation import Augmentation
 
     groups = plain(config)
     try:

@@ -6,13 +6,13 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
-from skin.augmentation import Augmentation
 from skin.classifier import Batch
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.labels import Task
 from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation
+from skin.signal.augmentation import Augmentation
 
 __all__ = ["MakeRepresentation", "TouchData"]
 

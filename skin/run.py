@@ -13,9 +13,9 @@ from pytorch_lightning.loggers import MLFlowLogger
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.console import quiet
-from skin.evaluation import Report, evaluate
-from skin.exchange import digest
+from skin.evaluation.report import Report, evaluate
 from skin.labels import Task
+from skin.peers.exchange import digest
 from skin.recording import Touches
 from skin.results.figures import confusions, save
 from skin.results.show import report as show

@@ -5,12 +5,12 @@ from functools import partial
 import pytest
 import torch
 
-from skin.augmentation import Augmentation
 from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.labels import TOUCH_SLIDING
 from skin.recording import Touches
 from skin.representation.readings import Readings
+from skin.signal.augmentation import Augmentation
 
 
 class Numbered:

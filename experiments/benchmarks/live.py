@@ -19,10 +19,10 @@ import torch
 from benchmarks.setting import configuration
 from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
-from skin.gate import Threshold, gates
 from skin.learner.network import Network
 from skin.live.engine import Engine
 from skin.port.frame import Frame
+from skin.signal.gate import Threshold, gates
 
 __all__ = ["measure"]
 

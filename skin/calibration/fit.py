@@ -11,7 +11,7 @@ from skin.calibration._channel import Idle
 from skin.calibration.bench import Bench
 from skin.calibration.values import Calibration
 from skin.errors import InputError
-from skin.lag import lagged, peaks
+from skin.signal.lag import lagged, peaks
 
 __all__ = ["fit"]
 

@@ -10,8 +10,8 @@ from skin.calibration.bench import Bench
 from skin.calibration.fit import fit
 from skin.calibration.values import Calibration
 from skin.errors import InputError
-from skin.imperfection import Imperfection
-from skin.lag import lagged
+from skin.signal.imperfection import Imperfection
+from skin.signal.lag import lagged
 
 __all__ = ["Outcome", "estimate", "hold_out", "judge", "predicted"]
 

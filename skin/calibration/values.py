@@ -28,7 +28,8 @@ QUANTITIES = {
     "clip": math.inf,
     "quantum": 0.0,
 }
-"""Quantities per sensor, as in :class:`skin.imperfection.Constants`, and what stands for unknown ones."""
+"""Quantities per sensor, as :class:`skin.signal.imperfection.Constants` has them, and what stands for unknown
+ones."""
 _SIGNED = ("offset", "drift")
 BROKEN = ("dead", "stuck", "saturated")
 """Why readings mean nothing; ``stuck`` and ``saturated`` sensors say their ``offset`` all the time."""

@@ -15,10 +15,10 @@ from skin.device._tracking import tracker
 from skin.device._truth import true_model, true_readings, true_sensors
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
-from skin.imperfection import Imperfection
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout, Sensors
 from skin.recording import Recording, Touches, join
+from skin.signal.imperfection import Imperfection
 from skin.simulator.base import AbstractSimulator
 from skin.streams import Stream, generator
 from skin.summary import summarise
@@ -53,7 +53,7 @@ class Simulated(AbstractDevice):
         direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
-        gain_spread, offset, noise, ... quantum: as in :class:`skin.imperfection.Imperfection`.
+        gain_spread, offset, noise, ... quantum: as in :class:`skin.signal.imperfection.Imperfection`.
         calibration: file of experiments/calibrate.py, which takes the place of all these but dead and tare.
         randomise: every gesture is felt by a device of its own.
         position_error: standard deviation of the true sensors' places about those that touches report, m.

@@ -10,12 +10,12 @@ from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostin
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from skin.bearing import bearings
 from skin.errors import InputError
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
-from skin.measurements import measurements
 from skin.recording import Touches
+from skin.signal.bearing import bearings
+from skin.signal.measurements import measurements
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -30,7 +30,7 @@ class Features(AbstractLearner):
 
     What a practitioner would try first; a network that does not beat it is not worth its cost. The
     measurements know no sensor by number, so it takes any layout. Where the task has a direction, signed
-    measurements (:mod:`skin.bearing`) join them, and trees of least squares learn its cosines.
+    measurements (:mod:`skin.signal.bearing`) join them, and trees of least squares learn its cosines.
 
     Args:
         rounds: most trees per label; fewer if the validation loss stops falling.

@@ -14,8 +14,8 @@ from torch import Tensor
 from skin.errors import InputError
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
-from skin.measurements import measurements
 from skin.recording import Touches
+from skin.signal.measurements import measurements
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger

@@ -4,13 +4,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.evaluation import Answers
-from skin.gate import Gate
+from skin.evaluation.report import Answers
 from skin.labels import Task
 from skin.live.verdict import Debounce, Patience, Verdict
 from skin.live.window import Seen, Window
 from skin.port.frame import Frame
 from skin.recording import Touches
+from skin.signal.gate import Gate
 
 __all__ = ["Engine"]
 

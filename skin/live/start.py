@@ -12,8 +12,7 @@ from skin.device.recording import Recorded
 from skin.device.serial import Serial
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation import Answers
-from skin.gate import Threshold, gates, rise
+from skin.evaluation.report import Answers
 from skin.live.engine import Engine
 from skin.live.newtons import Newtons
 from skin.live.verdict import Patience
@@ -21,6 +20,7 @@ from skin.port.live import Skin
 from skin.port.opening import open_skin
 from skin.reload import restore
 from skin.session.newtons import newtons
+from skin.signal.gate import Threshold, gates, rise
 from skin.tracking import Store
 
 __all__ = ["Source", "Trained", "engine", "source", "trained"]

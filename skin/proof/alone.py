@@ -30,8 +30,8 @@ def main(threads: int, cells: int, path: str) -> None:
         felt = solid(1e4 * frames).readings
         compliance = with_grain(solid.compliance().double(), body)
     away = (np.indices(body.shape) + 0.5 - cells / 2) * body.cell[0]
-    gap = torch.from_numpy((away**2).sum(axis=0).reshape(1, -1) / (2 * 0.05))
-    pressed = solve(compliance, gap, torch.tensor([20 / body.cell[0] ** 2]), tolerance=1e-8, iterations=1000)
+    gap = torch.from_numpy((away**2).sum(axis=0).reshape(1, -1) / (2 * 1.0))
+    pressed = solve(compliance, gap, torch.tensor([200 / body.cell[0] ** 2]), tolerance=1e-8, iterations=1000)
     np.savez(path, operator=operator, readings=felt.numpy(), contact=pressed.pressure.numpy())
 
 

@@ -32,8 +32,9 @@ _LIMITS = """
 - **It is the linear theory that is proved.** Most default gestures strain the skin beyond it; see
   [results](results.md#what-the-numbers-are-worth).
 - **Motion of the surface converges slowly where the skin is thin and nearly incompressible.** What goes down
-  under a wide object has to flow out sideways, and elements as long as the skin is thick hinder it: see
-  `mesh` for coarser and finer ones. Readings suffer less, because what is pressed on has to come out below.
+  under a wide object has to flow out sideways, and elements as long as the skin is thick hinder it,
+  above all beside its edge: see `mesh` for the default mesh, a finer one and coarser ones. Readings suffer
+  less, because what is pressed on has to come out below.
   Beside an edge, though, an error of 1 % of the reading under the object can be much of a small reading.
 - **The thick block ends** at 60 half sides, so that its surface moves about 2 % less than a half-space does.
   No refinement mends that.

@@ -108,7 +108,9 @@ def hertz(quick: bool) -> Outcome:
             compared("force at its approach, N", force, sphere.force(approach), 0.05),
         ]
         remarks.append(_refined(count, findings))
-        curves.append(Curve(f"{count} cells a radius", 1e3 * np.sqrt(square), pressure / 1e3, marks=True))
+        near = square < (1.4 * _HALF) ** 2
+        distance, shown = 1e3 * np.sqrt(square[near]), pressure[near] / 1e3
+        curves.append(Curve(f"{count} cells a radius", distance, shown, marks=True))
     r = np.linspace(0, 1.4, 200)
     exact = sphere.peak(force) * np.sqrt(np.clip(1 - r**2, 0, None))
     curves.append(Curve("Hertz", 1e3 * _HALF * r, exact / 1e3))

@@ -5,10 +5,10 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from skin.measurements import measurements
 from skin.recording import Touches
 from skin.representation._channels import channels
 from skin.representation.base import AbstractRepresentation, Frames
+from skin.signal.measurements import measurements
 
 __all__ = ["Measured"]
 

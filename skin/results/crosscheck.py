@@ -14,7 +14,7 @@ from rich.table import Table
 
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint
-from skin.metrics import metrics
+from skin.evaluation.metrics import metrics
 from skin.recording import Touches
 from skin.reload import restore
 from skin.results.table import markdown, write

@@ -15,7 +15,7 @@ from rich.table import Table
 from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.metrics import metrics
+from skin.evaluation.metrics import metrics
 from skin.reload import changed, configuration, restore
 from skin.results.moving_runs import Trial
 from skin.results.moving_table import comparison

@@ -14,9 +14,9 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation import columns, evaluate
-from skin.exchange import digest
+from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
+from skin.peers.exchange import digest
 from skin.recording import Touches
 from skin.reload import restore
 from skin.results.table import percent

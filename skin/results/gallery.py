@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skin.device.simulated import Simulated
-from skin.metrics import confusion
+from skin.evaluation.metrics import confusion
 from skin.representation.fourier import Fourier
 from skin.representation.image import Image
 from skin.representation.interp import Interpolation

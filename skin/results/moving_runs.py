@@ -19,8 +19,8 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import checked, fingerprint
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.metrics import metrics
 from skin.learner.base import AbstractLearner
-from skin.metrics import metrics
 from skin.reload import changed, configuration, restore
 from skin.run import PARENT, train
 from skin.tracking import Store

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from skin.evaluation import Report
+from skin.evaluation.report import Report
 from skin.results.table import LABELS, beside, percent
 
 __all__ = ["report", "results"]

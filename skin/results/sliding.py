@@ -7,10 +7,10 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from skin.alarm import Alarms
+from skin.evaluation.alarm import Alarms
+from skin.evaluation.sliding import Sliding
 from skin.results.figures import save
 from skin.results.table import markdown, write
-from skin.sliding import Sliding
 
 __all__ = ["line", "publish"]
 

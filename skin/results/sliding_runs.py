@@ -15,11 +15,11 @@ from rich.progress import track
 
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint
-from skin.course import Course
 from skin.errors import InputError
+from skin.evaluation.course import Course
+from skin.evaluation.sliding import slide
 from skin.reload import changed, configuration, restore
 from skin.results.sliding import line, publish
-from skin.sliding import slide
 from skin.tracking import Store
 
 __all__ = ["newest", "try_run"]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 
-from skin.probe import FRAME, Found
+from skin.embedding.probe import FRAME, Found
 from skin.results.study import conclude, paired, verdict
 
 __all__ = ["lines", "planes", "spaces", "statements"]

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.csv
 from torch import Tensor
 
-from skin.evaluation import Report
+from skin.evaluation.report import Report
 from skin.labels import Task
 from skin.results.figures import confusions, save
 

@@ -13,8 +13,8 @@ from skin.calibration.protocol import Protocol, emulate
 from skin.calibration.values import Calibration, write
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.imperfection import Imperfection
 from skin.layout.grid import Grid
+from skin.signal.imperfection import Imperfection
 from skin.simulator.fem import PlatesAndBeams
 
 LAYERS = [

@@ -15,7 +15,7 @@ from sklearn.frozen import FrozenEstimator
 
 from skin.build import build_device
 from skin.config import ROOT, Evaluation, Tracking, checked, fingerprint
-from skin.exchange import export
+from skin.peers.exchange import export
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

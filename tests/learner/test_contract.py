@@ -9,9 +9,9 @@ from hydra.utils import instantiate
 
 from skin.datamodule import TouchData
 from skin.errors import InputError
+from skin.evaluation.metrics import metrics
 from skin.labels import TOUCH_SLIDING
 from skin.learner.rules import Rules
-from skin.metrics import metrics
 from skin.recording import Touches
 
 OPTIONS = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "learner").glob("*.yaml"))

@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.gate import Threshold, gates
 from skin.labels import TOUCH, Task
 from skin.live.engine import Engine
 from skin.live.verdict import Debounce, Patience
 from skin.port.frame import Frame
 from skin.recording import Touches
+from skin.signal.gate import Threshold, gates
 
 
 class Loud:

@@ -2,9 +2,11 @@
 
 import json
 import math
+import re
 
 import pytest
 
+from skin.config import ROOT
 from skin.errors import InputError
 from skin.proof.finding import Curve, Finding, Law, Outcome, Picture, compared
 from skin.proof.index import LAWS, chosen
@@ -54,3 +56,12 @@ def test_laws_are_chosen_by_name():
     for wrong in (["gravity"], []):
         with pytest.raises(InputError, match="hertz"):
             chosen(wrong)
+
+
+def test_the_page_in_the_docs_knows_every_law_and_its_pictures():
+    text = (ROOT / "docs" / "physics.md").read_text()
+    for law in LAWS:
+        assert f"## {law.name}\n\n{law.statement}\n" in text
+    for name in re.findall(r"\((results/physics/[^)]+)\)", text):
+        assert (ROOT / "docs" / name).is_file()
+    assert "missed" not in text

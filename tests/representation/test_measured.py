@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from skin.measurements import measurements
 from skin.representation.measured import Measured
+from skin.signal.measurements import measurements
 
 TIME, SENSORS = 30, 5
 

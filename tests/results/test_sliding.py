@@ -6,9 +6,9 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.alarm import Alarms
+from skin.evaluation.alarm import Alarms
+from skin.evaluation.sliding import Bin, Sliding
 from skin.results.sliding import line, publish
-from skin.sliding import Bin, Sliding
 
 NAMES = ("big", "dynamic", "press", "dangerous")
 FOUND = Sliding(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.probe import FRAME, Found, Space
+from skin.embedding.probe import FRAME, Found, Space
 from skin.results.space import lines, planes, spaces, statements
 
 NAMES = ("big", "press")

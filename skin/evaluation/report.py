@@ -14,9 +14,9 @@ from skin.config import Evaluation
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.metrics import confusion, metrics
 from skin.labels import Task
 from skin.layout.scattered import Scattered
-from skin.metrics import confusion, metrics
 from skin.recording import Touches
 
 __all__ = ["Answers", "Report", "columns", "evaluate"]

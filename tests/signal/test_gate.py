@@ -5,9 +5,9 @@ import torch
 from sklearn.metrics import balanced_accuracy_score
 
 from skin.errors import InputError
-from skin.gate import Threshold, gates, rise
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.recording import Touches
+from skin.signal.gate import Threshold, gates, rise
 
 
 def touches(readings, valid=None):

@@ -9,8 +9,8 @@ import torch
 
 from skin.build import build_device
 from skin.config import Evaluation
-from skin.evaluation import columns
-from skin.exchange import Foreign, digest, export
+from skin.evaluation.report import columns
+from skin.peers.exchange import Foreign, digest, export
 from skin.storage import read
 
 SETTINGS = Evaluation(devices=2, layouts=1, gestures=24, false_alarm_rate=0.02)

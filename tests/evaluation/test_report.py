@@ -8,7 +8,7 @@ import torch
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.errors import InputError
-from skin.evaluation import columns, evaluate
+from skin.evaluation.report import columns, evaluate
 from skin.labels import TOUCH
 
 SETTINGS = Evaluation(devices=2, layouts=2, gestures=32, false_alarm_rate=0.02)

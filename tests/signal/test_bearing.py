@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from skin.bearing import bearings
 from skin.recording import Touches
+from skin.signal.bearing import bearings
 
 GRID = torch.cartesian_prod(torch.linspace(0.01, 0.15, 8), torch.linspace(0.01, 0.15, 8))
 POSITIONS = torch.cat([GRID, torch.full((64, 1), 0.005)], dim=1)

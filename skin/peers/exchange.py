@@ -14,11 +14,11 @@ from torch import Tensor
 from skin.config import Evaluation
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation import columns
+from skin.evaluation.report import columns
 from skin.labels import Task
-from skin.measurements import measurements
 from skin.recording import Recording, Touches
 from skin.results.table import write as write_text
+from skin.signal.measurements import measurements
 from skin.storage import write
 
 __all__ = ["Foreign", "digest", "export"]
@@ -32,7 +32,7 @@ def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
 
     ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
     engineered measurements, one row per touch. Sets: ``train``, ``validation``, then
-    ``<column>_<number>`` for the sets of :func:`skin.evaluation.columns`. ``sets.json``, written last,
+    ``<column>_<number>`` for the sets of :func:`skin.evaluation.report.columns`. ``sets.json``, written last,
     names the content of each set: set -> digest. A folder with other touches is emptied, answers and all.
 
     Args:

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from skin.augmentation import Augmentation
 from skin.errors import InputError
 from skin.recording import Touches
+from skin.signal.augmentation import Augmentation
 
 TIME, SENSORS = 30, 4
 

@@ -5,8 +5,8 @@ from itertools import groupby
 import pytest
 import torch
 
-from skin.measurements import measurements
 from skin.recording import Touches
+from skin.signal.measurements import measurements
 
 PLACES = torch.tensor([[0.02, 0.02, 0.0], [0.06, 0.02, 0.0], [0.10, 0.02, 0.0], [0.06, 0.08, 0.0]])
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
+from skin.evaluation.metrics import angles, confusion, metrics, recall_at
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
-from skin.metrics import angles, confusion, metrics, recall_at
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from sklearn.svm import SVC
 
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
-from skin.embedding import doc2vec, invariant, levels, line_graph, subtrees
+from skin.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
 from skin.learner.network import Network

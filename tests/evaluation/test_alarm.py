@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.stats import poisson
 
-from skin.alarm import Alarms, count_alarms
+from skin.evaluation.alarm import Alarms, count_alarms
 
 
 def count(alarm, gesture, dangerous=(True, False, True, True)):

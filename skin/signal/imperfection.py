@@ -9,7 +9,7 @@ from torch import Tensor
 
 from skin.calibration.values import Calibration, read
 from skin.errors import InputError
-from skin.lag import lagged, rounded, unloading
+from skin.signal.lag import lagged, rounded, unloading
 
 __all__ = ["Constants", "Imperfection"]
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from skin.build import build_device
-from skin.course import Course
 from skin.errors import InputError
+from skin.evaluation.course import Course
+from skin.evaluation.sliding import bins, slide
 from skin.labels import TOUCH, TOUCH_OR_NOT
-from skin.sliding import bins, slide
 
 COURSE = Course(hours=0.05, gap=[20, 100], stride=3, windows=(20, 60))
 ONLY_ALARMS = replace(COURSE, windows=())

@@ -6,7 +6,7 @@ import torch
 
 from skin.calibration.values import Calibration
 from skin.errors import InputError
-from skin.imperfection import Imperfection
+from skin.signal.imperfection import Imperfection
 
 NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}
 

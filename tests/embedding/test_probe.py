@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from skin.build import build_device
+from skin.embedding.probe import FRAME, Settings, accuracy, explained, probe, strongest
 from skin.errors import InputError
-from skin.probe import FRAME, Settings, accuracy, explained, probe, strongest
 from skin.recording import Touches
 
 SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "layouts": 2}

@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.classification import binary_confusion_matrix
 
-from skin.alarm import Alarms, count_alarms
-from skin.course import Course
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation import Answers
-from skin.gate import Gate, Threshold, gates, rise
+from skin.evaluation.alarm import Alarms, count_alarms
+from skin.evaluation.course import Course
+from skin.evaluation.metrics import metrics
+from skin.evaluation.report import Answers
 from skin.labels import TOUCH_OR_NOT, Task
-from skin.metrics import metrics
+from skin.signal.gate import Gate, Threshold, gates, rise
 
 __all__ = ["Bin", "Sliding", "bins", "slide"]
 

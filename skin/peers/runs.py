@@ -11,8 +11,8 @@ from skin.build import build_device
 from skin.config import fingerprint, plain
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation import evaluate
-from skin.exchange import ABOUT, Foreign, export
+from skin.evaluation.report import evaluate
+from skin.peers.exchange import ABOUT, Foreign, export
 from skin.run import conclude, describe, tags
 from skin.tracking import Store
 

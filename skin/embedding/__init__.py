@@ -1,0 +1,1 @@
+"""Pretrained embeddings of sensor graphs, and what they know of a touch."""

@@ -1,0 +1,1 @@
+"""How a trained learner is judged: on devices, layouts and streams, in figures that mean something."""

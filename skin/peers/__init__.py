@@ -1,0 +1,1 @@
+"""What others built, on the same touches: files to them, answers back."""

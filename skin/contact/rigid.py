@@ -109,13 +109,16 @@ class Rigid(AbstractContact):
     def gap(self, strokes: Strokes, ground: Ground) -> Tensor:
         """Return how far the object is above each cell when its highest point touches, (U, H * W), m.
 
-        Infinite where there is no object.
+        Infinite where there is no object. On an arm the object comes down along the normal at its middle, and
+        the skin falls away to its sides.
         """
         solids = ground.shapes.solids(strokes.shape, strokes.angle, strokes.scale, strokes.place)
         lower = self.relief * (1 - solids.grey)
         inward = (self.fillet - solids.rim).clamp(min=0, max=self.fillet)
         lower += self.fillet - (self.fillet**2 - inward**2).clamp(min=0).sqrt()
-        lower = lower.where(solids.inside, torch.inf).flatten(1)
+        lower = (lower.flatten(1) + _sag(ground.shapes.body, solids.inside.flatten(1))).where(
+            solids.inside.flatten(1), torch.inf
+        )
         return lower - lower.amin(1, keepdim=True)
 
     def _sought(
@@ -134,6 +137,22 @@ class Rigid(AbstractContact):
 
         found = seek(solved, own.isfinite().float(), strokes.peak, strokes.wanted[:, [0, 3]], ground)
         return found, found.failed.astype(np.int64)
+
+
+def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
+    """Return how far cells lie below the plane on which objects touch, (U, H * W), m: 0 on a flat body.
+
+    Args:
+        body: what is touched.
+        inside: (U, H * W), bool, the cells that each object is above.
+    """
+    x, y = ((np.arange(count) + 0.5) * size for count, size in zip(body.cells, body.cell, strict=True))
+    cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
+    cover = inside.double().numpy()
+    middle = cover @ cells / np.maximum(cover.sum(axis=1, keepdims=True), 1)
+    inward = body.frame(middle)[:, 2]
+    below = inward @ body.place(cells).T - (inward * body.place(middle)).sum(axis=1, keepdims=True)
+    return torch.from_numpy(below).float()
 
 
 def _telling(strokes: Strokes, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.arm import Arm
 from skin.body.sheet import Sheet
 from skin.contact.base import Ground, Strokes
 from skin.contact.prescribed import Prescribed
@@ -251,3 +252,22 @@ def test_bad_settings_are_refused(settings, message):
 def test_a_simulator_without_a_surface_is_refused():
     with pytest.raises(InputError, match="simulator=naive: set simulator=solid"):
         Rigid(BODY, Naive(BODY, SENSORS))
+
+
+def test_the_skin_of_an_arm_falls_away_below_a_stamp():
+    """By radius (1 - cos(x / radius)) at x around the arm from the middle of the contact."""
+    arm = Arm(radius=0.05, length=0.16, angle=3.2, cells=(20, 20), layers=BODY.layers)
+    flat = Rigid(arm, HalfSpace(), relief=0.0, fillet=0.0)
+    stamp = still(0.06)
+    given = ground(shapes=["square"])
+    shapes = Shapes(("square",), arm, given.settings.thresholds.contact)
+    gap = flat.gap(stamp, given._replace(shapes=shapes))[0].view(20, 20)
+    assert (gap == gap[10:11])[gap.isfinite()].all()
+    row = gap[10]
+    inside = row.isfinite().numpy()
+    away = (np.arange(20) + 0.5) * 0.008
+    away = np.abs(away - away[inside].mean())
+    expected = 0.05 * (1 - np.cos(away[inside] / 0.05))
+    assert inside.sum() >= 10
+    assert row[inside].numpy() == pytest.approx(expected - expected.min(), abs=1e-7)
+    assert flat.gap(stamp, given).isinf().sum() == gap.isinf().sum()

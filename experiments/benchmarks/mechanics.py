@@ -5,13 +5,14 @@ from importlib.util import find_spec
 
 import numpy as np
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU
 
 from benchmarks.setting import configuration, seconds
 from skin.build import build_device
 from skin.device.simulated import Simulated
 from skin.simulator import _pynite
 from skin.simulator._assembly import Structure
+from skin.simulator._factors import factorised
 from skin.simulator.solid import hexahedra
 
 __all__ = ["direct_seconds_per_frame", "pynite_seconds_per_frame"]
@@ -31,9 +32,7 @@ def direct_seconds_per_frame(simulator: str, gestures_frames: int, repeats: int)
     pressures = _pressures()
 
     def factorise() -> SuperLU:
-        return splu(
-            stiffness(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        return factorised(stiffness())
 
     factors = factorise()
     solving = seconds(lambda: [factors.solve(load @ frame) for frame in pressures], repeats) / len(pressures)

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from skin.body.sheet import Sheet
+from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
 
 __all__ = ["ALL", "FACES", "WALLS", "block", "graded", "held", "row_means", "solve"]
@@ -77,12 +77,7 @@ def solve(
     """
     whole = mesh.stiffness() if stiffness is None else stiffness
     free = np.flatnonzero(~fixed)
-    factors = splu(
-        whole[free][:, free].tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factors = factorised(whole[free][:, free].tocsc())
     moves = np.zeros_like(forces)
     moves[free] = factors.solve(np.ascontiguousarray(forces[free]))
     return moves

@@ -5,12 +5,12 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.simulator._assembly import Constraint, Structure
+from skin.simulator._factors import factorised
 from skin.simulator.base import AbstractSimulator
 
 __all__ = ["deflection", "draw_surface", "surface", "surface_motion"]
@@ -28,13 +28,7 @@ def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "v
         constraint: as in :class:`skin.simulator._assembly.Structure`.
     """
     structure = Structure(body, constraint)
-    # K is symmetric and positive definite: no pivoting, and an ordering for symmetric matrices.
-    factors = splu(
-        structure.stiffness(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factors = factorised(structure.stiffness())
     loads = structure.load() @ pressure.flatten(1).double().numpy().T
     down = -factors.solve(loads).reshape(-1, len(structure.free), len(pressure))[:, structure.free.index(2)]
     return np.moveaxis(down.reshape(*structure.grid, len(pressure)), -1, 0)

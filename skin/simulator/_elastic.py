@@ -8,9 +8,10 @@ import numpy as np
 import scipy.sparse as sp
 from rich.console import Console
 from rich.progress import track
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU
 
 from skin.body._memory import require_memory
+from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator._store import place
 
@@ -40,13 +41,7 @@ class Elastic:
             f"the stiffness of {columns} x {rows} x {deep} solid elements",
             "give fewer, such as body.cells=[32,32] or simulator.divisions=2",
         )
-        # K is symmetric and positive definite: no pivoting, and an ordering for symmetric matrices.
-        return splu(
-            self.mesh.stiffness()[self._free][:, self._free].tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        return factorised(self.mesh.stiffness()[self._free][:, self._free].tocsc())
 
     @cached_property
     def _free(self) -> np.ndarray:

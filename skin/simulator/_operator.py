@@ -9,12 +9,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse.linalg import splu
 
 from skin.body._memory import require_memory
 from skin.layout.base import Sensors
 from skin.simulator import _store
 from skin.simulator._assembly import Structure
+from skin.simulator._factors import factorised
 
 __all__ = ["Operator", "build", "cached"]
 
@@ -23,7 +23,7 @@ _FORMAT = 2
 _HERE = Path(__file__).parent
 _SOURCES = [
     _HERE.parent / "body" / "base.py",
-    *(_HERE / name for name in ("_assembly.py", "_beam.py", "_operator.py", "_plate.py")),
+    *(_HERE / name for name in ("_assembly.py", "_beam.py", "_factors.py", "_operator.py", "_plate.py")),
 ]
 
 
@@ -68,13 +68,7 @@ def build(structure: Structure, sensors: Sensors) -> Operator:
         structure.carried(sensors, levels),
         *(structure.shift(sensors, levels, axis) for axis in (0, 1) if axis in structure.free),
     ]
-    # K is symmetric and positive definite: no pivoting, and an ordering for symmetric matrices.
-    factors = splu(
-        structure.stiffness(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factors = factorised(structure.stiffness())
     load = structure.load()
     deflection, surface, carried, *along = (
         np.ascontiguousarray((load.T @ factors.solve(rows.T.toarray())).T) for rows in functionals

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import scipy.sparse as sp
 import torch
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from skin.simulator._assembly import Structure
+from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
 
 __all__ = ["largest", "solid_rows", "squeeze"]
@@ -21,13 +21,7 @@ _NUMBERS_AT_ONCE = 2**24
 
 def squeeze(structure: Structure) -> np.ndarray:
     """Return how much thinner the top layer of plates and beams gets at each node, (nodes, cells), 1/Pa."""
-    # K is symmetric and positive definite: no pivoting, and an ordering for symmetric matrices.
-    factors = splu(
-        structure.stiffness(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    factors = factorised(structure.stiffness())
     moved = factors.solve(structure.load().toarray())
     layers, rows, columns = structure.grid
     down = -moved.reshape(layers, rows * columns, len(structure.free), -1)[:, :, structure.free.index(2)]

@@ -27,7 +27,7 @@ __all__ = ["Solid", "hexahedra", "readings"]
 _HERE = Path(__file__).parent
 _SOURCES = [
     *sorted((_HERE.parent / "body").glob("*.py")),
-    *(_HERE / f"{name}.py" for name in ("_elastic", "_footprint", "_hexahedra", "solid")),
+    *(_HERE / f"{name}.py" for name in ("_elastic", "_factors", "_footprint", "_hexahedra", "solid")),
 ]
 _INWARDS = 2
 

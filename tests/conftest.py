@@ -1,7 +1,10 @@
 """What all tests share."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
 
 # Where tests run in the background Ctrl-C may be ignored, and commands that they start would inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -10,7 +13,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Tests are many small problems: a second thread only waits, and for long where the machine is busy.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,10 +21,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from skin.config import ROOT
 from skin.labels import TOUCH
 from skin.recording import Touches
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = ROOT / "conf"
+PATIENCE = 600  # s: machines are busy at times
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -41,6 +46,44 @@ def configured() -> Callable[..., DictConfig]:
             return compose("train", overrides=list(overrides))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def starter(own_cache) -> Iterator[subprocess.Popen]:
+    """Run the process that forks commands; see tests/starter.py."""
+    command = [sys.executable, str(Path(__file__).with_name("starter.py"))]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield process
+        process.kill()
+
+
+@pytest.fixture(scope="session")
+def run(request, tmp_path_factory) -> Callable[..., subprocess.CompletedProcess]:
+    """Return a function that runs ``experiments/<script>`` in a folder, with a store of its own there.
+
+    ``store=False`` names no store. The command is a process of its own that shares its imports with others;
+    with ``fresh=True`` it shares nothing, as where a person starts it.
+    """
+    said = tmp_path_factory.mktemp("said")
+
+    def run(folder, script, *arguments, store=True, fresh=False) -> subprocess.CompletedProcess:
+        own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
+        command = [str(ROOT / "experiments" / script), *map(str, arguments), *own]
+        if fresh:
+            command = [sys.executable, *command]
+            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
+        out, err = said / "out", said / "err"
+        job = {"command": command, "folder": str(folder), "environment": dict(os.environ)}
+        job |= {"out": str(out), "err": str(err), "seconds": PATIENCE}
+        for file in (out, err):
+            file.write_text("")
+        process = request.getfixturevalue("starter")
+        process.stdin.write(json.dumps(job) + "\n")
+        process.stdin.flush()
+        code = int(process.stdout.readline())
+        return subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+
+    return run
 
 
 class MadeUpDevice:

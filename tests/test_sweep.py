@@ -58,16 +58,10 @@ def test_a_skipped_job_says_nothing_about_speed():
     assert progress.left() == 30
 
 
-def command(folder, *overrides):
+def sweep(folder, *overrides):
+    """Return the arguments of a sweep."""
     own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    train = [sys.executable, str(ROOT / "experiments" / "train.py"), "-m"]
-    return [*train, *SMALL, *own, *overrides, f"hydra.sweep.dir={folder}/out"]
-
-
-def run(folder, *overrides):
-    return subprocess.run(
-        command(folder, *overrides), capture_output=True, text=True, timeout=300, check=False, cwd=folder
-    )
+    return ["train.py", "-m", *SMALL, *own, *overrides, f"hydra.sweep.dir={folder}/out"]
 
 
 def runs(folder):
@@ -82,17 +76,17 @@ def runs(folder):
 
 
 @pytest.mark.slow
-def test_a_sweep_that_was_killed_goes_on_where_it_was(tmp_path):
-    with subprocess.Popen(
-        command(tmp_path, "seed=0,1,2"), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as first:
+def test_a_sweep_that_was_killed_goes_on_where_it_was(run, tmp_path):
+    script, *arguments = sweep(tmp_path, "seed=0,1,2")
+    command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as first:
         for line in first.stdout:
             if line.startswith("[2/3]"):
                 os.kill(first.pid, signal.SIGKILL)
                 break
         first.wait(60)
     assert [one[:2] for one in runs(tmp_path)][:2] == [("sweep", "RUNNING"), ("rules naive 0", "FINISHED")]
-    again = run(tmp_path, "seed=0,1,2")
+    again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
     assert again.returncode == 0, again.stderr
     assert [line for line in again.stdout.splitlines() if "finished before" in line] == [
         line for line in again.stdout.splitlines() if line.startswith("[1/3]") and "…" not in line
@@ -102,8 +96,8 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_bad_job_fails_and_the_others_run(tmp_path):
-    done = run(tmp_path, "device.offset=-1,0.1")
+def test_a_bad_job_fails_and_the_others_run(run, tmp_path):
+    done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False)
     assert done.returncode == 1
     assert "offset" in done.stderr
     states = [status for name, status, parent in runs(tmp_path) if parent]

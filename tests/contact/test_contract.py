@@ -1,14 +1,11 @@
 """What every contact does, whichever it is, from the command line on."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
 
 from skin.build import build_device
-from skin.config import CONF, ROOT, checked
+from skin.config import CONF, checked
 from skin.errors import InputError
 
 OPTIONS = sorted(path.stem for path in (CONF / "contact").glob("*.yaml"))
@@ -43,28 +40,17 @@ def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
         build_device(checked(configured("contact=rigid", f"simulator={simulator}")))
 
 
-def test_the_command_line_says_so_too(tmp_path):
-    command = [sys.executable, "experiments/train.py", "simulator=naive", "contact=rigid"]
-    command.append(f"tracking.uri=sqlite:///{tmp_path}/m.db")
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=ROOT)
+def test_the_command_line_says_so_too(run, tmp_path):
+    done = run(tmp_path, "train.py", "simulator=naive", "contact=rigid")
     assert done.returncode == 2
     assert "set simulator=solid" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_rigid_gestures_are_generated(tmp_path):
+def test_rigid_gestures_are_generated(run, tmp_path):
     out = tmp_path / "touches.parquet"
-    command = [
-        sys.executable,
-        "experiments/generate.py",
-        "simulator=solid",
-        "contact=rigid",
-        "n=32",
-        *SMALL[:2],
-    ]
-    done = subprocess.run(
-        [*command, f"out={out}"], capture_output=True, text=True, timeout=300, check=False, cwd=ROOT
-    )
+    rigid = ["simulator=solid", "contact=rigid", "n=32", *SMALL[:2]]
+    done = run(tmp_path, "generate.py", *rigid, f"out={out}", store=False)
     assert done.returncode == 0, done.stderr
     assert "0 frames not solved" in done.stdout
     assert out.is_file()

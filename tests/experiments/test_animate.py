@@ -1,31 +1,22 @@
 """experiments/animate.py as a person runs it."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 from PIL import Image
 
 from skin.build import build_device
 from skin.storage import write
 
-ROOT = Path(__file__).parents[2]
-
-
-def run(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, str(ROOT / "experiments" / "animate.py"), "simulator=naive", *overrides]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
+NAIVE = ("animate.py", "simulator=naive")
 
 
 @pytest.mark.slow
-def test_a_drawn_touch_and_a_recorded_one(tmp_path, configured):
-    done = run(tmp_path, "out=hand.gif", "labels=[big,dynamic]", "shape=hand", "seed=3")
+def test_a_drawn_touch_and_a_recorded_one(run, tmp_path, configured):
+    done = run(tmp_path, *NAIVE, "out=hand.gif", "labels=[big,dynamic]", "shape=hand", "seed=3", store=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "hand.gif: hand: big, dynamic, 30 frames at 10 Hz\n"
     write(build_device(configured("simulator=naive", "data.gestures=16")).recording(), tmp_path / "x.parquet")
     recording = ["device=recording", "device.path=x.parquet", "index=5", "out=five.gif"]
-    done = run(tmp_path, *recording)
+    done = run(tmp_path, *NAIVE, *recording, store=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("five.gif: touch 5: ")
     for name in ("hand.gif", "five.gif"):
@@ -36,8 +27,9 @@ def test_a_drawn_touch_and_a_recorded_one(tmp_path, configured):
 
 
 @pytest.mark.slow
-def test_a_still_of_the_arm(tmp_path):
-    done = run(tmp_path, "body=arm", "out=arm.png", "view=skin3d", "labels=[press]", "shape=disc")
+def test_a_still_of_the_arm(run, tmp_path):
+    arm = ["body=arm", "out=arm.png", "view=skin3d", "labels=[press]", "shape=disc"]
+    done = run(tmp_path, *NAIVE, *arm, store=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "arm.png: disc: press, 30 frames at 10 Hz\n"
     with Image.open(tmp_path / "arm.png") as file:
@@ -52,8 +44,8 @@ def test_a_still_of_the_arm(tmp_path):
         (["vieww=flat"], "vieww"),
     ],
 )
-def test_bad_input_ends_with_a_sentence(tmp_path, overrides, words):
-    done = run(tmp_path, *overrides)
+def test_bad_input_ends_with_a_sentence(run, tmp_path, overrides, words):
+    done = run(tmp_path, *NAIVE, *overrides, store=False)
     assert done.returncode == 2
     assert words in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,9 +1,5 @@
 """The arm from end to end: what works on a sheet works on it, in its chart."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +9,6 @@ from skin.errors import InputError
 from skin.results.moving import change
 from skin.storage import read, write
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SOLID = (
     "simulator=solid",
     "simulator.divisions=1",
@@ -24,14 +19,8 @@ SOLID = (
 )
 
 
-def run(folder: Path, name: str, *overrides: str) -> subprocess.CompletedProcess:
-    store = f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/artifacts"
-    command = [sys.executable, str(EXPERIMENTS / name), *overrides, *store]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
-
-
 @pytest.mark.slow
-def test_generated_touches_train_and_are_evaluated(tmp_path):
+def test_generated_touches_train_and_are_evaluated(run, tmp_path):
     arm = "body=arm", "body.angle=2.5", "layout=grid"
     made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet")
     assert made.returncode == 0, made.stderr
@@ -44,7 +33,7 @@ def test_generated_touches_train_and_are_evaluated(tmp_path):
     assert (tmp_path / "evaluation_recording.md").is_file()
 
 
-def test_plates_do_not_bend_and_a_sentence_says_what_does(tmp_path):
+def test_plates_do_not_bend_and_a_sentence_says_what_does(run, tmp_path):
     done = run(tmp_path, "train.py", "body=arm", "simulator=fem")
     assert done.returncode == 2
     assert "plates and beams are flat, body=arm is not: set simulator=solid" in done.stderr

@@ -1,36 +1,24 @@
 """The command that calibrates: from an emulated bench to a device that trains."""
 
-import subprocess
-import sys
-
 import pytest
 
 from skin.calibration.values import read
-from skin.config import ROOT
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
 
 
-def run(script: str, *arguments: object) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, ROOT / "experiments" / script, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=300,
-    )
-
-
 @pytest.mark.slow
-def test_from_a_bench_to_touches_of_the_calibrated_device(tmp_path):
+def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     session, out = tmp_path / "bench.parquet", tmp_path / "mine.yaml"
     done = run(
+        tmp_path,
         "calibrate.py",
         *SMALL,
         f"session={session}",
         f"out={out}",
         "calibrate.demo=true",
         "device.gain_spread=0.2",
+        store=False,
     )
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
@@ -39,23 +27,26 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(tmp_path):
     assert len(read(out)) == 4
     touches = tmp_path / "touches.csv"
     made = run(
+        tmp_path,
         "generate.py",
         *SMALL[:3],
         "n=16",
         f"out={touches}",
         f"device.calibration={out}",
         "device.randomise=true",
+        store=False,
     )
     assert made.returncode == 0, made.stderr
     assert touches.is_file()
 
 
 @pytest.mark.slow
-def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(tmp_path):
+def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tmp_path):
     """A skin that is what the simulation says cannot gain from a fit to its noise."""
     perfect = ["device.gain_spread=0", "device.offset=0", "device.clip=1000"]
     session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
-    done = run("calibrate.py", *SMALL, *perfect, f"session={session}", f"out={out}", "calibrate.demo=true")
+    files = f"session={session}", f"out={out}"
+    done = run(tmp_path, "calibrate.py", *SMALL, *perfect, *files, "calibrate.demo=true", store=False)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "It does not help" in done.stdout
     assert not out.exists()
@@ -68,8 +59,8 @@ def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(tmp_pat
         (("session=none.csv",), "no file none.csv"),
     ],
 )
-def test_bad_input_ends_with_2_and_one_sentence(arguments, reason):
-    done = run("calibrate.py", *arguments)
+def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, arguments, reason):
+    done = run(tmp_path, "calibrate.py", *arguments, store=False, fresh=True)
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,12 +1,8 @@
 """The cross-check of mechanics, through the command line."""
 
 import csv
-import subprocess
-import sys
 
 import pytest
-
-from skin.config import ROOT
 
 SMALL = [
     *("body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100"),
@@ -14,15 +10,9 @@ SMALL = [
 ]
 
 
-def run(*arguments):
-    command = [sys.executable, ROOT / "experiments" / "crosscheck.py", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
-
-
 @pytest.mark.slow
-def test_every_simulator_against_every_other(tmp_path):
-    store = [f"tracking.uri=sqlite:///{tmp_path}/runs.db", f"tracking.artifacts={tmp_path}/artifacts"]
-    done = run("rules", *SMALL, *store, "--out", tmp_path)
+def test_every_simulator_against_every_other(run, tmp_path):
+    done = run(tmp_path, "crosscheck.py", "rules", *SMALL, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     lines = list(csv.DictReader((tmp_path / "crosscheck.csv").read_text().splitlines()))
     names = ["naive", "fem, equation 10", "fem, interface", "solid"]
@@ -33,8 +23,8 @@ def test_every_simulator_against_every_other(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_mistyped_row_is_refused():
-    done = run("featurs")
+def test_a_mistyped_row_is_refused(run, tmp_path):
+    done = run(tmp_path, "crosscheck.py", "featurs", fresh=True)
     assert done.returncode == 2
     assert "featurs" in done.stderr
     assert "Traceback" not in done.stderr

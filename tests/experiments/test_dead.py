@@ -1,12 +1,9 @@
 """The command on dead sensors: pairs of trainings with a mask and without."""
 
 import csv
-import subprocess
-import sys
 
 import pytest
 
-from skin.config import ROOT
 from skin.results.dead import publish
 from skin.results.moving_runs import Trial
 
@@ -14,21 +11,8 @@ SMALL = ["data.gestures=80", "trainer.max_epochs=1", "device.test_gestures=48", 
 SMALL += ["evaluation.layouts=0", "layout=grid"]
 
 
-def run(folder, script, *overrides):
-    """Run a command with a store of its own."""
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    return subprocess.run(
-        [sys.executable, ROOT / "experiments" / script, *overrides, *own],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-
-
 @pytest.mark.slow
-def test_masks_are_compared_over_the_same_sensors(tmp_path):
+def test_masks_are_compared_over_the_same_sensors(run, tmp_path):
     pair = ["-m", "experiment=temporal_graph", "row=dead", "representation.mask=true,false"]
     done = run(tmp_path, "train.py", *pair, "device.dead=2", "device.randomise=true", *SMALL)
     assert done.returncode == 0, done.stderr
@@ -43,7 +27,7 @@ def test_masks_are_compared_over_the_same_sensors(tmp_path):
     } == {"dead, trained with 2 dead"}
     assert all(25 < float(line["accuracy"].split()[0]) < 95 for line in lines)
     assert all(line["verdict"] in ("", "undecided") for line in lines)
-    done = run(tmp_path, "dead.py", "rows=[gru]")
+    done = run(tmp_path, "dead.py", "rows=[gru]", fresh=True)
     assert done.returncode == 2
     assert "no finished run of gru" in done.stderr
 

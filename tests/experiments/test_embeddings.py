@@ -1,29 +1,18 @@
 """experiments/embeddings.py as a person runs it."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-ROOT = Path(__file__).parents[2]
-SMALL = ["data.gestures=160", "device.test_gestures=32", "evaluation.devices=1", "evaluation.layouts=1",
-         "evaluation.gestures=32"]  # fmt: skip
+SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=32", "evaluation.devices=1",
+         "evaluation.layouts=1", "evaluation.gestures=32"]  # fmt: skip
 FEW = ["embeddings.train=80", "embeddings.test=40", "embeddings.seeds=[0]", "embeddings.epochs=2",
        "embeddings.layouts=2", "embeddings.attributes=[reading]"]  # fmt: skip
 
 
-def run(folder: Path, script: str, *overrides: str) -> subprocess.CompletedProcess:
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    command = [sys.executable, str(ROOT / "experiments" / script), "simulator=naive", *overrides, *own]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
-
-
 @pytest.mark.slow
-def test_a_run_is_probed_beside_graph_embeddings(tmp_path):
+def test_a_run_is_probed_beside_graph_embeddings(run, tmp_path):
     trained = run(tmp_path, "train.py", "experiment=temporal_graph", "trainer.max_epochs=1", *SMALL)
     assert trained.returncode == 0, trained.stderr
-    done = run(tmp_path, "embeddings.py", "run=latest", "out=new", *FEW)
+    done = run(tmp_path, "embeddings.py", "simulator=naive", "run=latest", "out=new", *FEW)
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "new" / "embeddings.md").read_text()
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
@@ -44,8 +33,8 @@ def test_a_run_is_probed_beside_graph_embeddings(tmp_path):
         (["embeddings.typo=1"], "typo"),
     ],
 )
-def test_bad_input_ends_with_a_sentence(tmp_path, overrides, words):
-    done = run(tmp_path, "embeddings.py", "out=new", *overrides)
+def test_bad_input_ends_with_a_sentence(run, tmp_path, overrides, words):
+    done = run(tmp_path, "embeddings.py", "out=new", *overrides, fresh=True)
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
     assert "Traceback" not in done.stderr

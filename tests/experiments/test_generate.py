@@ -1,23 +1,14 @@
 """experiments/generate.py as a person runs it."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 from skin.storage import read
 
-ROOT = Path(__file__).parents[2]
+NAIVE = ("generate.py", "simulator=naive")
 
 
-def generate(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, str(ROOT / "experiments" / "generate.py"), "simulator=naive", *overrides]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-
-
-def test_writes_a_recording(tmp_path):
-    done = generate(tmp_path, "n=32", "out=x.csv")
+def test_writes_a_recording(run, tmp_path):
+    done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, fresh=True)
     assert done.returncode == 0, done.stderr
     assert "x.csv: 32 gestures" in done.stdout
     recording = read(tmp_path / "x.csv")
@@ -34,8 +25,8 @@ def test_writes_a_recording(tmp_path):
         (["n=32", "out=x.csv", "touch.shapes=[potato]"], "no shape potato"),
     ],
 )
-def test_bad_input_ends_with_a_sentence(tmp_path, overrides, message):
-    done = generate(tmp_path, *overrides)
+def test_bad_input_ends_with_a_sentence(run, tmp_path, overrides, message):
+    done = run(tmp_path, *NAIVE, *overrides, store=False)
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr

@@ -2,9 +2,6 @@
 
 import csv
 import sqlite3
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,6 @@ from skin.tracking import Store
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
-ROOT = Path(__file__).parents[2]
 SMALL = [
     "data.gestures=80",
     "trainer.max_epochs=1",
@@ -27,20 +23,6 @@ SMALL = [
 ]
 
 
-def run(folder, script, *overrides):
-    """Run a command with a store of its own and return its exit code and what it said."""
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    done = subprocess.run(
-        [sys.executable, ROOT / "experiments" / script, *overrides, *own],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
-
-
 def runs(folder):
     with sqlite3.connect(folder / "m.db") as database:
         names = database.execute("select name, status from runs order by start_time").fetchall()
@@ -49,14 +31,14 @@ def runs(folder):
 
 
 @pytest.mark.slow
-def test_finished_runs_are_tried_and_lines_are_trained_once(tmp_path):
-    code, _, said = run(tmp_path, "train.py", "experiment=temporal_graph", *SMALL)
-    assert code == 0, said
+def test_finished_runs_are_tried_and_lines_are_trained_once(run, tmp_path):
+    done = run(tmp_path, "train.py", "experiment=temporal_graph", *SMALL)
+    assert done.returncode == 0, done.stderr
     asked = ["n=60", "out=found", "moving.devices=2", "moving.gestures=32", "moving.train=true"]
     asked += ["moving.errors=[0.0,0.005]", "moving.seeds=[0]", *SMALL]
-    code, said, errors = run(tmp_path, "moving.py", *asked)
-    assert code == 0, errors
-    assert "below 1 %, no effect possible" in said
+    done = run(tmp_path, "moving.py", *asked)
+    assert done.returncode == 0, done.stderr
+    assert "below 1 %, no effect possible" in done.stdout
     with (tmp_path / "found" / "moving.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     conditions = ["0 mm", "5 mm", "modulus ± 20%", "layout", "oracle", "estimated"]
@@ -68,8 +50,8 @@ def test_finished_runs_are_tried_and_lines_are_trained_once(tmp_path):
     assert len(before) == 6  # a training, its trial, a parent and three lines
     assert {status for _, status in before} == {"FINISHED"}
     written = (tmp_path / "found" / "moving.csv").read_text()
-    code, _, errors = run(tmp_path, "moving.py", *asked)
-    assert code == 0, errors
+    done = run(tmp_path, "moving.py", *asked)
+    assert done.returncode == 0, done.stderr
     assert runs(tmp_path) == before
     assert (tmp_path / "found" / "moving.csv").read_text() == written
 
@@ -81,8 +63,8 @@ def test_finished_runs_are_tried_and_lines_are_trained_once(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_skin_without_motion_is_refused_in_one_sentence(tmp_path):
-    code, _, said = run(tmp_path, "moving.py", f"out={tmp_path}/found", "simulator=naive")
-    assert (code, said.count("\n")) == (2, 1), said
-    assert "set simulator=fem simulator.constraint=free" in said
+def test_a_skin_without_motion_is_refused_in_one_sentence(run, tmp_path):
+    done = run(tmp_path, "moving.py", f"out={tmp_path}/found", "simulator=naive", fresh=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "set simulator=fem simulator.constraint=free" in done.stderr
     assert not (tmp_path / "found").exists()

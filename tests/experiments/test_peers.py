@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 
@@ -31,18 +30,16 @@ SMALL = [
 ]
 
 
-def command(folder, *arguments):
+@pytest.fixture(scope="module")
+def command(run):
     """Run the command with a store and files of its own."""
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    return subprocess.run(
-        [sys.executable, ROOT / "experiments" / "peers.py", *arguments, "--folder", folder / "files", *own],
-        cwd=folder,
-        env=os.environ | {"COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+
+    def command(folder, *arguments, fresh=False):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("COLUMNS", "200")
+            return run(folder, "peers.py", *arguments, "--folder", folder / "files", fresh=fresh)
+
+    return command
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +60,7 @@ def exchanged(configured, tmp_path_factory):
     return device, folder
 
 
-def test_without_its_environment_it_says_what_builds_it(tmp_path):
+def test_without_its_environment_it_says_what_builds_it(command, tmp_path):
     done = command(tmp_path, "--python", str(tmp_path / "none" / "python"))
     assert done.returncode == 2
     assert done.stderr.endswith("make peers builds it\n")
@@ -78,15 +75,15 @@ def test_without_its_environment_it_says_what_builds_it(tmp_path):
         (["--seeds", "0"], "1 or more"),
     ],
 )
-def test_bad_input_exits_with_2(tmp_path, arguments, reason):
-    done = command(tmp_path, *arguments)
+def test_bad_input_exits_with_2(command, tmp_path, arguments, reason):
+    done = command(tmp_path, *arguments, fresh=arguments[0] == "--peers")
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory):
+def ran(command, tmp_path_factory):
     """What two calls of the command with the peer that needs no other environment did."""
     folder = tmp_path_factory.mktemp("peers")
     arguments = ["--peers", "ridge", "--python", sys.executable, "--simulators", "naive", *SMALL]

@@ -25,21 +25,6 @@ COUNT = 8
 PATIENCE = 300  # s: machines are busy at times
 
 
-def run(folder, script, *overrides):
-    """Run a command with a store of its own and return what it said."""
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    done = subprocess.run(
-        [sys.executable, ROOT / "experiments" / script, *map(str, overrides), *own],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def stream(folder):
     """Return the bytes that an emulated skin sends for some gestures, and its N per count."""
     fast = ["port=tcp:0", "emulate.speed=20", f"gestures={COUNT}"]
@@ -81,16 +66,19 @@ def answers(folder, said):
 
 
 @pytest.mark.slow
-def test_a_skin_at_a_port_and_its_recording_are_judged_alike(tmp_path):
-    run(tmp_path, "train.py", "experiment=rules", *SKIN, *SMALL)
+def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, tmp_path):
+    def tell(script, *overrides):
+        done = run(tmp_path, script, *overrides)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    tell("train.py", "experiment=rules", *SKIN, *SMALL)
     data, scale = stream(tmp_path)
     assert data.count(b"# gesture") == COUNT
     with played(data) as port:
         there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]
-        live = answers(
-            tmp_path, run(tmp_path, "evaluate.py", "device=serial", *there, f"out={tmp_path}/live")
-        )
-        said = run(tmp_path, "record.py", *SKIN, "out=s.csv", "device.labels=announced", *there)
+        live = answers(tmp_path, tell("evaluate.py", "device=serial", *there, f"out={tmp_path}/live"))
+        said = tell("record.py", *SKIN, "out=s.csv", "device.labels=announced", *there)
         assert said == f"s.parquet: {COUNT} gestures\n"
         sheet = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
         direct = Serial(body=sheet, layout=Grid(3, 3), port=port, scale=float(scale), gestures=COUNT)
@@ -100,10 +88,10 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(tmp_path):
     assert torch.equal(felt.valid, stored.valid)
     assert torch.equal(felt.labels, stored.labels)
     file = ["device=recording", "device.path=s.parquet", "device.test=all"]
-    again = answers(tmp_path, run(tmp_path, "evaluate.py", *file, f"out={tmp_path}/played"))
+    again = answers(tmp_path, tell("evaluate.py", *file, f"out={tmp_path}/played"))
     assert len(next(iter(live.values()))) == COUNT
     assert again == live
-    text = run(tmp_path, "compare.py", *SKIN, "session=s.csv", "run=latest", f"out={tmp_path}")
+    text = tell("compare.py", *SKIN, "session=s.csv", "run=latest", f"out={tmp_path}")
     assert text.startswith("# The same gestures, simulated and recorded")
     ratio = float(re.search(r"median: (\d\.\d+)", text)[1])
     assert ratio == pytest.approx(1.0, abs=0.1)

@@ -18,16 +18,6 @@ SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 PATIENCE = 300  # s: machines are busy at times
 
 
-def run(script, *arguments):
-    return subprocess.run(
-        [sys.executable, ROOT / "experiments" / script, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
-
-
 @contextmanager
 def emulated(*overrides):
     """Run the emulator; give what device.port takes and the process."""
@@ -54,7 +44,7 @@ def test_ctrl_c_ends_the_emulator_well(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_session_that_was_killed_goes_on_and_is_played_back(tmp_path):
+def test_a_session_that_was_killed_goes_on_and_is_played_back(run, tmp_path):
     path = tmp_path / "s.csv"
     with emulated("emulate.speed=5", "touch.window=30") as (port, _):
         settings = ["device.labels=announced", "device.scale=0.0390625", f"device.port={port}"]
@@ -71,14 +61,14 @@ def test_a_session_that_was_killed_goes_on_and_is_played_back(tmp_path):
         assert before.endswith("\n")
         done = len(read_session(path).takes)
         assert done >= 1
-        resumed = run(*command, f"device.gestures={done + 2}")
+        resumed = run(tmp_path, *command, f"device.gestures={done + 2}", store=False)
     assert resumed.returncode == 0, resumed.stderr
     assert path.read_text().startswith(before)
     stored = read(tmp_path / "s.parquet")
     assert len(stored) == done + 2
     assert stored.touches.readings.shape[1:] == (30, 4)
     assert (stored.touches.readings.flatten(1).amax(1) > 0.3).all()
-    again = run("record.py", *SMALL, f"out={path}", "record.finish=true")
+    again = run(tmp_path, "record.py", *SMALL, f"out={path}", "record.finish=true", store=False)
     assert f"{done + 2} gestures" in again.stdout
 
 
@@ -93,8 +83,8 @@ def test_a_session_that_was_killed_goes_on_and_is_played_back(tmp_path):
     ],
 )
 @pytest.mark.slow
-def test_bad_input_ends_with_2_and_one_sentence(command, reason):
-    done = run(*command)
+def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, command, reason):
+    done = run(tmp_path, *command, store=False)
     assert done.returncode == 2, done.stderr
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

@@ -2,47 +2,29 @@
 
 import csv
 import sqlite3
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
 SMALL = ["data.gestures=200", "device.test_gestures=120", "evaluation.devices=1", "evaluation.layouts=1"]
-SHORT = ["rows=all", "simulator=naive", "stream.hours=0.02", "stream.gap=[20,60]", "out=results"]
-
-
-def run(folder, script, *overrides):
-    """Run a command with a store of its own and return its exit code and what it said."""
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    given = [one.replace("out=results", f"out={folder}/results") for one in overrides]
-    done = subprocess.run(
-        [sys.executable, ROOT / "experiments" / script, *given, *own],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
+SHORT = ["rows=all", "simulator=naive", "stream.hours=0.02", "stream.gap=[20,60]"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(run, tmp_path_factory):
     """A folder with one finished run of a network that learnt from windows."""
     folder = tmp_path_factory.mktemp("runs")
     row = ["experiment=temporal_graph", "simulator=naive", "trainer.max_epochs=1", "data.stream=true"]
-    code, said, errors = run(folder, "train.py", *row, "evaluation.gestures=96", *SMALL)
-    assert code == 0, errors
-    assert "touch/accuracy" in said
+    done = run(folder, "train.py", *row, "evaluation.gestures=96", *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert "touch/accuracy" in done.stdout
     return folder
 
 
 @pytest.mark.slow
-def test_a_run_is_tried_once_and_then_brought_back(folder):
-    code, said, errors = run(folder, "stream.py", *SHORT)
-    assert code == 0, errors
+def test_a_run_is_tried_once_and_then_brought_back(run, folder):
+    done = run(folder, "stream.py", *SHORT, f"out={folder}/results")
+    assert done.returncode == 0, done.stderr
+    said = done.stdout
     files = {path.name: path for path in (folder / "results").iterdir()}
     name = "stream_temporal_graph_streams"
     assert set(files) == {f"{name}.md", f"{name}.csv", f"{name}.png"}
@@ -58,8 +40,8 @@ def test_a_run_is_tried_once_and_then_brought_back(folder):
 
     for path in files.values():
         path.unlink()
-    code, again, errors = run(folder, "stream.py", *SHORT)
-    assert (code, again) == (0, said), errors
+    again = run(folder, "stream.py", *SHORT, f"out={folder}/results")
+    assert (again.returncode, again.stdout) == (0, said), again.stderr
     assert {path.name for path in (folder / "results").iterdir()} == set(files)
     with sqlite3.connect(folder / "m.db") as database:
         tried = database.execute("select count(*) from tags where key='outcome'").fetchone()
@@ -68,8 +50,8 @@ def test_a_run_is_tried_once_and_then_brought_back(folder):
 
 
 @pytest.mark.slow
-def test_bad_input_is_one_sentence(folder):
-    code, _, said = run(folder, "stream.py", "stream.hours=0", "out=nowhere")
-    assert (code, said.count("\n")) == (2, 1)
-    assert "stream.hours=0" in said
+def test_bad_input_is_one_sentence(run, folder):
+    done = run(folder, "stream.py", "stream.hours=0", "out=nowhere", fresh=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "stream.hours=0" in done.stderr
     assert not (folder / "nowhere").exists()

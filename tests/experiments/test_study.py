@@ -23,12 +23,15 @@ finally:
 """
 
 
-def study(folder, *arguments, code=""):
-    """Run the command with a store and a folder of results of its own."""
-    command = [sys.executable, "-c", code] if code else [sys.executable, str(STUDY)]
+def light(folder, *arguments):
+    """Run the command with a store and a folder of results of its own; it tells its heavy imports."""
     own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a", f"--out={folder}/r"]
     return subprocess.run(
-        [*command, *arguments, *own], capture_output=True, text=True, timeout=300, check=False, cwd=folder
+        [sys.executable, "-c", LIGHT, *arguments, *own],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=folder,
     )
 
 
@@ -48,8 +51,8 @@ def folder(tmp_path_factory, configured):
     return folder
 
 
-def test_finished_runs_are_found_and_judged(folder):
-    done = study(folder, "activation")
+def test_finished_runs_are_found_and_judged(run, folder):
+    done = run(folder, "study.py", "activation", f"--out={folder}/r", fresh=True)
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout, "nothing was to be trained"
     page = (folder / "r" / "study_activation.md").read_text()
@@ -68,14 +71,14 @@ def test_finished_runs_are_found_and_judged(folder):
     ],
 )
 def test_bad_input_ends_with_code_2_and_says_what(arguments, named, tmp_path):
-    done = study(tmp_path, *arguments, code=LIGHT)
+    done = light(tmp_path, *arguments)
     assert (done.returncode, done.stdout.split()) == (2, ["heavy:"])
     assert named in done.stderr
     assert not list(tmp_path.iterdir())
 
 
 def test_the_list_names_studies_and_statements_at_once(tmp_path):
-    done = study(tmp_path, "--list", code=LIGHT)
+    done = light(tmp_path, "--list")
     assert done.returncode == 0
     assert "edge_weight: " in done.stdout
     assert "  3.2.2  SiLU has a significant benefit" in done.stdout
@@ -83,9 +86,10 @@ def test_the_list_names_studies_and_statements_at_once(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_missing_is_trained_and_what_failed_is_told(folder):
+def test_what_is_missing_is_trained_and_what_failed_is_told(run, folder):
     # graph convolutions know this pooling, the transformer does not
-    done = study(folder, "transformer", "--smoke", "--seeds", "1", "model.pooling=attention")
+    few = ["--smoke", "--seeds", "1", "model.pooling=attention", f"--out={folder}/r"]
+    done = run(folder, "study.py", "transformer", *few)
     assert done.returncode == 1
     assert done.stdout.count("took") == 1
     assert all(setting in done.stdout.replace("\n", "") for setting in SMOKE[:2])

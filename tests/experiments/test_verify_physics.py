@@ -9,16 +9,10 @@ import pytest
 from skin.config import ROOT
 from skin.proof.index import LAWS
 
-COMMAND = [sys.executable, str(ROOT / "experiments" / "verify_physics.py")]
-
-
-def run(*overrides: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*COMMAND, *overrides], capture_output=True, text=True, check=False, timeout=300)
-
 
 @pytest.mark.slow
-def test_every_law_holds(tmp_path):
-    done = run("physics.quick=true", f"out={tmp_path}")
+def test_every_law_holds(run, tmp_path):
+    done = run(tmp_path, "verify_physics.py", "physics.quick=true", f"out={tmp_path}", store=False)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = json.loads((tmp_path / "physics.json").read_text())
     assert {line["law"] for line in lines} == {law.name for law in LAWS}
@@ -30,17 +24,19 @@ def test_every_law_holds(tmp_path):
         assert f"results/physics/{picture.name}" in text
 
 
-def test_some_laws_leave_the_page_alone():
+def test_some_laws_leave_the_page_alone(run, tmp_path):
     page = ROOT / "docs" / "physics.md"
     before = page.read_bytes() if page.exists() else None
-    done = run("physics.quick=true", "physics.laws=[confined,naive]")
+    done = run(
+        tmp_path, "verify_physics.py", "physics.quick=true", "physics.laws=[confined,naive]", store=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["confined: holds, 2 numbers", "naive: holds, 1 numbers"]
     assert (page.read_bytes() if page.exists() else None) == before
 
 
-def test_an_unknown_law_is_refused():
-    done = run("physics.laws=[gravity]")
+def test_an_unknown_law_is_refused(run, tmp_path):
+    done = run(tmp_path, "verify_physics.py", "physics.laws=[gravity]", store=False, fresh=True)
     assert done.returncode == 2
     assert "got gravity" in done.stderr
     assert "hertz" in done.stderr

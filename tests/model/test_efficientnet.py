@@ -6,14 +6,11 @@ and returns was written down once; its numbers are the literals below.
 
 import hashlib
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
 
-from skin.config import ROOT
 from skin.errors import InputError
 from skin.model.efficientnet import HEAD, EfficientNet
 
@@ -219,12 +216,10 @@ def test_other_channels_are_refused(channels):
 
 
 @pytest.mark.slow
-def test_the_command_line_ends_with_code_2_and_the_sentence(tmp_path, monkeypatch):
+def test_the_command_line_ends_with_code_2_and_the_sentence(run, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    command = [sys.executable, str(ROOT / "experiments" / "train.py"), "model=efficientnet"]
-    command += ["simulator=naive", "data.gestures=20", "device.test_gestures=20", "evaluation.gestures=20"]
-    command += [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
+    few = ["simulator=naive", "data.gestures=20", "device.test_gestures=20", "evaluation.gestures=20"]
+    done = run(tmp_path, "train.py", "model=efficientnet", *few)
     assert done.returncode == 2, done.stderr
     assert "put it there from https://download.pytorch.org/models/" in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,15 +1,12 @@
 """Together: the mean of probabilities, the share of votes, and how often members are not of one mind."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
 from rich.console import Console
 
-from skin.config import ROOT, checked, fingerprint
+from skin.config import checked, fingerprint
 from skin.console import quiet
 from skin.errors import InputError
 from skin.labels import TOUCH, Task
@@ -174,10 +171,8 @@ def test_one_member_is_no_ensemble(trained):
     ("arguments", "reason"),
     [(["--rows", "ruless"], "no row ruless"), ([], "two finished rows, got none")],
 )
-def test_the_command_refuses_with_one_sentence(tmp_path, arguments, reason):
-    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
-    command = [sys.executable, ROOT / "experiments" / "ensemble.py", *arguments, *own]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+def test_the_command_refuses_with_one_sentence(run, tmp_path, arguments, reason):
+    done = run(tmp_path, "ensemble.py", *arguments, fresh=bool(arguments))
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,0 +1,81 @@
+"""Runs commands, each in a fork of a process that has imported the heavy libraries once.
+
+A line of standard input is a job, the answering line its exit code. A job has a process of its own, with its
+own folder, environment, output and end, as one that a shell starts; only imports are shared. Without fork
+(Windows) it is started anew.
+"""
+
+import gc
+import json
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+__all__ = ["main"]
+
+WARM = (
+    "alembic.command",
+    "mlflow.store.tracking.sqlalchemy_store",
+    "pytorch_lightning.callbacks",
+    "skfem",
+    "skin.learner.features",
+    "skin.learner.network",
+    "skin.results.show",
+    "skin.run",
+)
+
+
+def main() -> None:
+    """Run jobs until standard input ends; returns in every fork, too, which then runs its script."""
+    if not hasattr(os, "fork"):
+        for line in sys.stdin:
+            print(_started(json.loads(line)), flush=True)
+        return
+    made = _warm()
+    assert threading.active_count() == 1, "a fork keeps one thread"
+    gc.freeze()  # else every fork would copy what it never changes
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            _become(json.loads(line), made)
+            return
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+
+
+def _warm() -> dict[str, str]:
+    """Import what nearly every command imports; return what that sets in the environment."""
+    before = dict(os.environ)
+    for name in WARM:
+        import_module(name)
+    return {name: value for name, value in os.environ.items() if before.get(name) != value}
+
+
+def _become(job: dict[str, Any], made: dict[str, str]) -> None:
+    """Turn this process into the command."""
+    os.environ.clear()
+    os.environ.update(made | job["environment"])
+    os.chdir(job["folder"])
+    for number, name in enumerate((os.devnull, job["out"], job["err"])):
+        file = os.open(name, os.O_RDWR)
+        os.dup2(file, number)
+        os.close(file)
+    signal.alarm(job["seconds"])
+    script, *arguments = job["command"]
+    sys.argv, sys.path[0] = [script, *arguments], str(Path(script).parent)
+    runpy.run_path(script, run_name="__main__")
+
+
+def _started(job: dict[str, Any]) -> int:
+    with open(job["out"], "w") as out, open(job["err"], "w") as err:
+        command, files = [sys.executable, *job["command"]], {"stdout": out, "stderr": err}
+        return subprocess.call(command, cwd=job["folder"], env=job["environment"], **files)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,14 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks import mechanics, training
-from benchmarks.generation import GESTURES
-from benchmarks.setting import machine, seconds, versions
-from benchmarks.wire import decode_core_share
+from benchmarks.setting import ROWS, machine, seconds, versions
 from rich.console import Console
 
 from skin.config import ROOT
-from skin.results.table import write
 
 HERE = Path(__file__).parent
 SIMULATORS = ("naive", "fem", "solid")
@@ -24,8 +20,15 @@ def main() -> None:
     """Take every figure and write the file whole; progress goes to standard error."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, choices=range(3, 100), default=3, metavar="N >= 3")
-    parser.add_argument("--rows", nargs="*", choices=training.ROWS, default=training.ROWS)
+    parser.add_argument("--rows", nargs="*", choices=ROWS, default=ROWS)
     arguments = parser.parse_args()
+
+    from benchmarks import mechanics, training
+    from benchmarks.generation import GESTURES
+    from benchmarks.wire import decode_core_share
+
+    from skin.results.table import write
+
     repeats, say = arguments.repeats, Console(stderr=True).print
     figures = {
         "repeats": repeats,

@@ -28,6 +28,8 @@ def main() -> None:
     arguments = parser.parse_intermixed_args()
     overrides = [*SAME, *(word for word in arguments.what if "=" in word)]
     rows = [word for word in arguments.what if "=" not in word] or ["features"]
+    for row in rows:
+        configuration(f"experiment={row}", *overrides)  # a mistake must not wait for heavy imports
     sys.exit(1 if run(rows, range(arguments.seeds), overrides, arguments.out) else 0)
 
 

@@ -6,15 +6,19 @@ hardware needed. Ctrl-C ends it.
 
 import sys
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skin.config import DictConfig, command, overrides, plain
-from skin.live.verdict import Patience
+
+if TYPE_CHECKING:
+    from skin.live.verdict import Patience
 
 
 @command("live")
 def main(config: DictConfig) -> None:
     """Bring a finished run back, open what is watched, and show verdicts until somebody ends it."""
+    from skin.live.verdict import Patience
+
     live = plain(config)["live"]
     patience = Patience(**live["patience"])
     try:
@@ -23,7 +27,7 @@ def main(config: DictConfig) -> None:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: dict[str, Any], patience: Patience) -> None:
+def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> None:
     import torch
     from rich.console import Console
 

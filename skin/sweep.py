@@ -86,15 +86,16 @@ class Sweep(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the parent run and tell the jobs about it."""
-        from skin.run import PARENT
-        from skin.tracking import Store
-
         try:
             settings = _tracking(config)
         except InputError as refusal:
             # What no job could accept is refused once, before any of them; Hydra lets only exits pass here.
             print(refusal, file=sys.stderr)
             sys.exit(2)
+
+        from skin.run import PARENT
+        from skin.tracking import Store
+
         _share_cores(config.hydra.launcher)
         self._store = store = Store.open(settings)
         name = config.hydra.runtime.choices.get("sweep") or "sweep"

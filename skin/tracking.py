@@ -9,6 +9,7 @@ os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 import signal
 import sqlite3
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from typing import Any
 
 from filelock import FileLock
 from mlflow import MlflowClient
-from mlflow.entities import Run, ViewType
+from mlflow.entities import Metric, Run, ViewType
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
 from skin.config import ROOT, Tracking
@@ -87,9 +88,10 @@ class Store:
             self.client.set_terminated(run.info.run_id, status)
 
     def log_metrics(self, run: Run, values: dict[str, float]) -> None:
-        """Log final metrics."""
-        for name, value in values.items():
-            self.client.log_metric(run.info.run_id, name, value, synchronous=True)
+        """Log final metrics, in one transaction."""
+        now = int(1000 * time.time())
+        metrics = [Metric(name, value, now, 0) for name, value in values.items()]
+        self.client.log_batch(run.info.run_id, metrics, synchronous=True)
 
 
 @contextmanager

@@ -16,7 +16,10 @@ from omegaconf import DictConfig
 
 from skin.config import CONF, checked
 
-__all__ = ["configuration", "machine", "peak_memory", "seconds", "versions"]
+__all__ = ["ROWS", "configuration", "machine", "peak_memory", "seconds", "versions"]
+
+ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
+"""What is trained, and has a plain twin."""
 
 
 def configuration(*overrides: str) -> DictConfig:

@@ -9,9 +9,7 @@ from skin.console import quiet
 from skin.datamodule import TouchData
 from skin.learner.network import Network
 
-__all__ = ["ROWS", "measure"]
-
-ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
+__all__ = ["measure"]
 
 
 def measure(row: str, repeats: int) -> dict[str, float]:

@@ -60,7 +60,7 @@ def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tm
     ],
 )
 def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, arguments, reason):
-    done = run(tmp_path, "calibrate.py", *arguments, store=False, fresh=True)
+    done = run(tmp_path, "calibrate.py", *arguments, store=False)
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

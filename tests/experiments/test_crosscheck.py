@@ -24,7 +24,7 @@ def test_every_simulator_against_every_other(run, tmp_path):
 
 @pytest.mark.slow
 def test_a_mistyped_row_is_refused(run, tmp_path):
-    done = run(tmp_path, "crosscheck.py", "featurs", fresh=True)
+    done = run(tmp_path, "crosscheck.py", "featurs")
     assert done.returncode == 2
     assert "featurs" in done.stderr
     assert "Traceback" not in done.stderr

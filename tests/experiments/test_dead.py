@@ -27,7 +27,7 @@ def test_masks_are_compared_over_the_same_sensors(run, tmp_path):
     } == {"dead, trained with 2 dead"}
     assert all(25 < float(line["accuracy"].split()[0]) < 95 for line in lines)
     assert all(line["verdict"] in ("", "undecided") for line in lines)
-    done = run(tmp_path, "dead.py", "rows=[gru]", fresh=True)
+    done = run(tmp_path, "dead.py", "rows=[gru]")
     assert done.returncode == 2
     assert "no finished run of gru" in done.stderr
 

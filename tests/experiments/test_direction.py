@@ -26,7 +26,7 @@ def test_it_trains_every_skin_once(run, tmp_path):
 
 
 def test_bad_input_is_one_sentence(run, tmp_path):
-    done = run(tmp_path, "direction.py", "direction.shear=0", f"out={tmp_path}", fresh=True)
+    done = run(tmp_path, "direction.py", "direction.shear=0", f"out={tmp_path}")
     assert done.returncode == 2
     assert done.stderr == "direction.shear must be above 0, got 0: as in direction.shear=0.5\n"
     assert not list(tmp_path.glob("direction*"))

@@ -27,15 +27,9 @@ def test_a_run_is_probed_beside_graph_embeddings(run, tmp_path):
     assert text in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["embeddings.typo=1"], "typo"),
-    ],
-)
-def test_bad_input_ends_with_a_sentence(run, tmp_path, overrides, words):
-    done = run(tmp_path, "embeddings.py", "out=new", *overrides, fresh=True)
+def test_bad_input_ends_with_a_sentence(run, tmp_path):
+    done = run(tmp_path, "embeddings.py", "out=new", "embeddings.typo=1")
     assert done.returncode == 2, done.stderr
-    assert words in done.stderr
+    assert "typo" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "new").exists()

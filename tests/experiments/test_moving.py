@@ -64,7 +64,7 @@ def test_finished_runs_are_tried_and_lines_are_trained_once(run, tmp_path):
 
 @pytest.mark.slow
 def test_a_skin_without_motion_is_refused_in_one_sentence(run, tmp_path):
-    done = run(tmp_path, "moving.py", f"out={tmp_path}/found", "simulator=naive", fresh=True)
+    done = run(tmp_path, "moving.py", f"out={tmp_path}/found", "simulator=naive")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "set simulator=fem simulator.constraint=free" in done.stderr
     assert not (tmp_path / "found").exists()

@@ -34,10 +34,10 @@ SMALL = [
 def command(run):
     """Run the command with a store and files of its own."""
 
-    def command(folder, *arguments, fresh=False):
+    def command(folder, *arguments):
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("COLUMNS", "200")
-            return run(folder, "peers.py", *arguments, "--folder", folder / "files", fresh=fresh)
+            return run(folder, "peers.py", *arguments, "--folder", folder / "files")
 
     return command
 
@@ -76,7 +76,7 @@ def test_without_its_environment_it_says_what_builds_it(command, tmp_path):
     ],
 )
 def test_bad_input_exits_with_2(command, tmp_path, arguments, reason):
-    done = command(tmp_path, *arguments, fresh=arguments[0] == "--peers")
+    done = command(tmp_path, *arguments)
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

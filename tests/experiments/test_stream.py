@@ -51,7 +51,7 @@ def test_a_run_is_tried_once_and_then_brought_back(run, folder):
 
 @pytest.mark.slow
 def test_bad_input_is_one_sentence(run, folder):
-    done = run(folder, "stream.py", "stream.hours=0", "out=nowhere", fresh=True)
+    done = run(folder, "stream.py", "stream.hours=0", "out=nowhere")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "stream.hours=0" in done.stderr
     assert not (folder / "nowhere").exists()

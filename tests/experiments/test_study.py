@@ -52,7 +52,7 @@ def folder(tmp_path_factory, configured):
 
 
 def test_finished_runs_are_found_and_judged(run, folder):
-    done = run(folder, "study.py", "activation", f"--out={folder}/r", fresh=True)
+    done = run(folder, "study.py", "activation", f"--out={folder}/r")
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout, "nothing was to be trained"
     page = (folder / "r" / "study_activation.md").read_text()

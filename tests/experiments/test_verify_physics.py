@@ -36,7 +36,7 @@ def test_some_laws_leave_the_page_alone(run, tmp_path):
 
 
 def test_an_unknown_law_is_refused(run, tmp_path):
-    done = run(tmp_path, "verify_physics.py", "physics.laws=[gravity]", store=False, fresh=True)
+    done = run(tmp_path, "verify_physics.py", "physics.laws=[gravity]", store=False)
     assert done.returncode == 2
     assert "got gravity" in done.stderr
     assert "hertz" in done.stderr

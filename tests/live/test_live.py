@@ -50,19 +50,19 @@ def until(found, process, what):
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
+def store(run, tmp_path_factory):
     """The overrides that lead to a store with one run of rules."""
     folder = tmp_path_factory.mktemp("live")
     own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
-    train = [sys.executable, ROOT / "experiments" / "train.py", *SMALL, *own]
-    subprocess.run(train, cwd=folder, check=True, capture_output=True, timeout=600)
+    done = run(folder, "train.py", *SMALL)
+    assert done.returncode == 0, done.stderr
     return own
 
 
 @pytest.mark.slow
 def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(store, browser, tmp_path):
     link = tmp_path / "skin"
-    faults = ["faults.unplug=[20]", "faults.away=3"]
+    faults = ["faults.unplug=[10]", "faults.away=2"]
     pace = ["emulate.rate=50", "emulate.gap=1.5"]
     emulator = started(tmp_path, "emulate.py", "simulator=naive", f"link={link}", *pace, *faults)
     live = None
@@ -104,7 +104,7 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(stor
 
 @pytest.mark.slow
 def test_the_simulator_is_watched_without_hardware(store, tmp_path):
-    live = started(tmp_path, "live.py", "seconds=8", *store)
+    live = started(tmp_path, "live.py", "seconds=5", *store)
     assert live.wait(PATIENCE) == 0
     assert re.search(r"\d+ verdicts, 10\.0 Hz, frame to verdict", (tmp_path / "live.py.err").read_text())
     assert "filling the window" in (tmp_path / "live.py.out").read_text()
@@ -117,10 +117,8 @@ def test_the_simulator_is_watched_without_hardware(store, tmp_path):
         ("run=none", "no finished training run none"),
     ],
 )
-def test_bad_input_is_one_sentence(tmp_path, override, needed):
-    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
-    live = started(tmp_path, "live.py", override, *own)
-    assert live.wait(PATIENCE) == 2
-    said = (tmp_path / "live.py.err").read_text()
-    assert needed in said
-    assert said.count("\n") == 1
+def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
+    done = run(tmp_path, "live.py", override)
+    assert done.returncode == 2
+    assert needed in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -172,7 +172,7 @@ def test_one_member_is_no_ensemble(trained):
     [(["--rows", "ruless"], "no row ruless"), ([], "two finished rows, got none")],
 )
 def test_the_command_refuses_with_one_sentence(run, tmp_path, arguments, reason):
-    done = run(tmp_path, "ensemble.py", *arguments, fresh=bool(arguments))
+    done = run(tmp_path, "ensemble.py", *arguments)
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,8 +1,8 @@
 """Runs commands, each in a fork of a process that has imported the heavy libraries once.
 
 A line of standard input is a job, the answering line its exit code. A job has a process of its own, with its
-own folder, environment, output and end, as one that a shell starts; only imports are shared. Without fork
-(Windows) it is started anew.
+own folder, environment, output and end, as one that a shell starts; only imports are shared. Where there is
+no fork (Windows), or none that libraries bear (macOS), it is started anew.
 """
 
 import gc
@@ -33,7 +33,7 @@ WARM = (
 
 def main() -> None:
     """Run jobs until standard input ends; returns in every fork, too, which then runs its script."""
-    if not hasattr(os, "fork"):
+    if not hasattr(os, "fork") or sys.platform == "darwin":
         for line in sys.stdin:
             print(_started(json.loads(line)), flush=True)
         return

@@ -33,9 +33,9 @@ def main() -> None:
     chosen = arguments.parse_intermixed_args()
     if unknown := [peer for peer in chosen.peers if peer not in PEERS]:
         raise InputError(f"there is no peer {unknown[0]}: choose from {', '.join(PEERS)}")
+    configs = [configuration(*job, f"row={peer}") for job in jobs(chosen) for peer in chosen.peers]
     if not chosen.python.is_file():
         raise InputError(f"there is no {chosen.python}: make peers builds it")
-    configs = [configuration(*job, f"row={peer}") for job in jobs(chosen) for peer in chosen.peers]
 
     from rich.progress import Progress
 

@@ -22,7 +22,7 @@ class Fourier(AbstractRepresentation):
         size: extent (x, y) of the sheet, m.
         pixels: edge length of the image and of its spectrum.
         scale: N; readings are divided by it.
-        mask: append a channel that tells which pixels (not frequencies) hold a valid reading.
+        mask: append a channel that tells which pixels (not frequencies) hold an invalid reading.
 
     Raises:
         InputError: ``pixels`` is below 8.

@@ -24,7 +24,7 @@ class Image(AbstractRepresentation):
         size: extent (x, y) of the sheet, m; the square image covers all of it.
         pixels: edge length of the image; the report tries 48, 64 and 128.
         scale: N; readings are divided by it.
-        mask: append a channel that tells which pixels hold a valid reading.
+        mask: append a channel that tells which pixels hold an invalid reading.
 
     Raises:
         InputError: ``pixels`` is below 8.

@@ -63,7 +63,7 @@ class Interpolation(AbstractRepresentation):
         method: nearest, linear or cubic, see :func:`weights`; or several of them, each giving one channel.
         pixels: edge length of the image.
         scale: N; readings are divided by it.
-        mask: append the interpolated validity, one channel per method.
+        mask: append where readings are invalid, interpolated, one channel per method.
 
     Raises:
         InputError: an unknown method, none at all, too few sensors for it, or ``pixels`` below 8.

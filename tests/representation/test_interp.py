@@ -92,9 +92,9 @@ def test_the_mask_of_several_methods_follows_their_values(given):
     x = Interpolation(positions, SIZE, METHODS, mask=True)(readings, valid).x
     plain = Interpolation(positions, SIZE, METHODS)
     torch.testing.assert_close(x[:, :, :3], plain(readings, valid).x)
-    wanted = plain(10 * valid.float(), torch.ones_like(valid)).x
+    wanted = plain(10 * (~valid).float(), torch.ones_like(valid)).x
     torch.testing.assert_close(x[:, :, 3:], wanted)
-    assert (wanted.amin(dim=(-2, -1)) < 0.5).sum() == 3 * 3  # in frame 4 of each touch, by each method
+    assert (wanted.amax(dim=(-2, -1)) > 0.5).sum() == 3 * 3  # in frame 4 of each touch, by each method
 
 
 def test_three_interpolations_feed_an_image_model_of_three_channels(configured, given):

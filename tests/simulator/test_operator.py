@@ -206,7 +206,8 @@ def test_the_folder_is_given_or_taken_from_the_environment(tmp_path, monkeypatch
 
 
 def test_a_warm_start_makes_no_noise(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(record=True) as noise:
+        warnings.simplefilter("always")
         for _ in range(2):
             cached(STRUCTURE, SENSORS, tmp_path)
+    assert not noise

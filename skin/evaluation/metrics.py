@@ -16,7 +16,7 @@ from torchmetrics.functional.classification import (
 
 from skin.labels import Task
 
-__all__ = ["angles", "confusion", "metrics", "recall_at"]
+__all__ = ["alarm_level", "angles", "confusion", "metrics", "recall_at"]
 
 
 def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate: float) -> dict[str, float]:
@@ -79,6 +79,12 @@ def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
     """
     false_alarms, recall, _ = binary_roc(chance, label)
     return float(recall[false_alarms <= false_alarm_rate].max())
+
+
+def alarm_level(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
+    """Return the probability from which on alarms are raised to reach :func:`recall_at`; same arguments."""
+    false_alarms, _, levels = binary_roc(chance, label)
+    return float(levels[false_alarms <= false_alarm_rate].min())
 
 
 def confusion(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:

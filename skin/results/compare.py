@@ -14,7 +14,7 @@ from skin.calibration.bench import Bench, bench
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.recording import Touches
-from skin.results.figures import save
+from skin.results.figures import COLOURS, save
 from skin.session.reduction import highest
 from skin.streams import Stream, generator
 
@@ -230,11 +230,11 @@ def figure(found: Comparison, shown: int, path: Path) -> Path:
         top = 1.1 * max(one.peaks)
         for row, (name, values) in enumerate((("simulated", found.simulated), ("recorded", found.recorded))):
             axis = axes[row, column]
-            axis.plot(time[span] - time[mine[0]], force[span], color="#0072B2")
-            axis.set_ylabel("applied force, N", color="#0072B2")
+            axis.plot(time[span] - time[mine[0]], force[span], color=COLOURS[0])
+            axis.set_ylabel("applied force, N", color=COLOURS[0])
             twin = axis.twinx()
-            twin.plot(time[span] - time[mine[0]], values[span, one.sensor], color="#E69F00", linewidth=1)
-            twin.set_ylabel("reading, N", color="#E69F00")
+            twin.plot(time[span] - time[mine[0]], values[span, one.sensor], color=COLOURS[4], linewidth=1)
+            twin.set_ylabel("reading, N", color=COLOURS[4])
             twin.set_ylim(-0.05 * top, top)
             axis.set_title(f"{name}, press {one.number}, sensor {one.sensor}", fontsize=9)
         axes[1, column].set_xlabel("time, s")

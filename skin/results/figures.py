@@ -8,12 +8,22 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-__all__ = ["confusions", "force_and_reading", "images", "misclassified", "overview", "save", "traces"]
+__all__ = [
+    "COLOURS",
+    "confusions",
+    "force_and_reading",
+    "images",
+    "misclassified",
+    "overview",
+    "save",
+    "traces",
+]
 
 Layout = tuple[tuple[float, float], float]
 
-# Okabe and Ito's palette: told apart by colour-blind readers too.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's palette: told apart by colour-blind readers too."""
+
 _MARKS = ("o", "s", "^", "D")
 
 
@@ -128,7 +138,7 @@ def misclassified(
     # Static touches go to group 0, a slide in bin k to group k.
     group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, bins), 1, len(bins) - 1))
     # Every colour comes with one mark after the other, so that any number of rows can be told apart.
-    styles = product(_MARKS, _COLOURS)
+    styles = product(_MARKS, COLOURS)
     for (row, errors), (mark, colour) in zip(wrong.items(), styles, strict=False):
         counts = np.bincount(group, minlength=len(middles))
         shares = np.bincount(group, weights=errors, minlength=len(middles)) / np.maximum(counts, 1)
@@ -154,7 +164,7 @@ def traces(readings: Mapping[str, Tensor], rate: float) -> Figure:
     axes = figure.subplots(1, len(readings), squeeze=False)[0]
     for axis, (name, values) in zip(axes, readings.items(), strict=True):
         sensor = int(values.amax(0).argmax())
-        axis.plot(np.arange(len(values)) / rate, values[:, sensor], color=_COLOURS[0], marker=".")
+        axis.plot(np.arange(len(values)) / rate, values[:, sensor], color=COLOURS[0], marker=".")
         axis.set_title(f"{name}, sensor {sensor}")
         axis.set_xlabel("time, s")
         axis.set_ylabel("reading, N")
@@ -176,10 +186,10 @@ def force_and_reading(force: Tensor, readings: Tensor, rate: float) -> Figure:
     ):
         time = np.arange(len(applied)) / rate
         sensor = int(values.amax(0).argmax())
-        axis.plot(time, applied, color=_COLOURS[0])
-        axis.set_ylabel("applied force, N", color=_COLOURS[0])
+        axis.plot(time, applied, color=COLOURS[0])
+        axis.set_ylabel("applied force, N", color=COLOURS[0])
         axis.set_xlabel("time, s")
         twin = axis.twinx()
-        twin.plot(time, values[:, sensor], color=_COLOURS[4])
-        twin.set_ylabel(f"sensor {sensor}, N", color=_COLOURS[4])
+        twin.plot(time, values[:, sensor], color=COLOURS[4])
+        twin.set_ylabel(f"sensor {sensor}, N", color=COLOURS[4])
     return figure

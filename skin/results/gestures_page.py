@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from skin.results.compare import Verdicts, agreement
-from skin.results.figures import save
+from skin.results.figures import COLOURS, save
 from skin.results.gestures import Gestures
 from skin.session.takes import sentence
 
@@ -72,13 +72,13 @@ def figure(found: Gestures, shown: int, path: Path) -> Path:
         for row, name in enumerate(("simulated", "recorded")):
             axis, values = axes[row, column], getattr(pair, name)[:, sensors[row]]
             if row == 0 or found.same:
-                axis.plot(time, pair.applied, color="#0072B2")
-                axis.set_ylabel("applied force, N", color="#0072B2")
+                axis.plot(time, pair.applied, color=COLOURS[0])
+                axis.set_ylabel("applied force, N", color=COLOURS[0])
             else:
                 axis.set_yticks([])
             twin = axis.twinx()
-            twin.plot(time, np.where(pair.valid[:, sensors[row]], values, np.nan), ".-", color="#E69F00")
-            twin.set_ylabel("reading, N", color="#E69F00")
+            twin.plot(time, np.where(pair.valid[:, sensors[row]], values, np.nan), ".-", color=COLOURS[4])
+            twin.set_ylabel("reading, N", color=COLOURS[4])
             twin.set_ylim(-0.05 * max(pair.peaks), 1.1 * max(pair.peaks))
             axis.set_title(f"{name}, gesture {pair.number}, sensor {sensors[row]}", fontsize=9)
         axes[1, column].set_xlabel("time, s")

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.sliding import Sliding
-from skin.results.figures import save
+from skin.results.figures import COLOURS, save
 from skin.results.table import markdown, write
 
 __all__ = ["line", "publish"]
-
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")  # Okabe and Ito's
 
 
 def publish(found: Sliding, title: str, path: Path) -> list[Path]:
@@ -112,7 +110,7 @@ def _figure(found: Sliding, title: str) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
     names = list(found.bins[0].accuracy) if found.bins else []
     places = range(len(found.bins))
-    for name, colour in zip(names, _COLOURS, strict=False):
+    for name, colour in zip(names, COLOURS, strict=False):
         left.plot(
             places, [100 * one.accuracy[name] for one in found.bins], "o-", color=colour, ms=4, label=name
         )
@@ -128,7 +126,7 @@ def _figure(found: Sliding, title: str) -> Figure:
         [rate - heard.range[0] for rate, heard in zip(rates, found.alarms.values(), strict=True)],
         [heard.range[1] - rate for rate, heard in zip(rates, found.alarms.values(), strict=True)],
     ]
-    right.bar(spots, rates, yerr=spread, color=_COLOURS[1], width=0.6, capsize=4)
+    right.bar(spots, rates, yerr=spread, color=COLOURS[1], width=0.6, capsize=4)
     right.set_ylim(bottom=0)
     labels = [
         f"{gate}\n{heard.found}/{heard.dangerous} found\n{heard.raised}/{heard.safe} safe raised"

@@ -10,13 +10,12 @@ from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 
 from skin.embedding.probe import FRAME, Found
+from skin.results.figures import COLOURS
 from skin.results.study import conclude, paired, verdict
 
 __all__ = ["lines", "planes", "spaces", "statements"]
 
 _Figure = Callable[[Found], float]
-
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 
 
 def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
@@ -157,6 +156,6 @@ def _percent(values: Sequence[float]) -> str:
 def _scatter(axis: Axes, plane: np.ndarray, classes: np.ndarray) -> None:
     for number in np.unique(classes):
         x, y = plane[classes == number].T
-        axis.scatter(x, y, s=4, color=_COLOURS[number % len(_COLOURS)], alpha=0.6, linewidths=0)
+        axis.scatter(x, y, s=4, color=COLOURS[number % len(COLOURS)], alpha=0.6, linewidths=0)
     axis.set_xticks([])
     axis.set_yticks([])

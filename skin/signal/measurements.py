@@ -5,7 +5,7 @@ from torch import Tensor
 
 from skin.recording import Touches
 
-__all__ = ["measurements"]
+__all__ = ["above_idle", "measurements"]
 
 LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle; the noise is about 0.05 N
 SHARES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)  # of the touch's own peak
@@ -16,11 +16,9 @@ BEST = 10  # how many sorted values are kept
 def measurements(touches: Touches) -> dict[str, Tensor]:
     """Return about 130 named measurements, (B,) each, of touches of any layout.
 
-    Every sensor's idle level (a low quantile over the window) is subtracted first, so that constant offsets
-    of a device do not matter; readings that are not valid count as idle.
+    Nearly all are of what exceeds a sensor's idle level; readings that are not valid count as idle.
     """
-    raw = torch.where(touches.valid, touches.readings, torch.zeros(()))
-    x = (raw - torch.quantile(raw, IDLE, dim=1, keepdim=True)) * touches.valid
+    raw, x = _valid(touches), above_idle(touches)
     places = touches.positions[..., :2].to(x.dtype)
     frame, peak = x.sum(dim=2), x.amax(dim=2)
     return {
@@ -31,6 +29,20 @@ def measurements(touches: Touches) -> dict[str, Tensor]:
         **_path(x, peak, places),
         **_spread(x, places),
     }
+
+
+def above_idle(touches: Touches) -> Tensor:
+    """Return by how much each reading exceeds its sensor's idle level, (B, T, S), N; 0 where it is not valid.
+
+    That level is a low quantile over the window, so that constant offsets of a device do not matter.
+    """
+    raw = _valid(touches)
+    return (raw - torch.quantile(raw, IDLE, dim=1, keepdim=True)) * touches.valid
+
+
+def _valid(touches: Touches) -> Tensor:
+    """Return the readings (B, T, S), N, 0 where they are not valid."""
+    return torch.where(touches.valid, touches.readings, torch.zeros(()))
 
 
 def _longest(active: Tensor) -> Tensor:

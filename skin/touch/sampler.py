@@ -24,7 +24,7 @@ __all__ = ["Movie", "TouchSampler", "balanced", "join"]
 _ATTEMPTS = 50
 _AHEAD = 64
 _DRAWN = ("shape", "angle", "duration", "onset", "direction", "speed")
-_FOUND = ("peak", "force", "area", "draws", "net_x", "net_y")
+_FOUND = ("peak", "force", "draws", "net_x", "net_y")
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,11 @@ class Movie:
         scale: (B, T), its share of full force; 0 where nothing touches.
         labels: (B, 4), 0 or 1, float32, in the order of ``skin.labels.TOUCH``.
         parameters: (B,) each: shape (index), angle (rad), duration and onset (frames), direction (rad), speed
-            (m per frame), peak (highest cell pressure, Pa), force (N, all cells at full force), area (largest
-            share of the sheet in contact), draws (how many were drawn until one had the wanted labels), net_x
-            and net_y (m, from the first place of the path to its last); and where pressure is solved for,
-            unconverged (frames of all its draws that were not found).
+            (m per frame), peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how
+            many were drawn until one had the wanted labels), net_x and net_y (m, from the first place of the
+            path to its last); area, travel, frames and pressure (``skin.labels.Measures``), which make the
+            labels; and where pressure is solved for, unconverged (frames of all its draws that were not
+            found).
         drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
             times the direction of motion, 0 where nothing slides; None: no friction.
     """
@@ -228,9 +229,10 @@ class TouchSampler:
         if not self.contact.proportional:
             # More of an object comes down as force grows, which moves the centre of pressure though it rests.
             measures = measures._replace(travel=torch.from_numpy(taken.travel))
-        values = pressed.peak, pressed.force, measures.area.numpy(), gestures["draws"], *taken.net.T
+        values = pressed.peak, pressed.force, gestures["draws"], *taken.net.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
         known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
+        known |= {name: value.float() for name, value in measures._asdict().items()}
         pull = settings.shear * heading(taken.way, taken.first) if settings.shear else None
         drag = None if pull is None else torch.from_numpy(pull).float()
         labels = measures.labels(settings.thresholds)

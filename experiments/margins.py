@@ -1,0 +1,42 @@
+"""How far from a threshold a verdict can be trusted: python experiments/margins.py run=latest
+
+Sorts the verdicts of a finished run by area, travel, duration and pressure over their thresholds, and by the
+highest reading. Writes margins_<row>.md, .csv and .png into out=, and an MLflow run of its own.
+"""
+
+from pathlib import Path
+
+from skin.config import ROOT, DictConfig, command, overrides
+
+_OWN = ("gestures", "out", "run")
+
+
+@command("margins")
+def main(config: DictConfig) -> None:
+    """Bring a finished run back, sort its verdicts, print a line, write its files and log them."""
+    from skin.build import build_data, build_device, build_learner
+    from skin.console import quiet
+    from skin.evaluation.margins import margins
+    from skin.reload import changed, configuration, find, restore
+    from skin.results.margins import line, publish
+    from skin.tracking import Store
+
+    quiet()
+    store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
+    run = find(store, config.run)
+    given = [one for one in overrides() if one.lstrip("+~").split("=")[0] not in _OWN]
+    own = changed(configuration(store, run), config, given)
+    device, learner = build_device(own), build_learner(own)
+    restore(store, run, learner, build_data(own, device))
+    found = margins(learner, device, config.gestures, own.evaluation.false_alarm_rate)
+    tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
+    with store.run(f"margins of {run.info.run_name}", tags, run.info.run_id) as logged:
+        title = f"{run.info.run_name}, run {run.info.run_id[:8]}, {config.gestures} touches"
+        written = publish(found, title, folder / f"margins_{own.row}")
+        for path in written:
+            store.client.log_artifact(logged.info.run_id, str(path))
+    print(line(found), *written, sep="\n")
+
+
+if __name__ == "__main__":
+    main()

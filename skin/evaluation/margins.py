@@ -1,0 +1,164 @@
+"""Where a learner errs: how near to the line between two classes, and at how faint a touch."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from scipy.stats import binomtest
+from torch import Tensor
+
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.evaluation.metrics import alarm_level
+from skin.evaluation.report import Answers
+from skin.labels import TOUCH, Measures, Thresholds
+from skin.signal.measurements import above_idle
+
+__all__ = ["ALARM", "Faint", "Margins", "Span", "margins", "spans"]
+
+ALARM = "alarm"
+"""Name of the verdict "dangerous" where only so many false alarms are allowed."""
+
+_SHARES = (0, 0.5, 0.8, 0.9, 0.95, 1, 1.05, 1.1, 1.25, 2, torch.inf)  # of the threshold
+_STRENGTHS = (0, 0.3, 0.5, 1, 2, 5, torch.inf)  # N; a touch of 0.3 N is six times the noise
+
+
+@dataclass(frozen=True)
+class Span:
+    """The touches whose measure lies between two shares of its threshold.
+
+    Attributes:
+        low: they are above it.
+        high: they are not above it; the label holds from 1 on.
+        mean: of their shares.
+        count: how many they are.
+        said: how many the learner says the label of.
+    """
+
+    low: float
+    high: float
+    mean: float
+    count: int
+    said: int
+
+    @property
+    def wrong(self) -> int:
+        """How many it is wrong of."""
+        return self.said if self.high <= 1 else self.count - self.said
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Shares said within 95 % confidence: exact (Clopper and Pearson, 1934)."""
+        low, high = binomtest(self.said, self.count).proportion_ci(0.95)
+        return float(low), float(high)
+
+
+@dataclass(frozen=True)
+class Faint:
+    """The touches whose highest reading lies between two forces.
+
+    Attributes:
+        low: N above the sensor's idle level; they are above it.
+        high: N; they are not above it.
+        count: how many they are.
+        wrong: label -> how many of them the learner is wrong of.
+    """
+
+    low: float
+    high: float
+    count: int
+    wrong: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Margins:
+    """What :func:`margins` found.
+
+    Attributes:
+        spans: label -> its spans, from below to above the threshold; ``ALARM`` too.
+        faint: from faint to strong.
+        false_alarm_rate: of ``ALARM``.
+    """
+
+    spans: dict[str, list[Span]]
+    faint: list[Faint]
+    false_alarm_rate: float
+
+
+def margins(learner: Answers, device: AbstractDevice, gestures: int, false_alarm_rate: float) -> Margins:
+    """Sort a learner's verdicts on whole test touches by what the labels are made of, and by strength.
+
+    Args:
+        learner: trained to tell the labels of ``TOUCH``, perhaps among others.
+        device: that it was trained on, or another.
+        gestures: how many test touches.
+        false_alarm_rate: share of the safe touches that may raise an alarm.
+
+    Raises:
+        InputError: a device that does not know how hard and where it is touched.
+    """
+    if not isinstance(device, Simulated):
+        raise InputError(
+            f"only simulated touches are known well enough, {type(device).__name__} has none: "
+            "add device=simulated"
+        )
+    recording = device.replace(test_gestures=gestures, stream=False, direction=False).recording(
+        "test", complete=False
+    )
+    touches, labels = recording.touches, recording.touches.labels
+    assert labels is not None
+    places = [device.task.names.index(name) for name in TOUCH.names]
+    chances = learner.probabilities(touches)[:, places]
+    said, known = chances > 0.5, recording.parameters
+    measures = Measures(*(known[name] for name in Measures._fields))
+    shares = _shares(measures, device.sampler.settings.thresholds)
+    found = {name: spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
+    danger = TOUCH.names.index("dangerous")
+    level = alarm_level(false_alarm_rate, chances[:, danger], labels[:, danger].long())
+    found[ALARM] = spans(chances[:, danger] >= level, shares[:, danger])
+    faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
+    return Margins(found, faint, false_alarm_rate)
+
+
+def spans(said: Tensor, shares: Tensor) -> list[Span]:
+    """Return the spans of touches that are not empty.
+
+    Args:
+        said: (B,), bool, whether the learner says the label.
+        shares: (B,), measure over threshold.
+    """
+    return [
+        Span(low, high, float(shares[here].mean()), int(here.sum()), int(said[here].sum()))
+        for low, high, here in _between(_SHARES, shares)
+    ]
+
+
+def _shares(measures: Measures, thresholds: Thresholds) -> Tensor:
+    """Return each measure over its threshold, (B, 4), in the order of ``TOUCH``."""
+    pairs = (
+        (measures.area, thresholds.area),
+        (measures.travel, thresholds.travel),
+        (measures.frames, thresholds.frames),
+        (measures.pressure, thresholds.pressure),
+    )
+    return torch.stack([measure / threshold for measure, threshold in pairs], dim=1)
+
+
+def _faint(wrong: Tensor, strength: Tensor) -> list[Faint]:
+    """Return the errors (B, 4) by the strength (B,), N, of the touch."""
+    return [
+        Faint(
+            low, high, int(here.sum()), dict(zip(TOUCH.names, wrong[here].sum(dim=0).tolist(), strict=True))
+        )
+        for low, high, here in _between(_STRENGTHS, strength)
+    ]
+
+
+def _between(edges: Sequence[float], values: Tensor) -> Iterator[tuple[float, float, Tensor]]:
+    """Yield each range (low, high] that holds some of the values (B,), and which, bool; 0 is in the first."""
+    for low, high in pairwise(edges):
+        here = (values <= high) & ((values > low) | (low == 0))
+        if here.any():
+            yield low, high, here

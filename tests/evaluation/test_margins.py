@@ -1,0 +1,85 @@
+"""Verdicts by the distance from a threshold and by strength, against touches whose answers are known."""
+
+import pytest
+import torch
+
+from skin.device.base import AbstractDevice
+from skin.errors import InputError
+from skin.evaluation.margins import ALARM, margins, spans
+from skin.evaluation.metrics import alarm_level, recall_at
+from skin.labels import TOUCH
+from skin.recording import Touches
+
+
+class Sure:
+    """Says what the labels say, but for some."""
+
+    def __init__(self, but: torch.Tensor) -> None:
+        self.but = but
+
+    def probabilities(self, touches: Touches) -> torch.Tensor:
+        """Return probabilities near 0 and 1."""
+        assert touches.labels is not None
+        return ((touches.labels > 0.5) != self.but).float() * 0.8 + 0.1
+
+
+def test_spans_hold_what_is_said_and_what_is_wrong():
+    shares = torch.tensor([0.0, 0.97, 1.0, 1.01, 1.02, 3.0])
+    said = torch.tensor([True, False, True, True, False, True])
+    found = spans(said, shares)
+    assert [(one.low, one.high, one.count, one.said, one.wrong) for one in found] == [
+        (0, 0.5, 1, 1, 1),
+        (0.95, 1, 2, 1, 1),  # a measure that only reaches its threshold does not pass it
+        (1, 1.05, 2, 1, 1),
+        (2, float("inf"), 1, 1, 0),
+    ]
+    assert found[1].mean == pytest.approx(0.985)
+
+
+def test_ranges_are_exact():
+    """None of ten: the upper end p has (1 - p)^10 = 0.025."""
+    (one,) = spans(torch.zeros(10, dtype=torch.bool), torch.zeros(10))
+    assert one.range == pytest.approx((0, 1 - 0.025**0.1))
+
+
+def test_alarms_are_raised_from_the_level_on():
+    generator = torch.Generator().manual_seed(0)
+    label = torch.rand(500, generator=generator).round().long()
+    chance = (torch.rand(500, generator=generator) + 0.4 * label) / 1.4
+    level = alarm_level(0.05, chance, label)
+    alarm = chance >= level
+    assert alarm[label == 0].float().mean() <= 0.05
+    assert float(alarm[label == 1].float().mean()) == pytest.approx(recall_at(0.05, chance, label))
+
+
+@pytest.fixture(scope="module")
+def device(configured) -> AbstractDevice:
+    from skin.build import build_device
+
+    return build_device(configured("simulator=naive", "layout=grid", "device.test_gestures=64"))
+
+
+def test_the_labels_are_what_the_measures_say(device):
+    """A learner that says the labels is wrong in no span; every label changes where its measure passes 1."""
+    found = margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, 0.02)
+    assert set(found.spans) == {*TOUCH.names, ALARM}
+    for each in found.spans.values():
+        assert sum(one.count for one in each) == 200
+        assert [one.said for one in each] == [0 if one.high <= 1 else one.count for one in each]
+        assert all(one.low < one.mean <= one.high or one.mean == one.low == 0 for one in each)
+    assert sum(one.count for one in found.faint) == 200
+    assert not any(value for one in found.faint for value in one.wrong.values())
+
+
+def test_errors_are_found_where_they_are(device):
+    but = torch.zeros(200, 4, dtype=torch.bool)
+    but[:7, 1] = True
+    found = margins(Sure(but), device, 200, 0.02)
+    assert sum(one.wrong for one in found.spans["dynamic"]) == 7
+    assert sum(one.wrong["dynamic"] for one in found.faint) == 7
+    assert sum(one.wrong for one in found.spans["big"]) == 0
+
+
+def test_only_simulated_touches_are_known(made_up_device):
+    with pytest.raises(InputError, match="device=simulated"):
+        margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, 0.02)

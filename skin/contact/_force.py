@@ -1,6 +1,7 @@
 """The force at which a touch has its wanted classes, gesture by gesture, by halving towards the limit."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -54,47 +55,98 @@ def seek(
         wanted: (B, 2), bool: big, dangerous.
         ground: what is touched; ranges and thresholds.
     """
-    settings, body = ground.settings, ground.shapes.body
-    cell = body.cell[0] * body.cell[1]
-    ends = np.where(wanted[:, 1:], settings.dangerous_peak, settings.safe_peak)
-    least, most = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
-    target = np.clip(peak, least, most)
-    pressure = begin * torch.from_numpy(target / begin.amax(1).double().numpy()).to(begin)[:, None]
-    load = pressure.sum(1).double().numpy() * cell
-    result = np.full(len(load), np.nan)
-    area, failed = np.zeros(len(load), bool), np.zeros(len(load), bool)
-    # How the load grows with the peak: by the power of 3 under a ball, in proportion under a flat punch.
-    power = np.full(len(load), 1.5)
-    last = np.full((2, len(load)), np.nan)
-    rows = np.arange(len(load))
+    search = _Search.of(begin, peak, wanted, ground)
+    rows = np.arange(len(peak))
     for _ in range(_STEPS):
-        found, lost = solve(rows, load[rows], pressure[torch.from_numpy(rows)])
-        pressure[torch.from_numpy(rows)] = found.pressure.to(pressure)
-        highest, classes = _classes(found.pressure, ground)
-        wrong = classes != wanted[rows]
-        up, down = ((wrong & side).any(1) for side in (wanted[rows], ~wanted[rows]))
-        offset = np.log(highest / target[rows])
-        met = np.abs(offset) < np.log(_NEAR)
-        done = met & ~up & ~down
-        result[rows[done]] = load[rows[done]]
-        # Nothing is left to try: both ways at once, or already at the end.
-        over = met & (
-            (up & down) | (up & (target[rows] >= most[rows])) | (down & (target[rows] <= least[rows]))
-        )
-        area[rows[over]] = wrong[over, 0]
-        failed[rows[lost]] = True
-        for side, end in ((met & up, most), (met & down, least)):
-            target[rows[side]] = _halfway(target[rows[side]], end[rows[side]])
-        goes_on = ~done & ~over & ~lost
-        power[rows] = _power(power[rows], np.log(load[rows]), np.log(highest), last[:, rows])
-        last[:, rows] = np.log(load[rows]), np.log(highest)
-        rows = rows[goes_on]
+        here = torch.from_numpy(rows)
+        equilibrium, lost = solve(rows, search.load[rows], search.pressure[here])
+        search.pressure[here] = equilibrium.pressure.to(search.pressure)
+        highest, classes = _classes(equilibrium.pressure, ground)
+        rows = search.move(rows, search.judge(rows, highest, classes != wanted[rows], lost), highest)
         if not len(rows):
             break
-        step = power[rows] * (np.log(target[rows]) - np.log(highest[goes_on]))
-        load[rows] *= np.exp(np.clip(step, -1.5, 1.5))
-    result[failed] = np.nan
-    return Found(result, area, failed, pressure)
+    search.result[search.failed] = np.nan
+    return Found(search.result, search.area, search.failed, search.pressure)
+
+
+@dataclass
+class _Search:
+    """How far the search is, gesture by gesture.
+
+    Attributes:
+        wanted: (B, 2), bool: big, dangerous.
+        least: (B,), Pa, lower end of the range of the highest cell's pressure.
+        most: (B,), Pa, its upper end.
+        target: (B,), Pa, the pressure that is sought.
+        load: (B,), N, tried next.
+        pressure: (B, N), Pa, found last.
+        power: (B,), how the load grows with the peak: by the power of 3 under a ball, in proportion under a
+            flat punch.
+        last: (2, B), logarithms of the load tried last and of the peak that it made.
+        result, area, failed: as in :class:`Found`.
+    """
+
+    wanted: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    target: np.ndarray
+    load: np.ndarray
+    pressure: torch.Tensor
+    power: np.ndarray
+    last: np.ndarray
+    result: np.ndarray
+    area: np.ndarray
+    failed: np.ndarray
+
+    @classmethod
+    def of(cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, ground: Ground) -> "_Search":
+        """Begin at the drawn peaks (B,), Pa, within their ranges; the rest is as :func:`seek` has it."""
+        settings, cell = ground.settings, ground.shapes.body.cell
+        ends = np.where(wanted[:, 1:], settings.dangerous_peak, settings.safe_peak)
+        least, most = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
+        target = np.clip(peak, least, most)
+        share = torch.from_numpy(target / begin.amax(1).double().numpy()).to(begin)
+        pressure = begin * share[:, None]
+        load = pressure.sum(1).double().numpy() * (cell[0] * cell[1])
+        count = len(peak)
+        power, last = np.full(count, 1.5), np.full((2, count), np.nan)
+        result = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
+        return cls(wanted, least, most, target, load, pressure, power, last, *result)
+
+    def judge(self, rows: np.ndarray, highest: np.ndarray, wrong: np.ndarray, lost: np.ndarray) -> np.ndarray:
+        """Note which searches have ended, and where a met target with wrong classes moves.
+
+        Args:
+            rows: (b,), the gestures that were tried.
+            highest: (b,), Pa, their highest cell.
+            wrong: (b, 2), bool, which of their classes are wrong.
+            lost: (b,), bool, whose equilibrium was not found.
+
+        Returns:
+            (b,), bool, which of them go on.
+        """
+        target, least, most = self.target[rows], self.least[rows], self.most[rows]
+        up, down = ((wrong & side).any(1) for side in (self.wanted[rows], ~self.wanted[rows]))
+        met = np.abs(np.log(highest / target)) < np.log(_NEAR)
+        done = met & ~up & ~down
+        self.result[rows[done]] = self.load[rows[done]]
+        # Nothing is left to try: both ways at once, or already at the end.
+        over = met & ((up & down) | (up & (target >= most)) | (down & (target <= least)))
+        self.area[rows[over]] = wrong[over, 0]
+        self.failed[rows[lost]] = True
+        for side, end in ((met & up, most), (met & down, least)):
+            self.target[rows[side]] = _halfway(self.target[rows[side]], end[side])
+        return ~done & ~over & ~lost
+
+    def move(self, rows: np.ndarray, goes_on: np.ndarray, highest: np.ndarray) -> np.ndarray:
+        """Set the next load of the searches that go on, (b,), and return their rows."""
+        tried = np.log(self.load[rows]), np.log(highest)
+        self.power[rows] = _power(self.power[rows], *tried, self.last[:, rows])
+        self.last[:, rows] = tried
+        rows, highest = rows[goes_on], highest[goes_on]
+        step = self.power[rows] * (np.log(self.target[rows]) - np.log(highest))
+        self.load[rows] *= np.exp(np.clip(step, -1.5, 1.5))
+        return rows
 
 
 def _classes(pressure: torch.Tensor, ground: Ground) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.setting import ROWS, machine, seconds, versions
@@ -23,8 +24,7 @@ def main() -> None:
     parser.add_argument("--rows", nargs="*", choices=ROWS, default=ROWS)
     arguments = parser.parse_args()
 
-    from benchmarks import mechanics, training
-    from benchmarks.generation import GESTURES
+    from benchmarks import training
     from benchmarks.wire import decode_core_share
 
     from skin.results.table import write
@@ -42,16 +42,7 @@ def main() -> None:
     say("operator")
     figures["operator"] = {name: _own("building", name, str(repeats)) for name in SIMULATORS}
     say("peers of the finite-element skins: about two minutes")
-    pynite = mechanics.pynite_seconds_per_frame(repeats)
-    if pynite is None:
-        say("PyNite is not installed: the ratio to it is left out")
-    for name in SIMULATORS[1:]:
-        own = figures["generation"][name]
-        frames = round(GESTURES * own["frames_per_second"] / own["gestures_per_second"])
-        direct = mechanics.direct_seconds_per_frame(name, frames, repeats)
-        if pynite is not None:
-            own["ratio_to_pynite"] = pynite * own["frames_per_second"]
-        own["ratio_to_direct_solve"] = direct * own["frames_per_second"]
+    _compare(figures["generation"], repeats, say)
     say("start")
     command = [sys.executable, str(HERE / "train.py"), "--help"]
     help_seconds = seconds(lambda: subprocess.run(command, capture_output=True, check=True), repeats)
@@ -63,6 +54,23 @@ def main() -> None:
     text = json.dumps(figures, indent=2)
     write(text + "\n", ROOT / "results" / "bench.json")
     print(text)
+
+
+def _compare(generation: dict[str, dict[str, float]], repeats: int, say: Callable[[str], None]) -> None:
+    """Add to each finite-element skin how many times faster it is than its peers, per frame."""
+    from benchmarks import mechanics
+    from benchmarks.generation import GESTURES
+
+    pynite = mechanics.pynite_seconds_per_frame(repeats)
+    if pynite is None:
+        say("PyNite is not installed: the ratio to it is left out")
+    for name in SIMULATORS[1:]:
+        own = generation[name]
+        frames = round(GESTURES * own["frames_per_second"] / own["gestures_per_second"])
+        direct = mechanics.direct_seconds_per_frame(name, frames, repeats)
+        if pynite is not None:
+            own["ratio_to_pynite"] = pynite * own["frames_per_second"]
+        own["ratio_to_direct_solve"] = direct * own["frames_per_second"]
 
 
 def _own(module: str, *arguments: str) -> dict[str, float]:

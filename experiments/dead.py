@@ -8,20 +8,22 @@ python experiments/train.py -m experiment=temporal_graph row=dead representation
 from pathlib import Path
 
 from skin.config import ROOT, DictConfig, command, plain
+from skin.results.asked import DeadSettings
 
 
 @command("dead")
 def main(config: DictConfig) -> None:
     """Try finished runs on devices with dead sensors; print and write dead.md and dead.csv."""
+    settings = DeadSettings(**plain(config)["dead"])
+
     from rich.console import Console
     from rich.progress import track
 
     from skin.console import quiet
-    from skin.results.dead import Settings, newest, publish, try_run
+    from skin.results.dead import newest, publish, try_run
     from skin.tracking import Store
 
     quiet()
-    settings = Settings(**plain(config)["dead"])
     store = Store.open(config.tracking)
     found = newest(store, config, plain(config)["rows"])
     runs = [(line, run) for line, seeds in found.items() for run in seeds.values()]

@@ -7,16 +7,18 @@ with it. Overrides of the training follow: trainer.max_epochs=30 direction.rows=
 from pathlib import Path
 
 from skin.config import ROOT, DictConfig, command, overrides, plain
+from skin.results.asked import DirectionSettings
 
 
 @command("direction")
 def main(config: DictConfig) -> None:
     """Train what is missing, compare, print and write direction.md and direction.csv."""
+    settings = DirectionSettings(**plain(config)["direction"])
+
     from skin.console import quiet
-    from skin.results.direction import Settings, comparison, publish, train_lines
+    from skin.results.direction import comparison, publish, train_lines
 
     quiet()
-    settings = Settings(**plain(config)["direction"])
     lines = train_lines(overrides(), settings)
     publish(Path(config.out).expanduser() if config.out else ROOT / "results", comparison(lines))
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skin.config import ROOT, DictConfig, command, overrides, plain
+from skin.embedding.asked import Probing
 from skin.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,16 +24,17 @@ usually is, they are all equal.
 @command("embeddings")
 def main(config: DictConfig) -> None:
     """Probe every embedding; write embeddings.md and figure 5 to a folder, and print the table."""
+    settings, learner = Probing(**plain(config)["embeddings"]), None
+
     from rich.console import Console
     from rich.progress import track
 
     from skin.build import build_device
-    from skin.embedding.probe import Settings, probe
+    from skin.embedding.probe import probe
     from skin.results.figures import save
     from skin.results.space import lines, spaces, statements
     from skin.results.table import markdown, write
 
-    settings, learner = Settings(**plain(config)["embeddings"]), None
     folder = Path(config.out).expanduser() if config.out else ROOT / "results"
     if config.run is not None:
         config, learner = _encoder(config)

@@ -7,6 +7,7 @@ highest reading. Writes margins_<row>.md, .csv and .png into out=, and an MLflow
 from pathlib import Path
 
 from skin.config import ROOT, DictConfig, command, overrides
+from skin.errors import InputError
 
 _OWN = ("gestures", "out", "run")
 
@@ -14,6 +15,9 @@ _OWN = ("gestures", "out", "run")
 @command("margins")
 def main(config: DictConfig) -> None:
     """Bring a finished run back, sort its verdicts, print a line, write its files and log them."""
+    if config.gestures < 1:
+        raise InputError(f"margins need touches, got gestures={config.gestures}: as in gestures=20000")
+
     from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
     from skin.evaluation.margins import margins

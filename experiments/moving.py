@@ -13,23 +13,25 @@ from omegaconf import DictConfig, OmegaConf
 
 from skin.config import ROOT, command, plain
 from skin.errors import InputError
+from skin.results.asked import MovingSettings
 
 if TYPE_CHECKING:
-    from skin.results.moving_runs import Settings, Trial
+    from skin.results.moving_runs import Trial
 
 
 @command("moving")
 def main(config: DictConfig) -> None:
     """Measure motion, try finished runs, train if asked to; print and write moving.md and moving.csv."""
+    settings = MovingSettings(**plain(config)["moving"])
+
     from skin.build import build_device
     from skin.console import quiet
     from skin.device.simulated import Simulated
     from skin.results.moving import change
-    from skin.results.moving_runs import Settings, train_lines
+    from skin.results.moving_runs import train_lines
     from skin.results.moving_table import comparison, publish
 
     quiet()
-    settings = Settings(**plain(config)["moving"])
     device = build_device(_free(config))
     if not isinstance(device, Simulated):
         raise InputError("how sensors move is known in simulation only: leave out device=")
@@ -51,7 +53,7 @@ def _free(config: DictConfig) -> DictConfig:
     return free
 
 
-def _tried(config: DictConfig, settings: "Settings") -> Iterator["Trial"]:
+def _tried(config: DictConfig, settings: MovingSettings) -> Iterator["Trial"]:
     """Yield finished runs on misplaced sensors and on skins whose modulus varies."""
     from rich.console import Console
     from rich.progress import track

@@ -1,8 +1,7 @@
 """What embeddings tell of touches: what an SVM reads in them, and on what they spend their variance."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from sklearn.model_selection import GridSearchCV
@@ -12,6 +11,7 @@ from sklearn.svm import SVC
 
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
+from skin.embedding.asked import Probing
 from skin.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
@@ -22,7 +22,6 @@ from skin.representation.graph import adjacency, neighbours
 __all__ = [
     "FRAME",
     "Found",
-    "Settings",
     "Space",
     "accuracy",
     "explained",
@@ -30,46 +29,12 @@ __all__ = [
     "strongest",
 ]
 
-ATTRIBUTES = ("degree", "reading")
 FRAME = "readings, one frame"
 
 # No training draws from these, and no layout of data/layouts is among the scattered ones.
 _FIRST_SEED, _FIRST_LAYOUT = 1_000_000, 101
 _COSTS = (0.1, 1, 10, 100)
 _FOLDS = 3
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is probed; ``conf/embeddings.yaml`` holds the same defaults.
-
-    Raises:
-        InputError: a name that is not known, or a number too small to be of use.
-    """
-
-    attributes: Sequence[str] = ATTRIBUTES
-    train: int = 800
-    test: int = 400
-    seeds: Sequence[int] = (0, 1, 2)
-    layouts: int = 3
-    levels: int = 8
-    depth: int = 2
-    width: int = 128
-    epochs: int = 50
-    graph: Mapping[str, Any] = field(default_factory=lambda: {"edges": "knn", "count": 6, "weight": "exp"})
-
-    def __post_init__(self) -> None:
-        if not self.attributes or set(self.attributes) - set(ATTRIBUTES):
-            raise InputError(
-                f"nodes are labelled by degree or reading, got {list(self.attributes)}: "
-                "set embeddings.attributes=[degree,reading]"
-            )
-        least = {"train": 20, "test": 10, "layouts": 1, "levels": 2, "depth": 0, "width": 2, "epochs": 1}
-        for name, number in least.items():
-            if getattr(self, name) < number:
-                raise InputError(f"embeddings.{name} must be at least {number}, got {getattr(self, name)}")
-        if not self.seeds:
-            raise InputError("embeddings.seeds is empty: give some, as in embeddings.seeds=[0,1,2]")
 
 
 class Space(NamedTuple):
@@ -113,7 +78,7 @@ class Found(NamedTuple):
     space: Space
 
 
-def probe(device: AbstractDevice, settings: Settings, learner: Network | None) -> Iterator[Found]:
+def probe(device: AbstractDevice, settings: Probing, learner: Network | None) -> Iterator[Found]:
     """Yield what every input tells, seed by seed: graph embeddings, a trained encoder's, plain readings.
 
     A simulated device draws new touches for every seed, of which no training has any; of another device the
@@ -157,7 +122,7 @@ def explained(vectors: np.ndarray, classes: np.ndarray) -> float:
 
 
 def _graph_vectors(
-    sets: Sequence[Touches], attribute: str, settings: Settings, seed: int
+    sets: Sequence[Touches], attribute: str, settings: Probing, seed: int
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield each graph embedding (B, E) of the strongest frames of touches, one layout per set.
 
@@ -185,7 +150,7 @@ def _graph_vectors(
 
 
 def _inputs(
-    sets: Sequence[Touches], settings: Settings, seed: int, learner: Network | None
+    sets: Sequence[Touches], settings: Probing, seed: int, learner: Network | None
 ) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
     for attribute in settings.attributes:
         for name, vectors in _graph_vectors(sets, attribute, settings, seed):
@@ -218,7 +183,7 @@ def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[s
     return Found(attribute, name, seed, right, shares, space)
 
 
-def _touches(device: AbstractDevice, settings: Settings, seed: int) -> list[Touches]:
+def _touches(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
     """Return the touches of one layout, those to train the SVM on first."""
     count = settings.train + settings.test
     if isinstance(device, Simulated):
@@ -227,7 +192,7 @@ def _touches(device: AbstractDevice, settings: Settings, seed: int) -> list[Touc
     return [device.touches("train")[: settings.train], device.touches("test")[: settings.test]]
 
 
-def _layouts(device: AbstractDevice, settings: Settings, seed: int) -> list[Touches]:
+def _layouts(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
     """Return as many other touches on each of some scattered layouts; none where that cannot be."""
     if not isinstance(device, Simulated) or settings.layouts < 2:
         return []

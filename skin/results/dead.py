@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
@@ -17,12 +17,13 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.metrics import metrics
 from skin.reload import changed, configuration, restore
+from skin.results.asked import DeadSettings
 from skin.results.moving_runs import Trial
 from skin.results.moving_table import comparison
 from skin.results.table import markdown, write
 from skin.tracking import Store
 
-__all__ = ["Settings", "newest", "publish", "try_run"]
+__all__ = ["newest", "publish", "try_run"]
 
 # The default device (0) is not among them.
 _FIRST = 1
@@ -34,26 +35,6 @@ Difference: from the row's first line, mean and standard error over the same see
 beyond two standard errors over three seeds or more. A dead sensor reads 0 N; a mask tells the network so,
 which helps only if it saw dead ones in training.
 """
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is tried; ``conf/dead.yaml`` explains the fields.
-
-    Raises:
-        InputError: a setting that cannot be used.
-    """
-
-    counts: Sequence[int]
-    gestures: int
-    devices: int
-
-    def __post_init__(self) -> None:
-        if not self.counts or min(self.counts) < 0:
-            raise InputError(f"dead.counts must list numbers from 0 up, got {self.counts}: as in [0,1,3,5]")
-        for name in ("gestures", "devices"):
-            if getattr(self, name) < 1:
-                raise InputError(f"dead.{name} must be at least 1, got {getattr(self, name)}")
 
 
 def newest(store: Store, config: DictConfig, rows: str | Sequence[str]) -> dict[str, dict[str, Run]]:
@@ -86,7 +67,7 @@ def _line(row: str, own: DictConfig) -> str:
     return f"{row}{_MASK if own.representation.get('mask') else ''}{trained}"
 
 
-def try_run(store: Store, line: str, run: Run, config: DictConfig, settings: Settings) -> list[Trial]:
+def try_run(store: Store, line: str, run: Run, config: DictConfig, settings: DeadSettings) -> list[Trial]:
     """Return the accuracy of a run on devices with ever more dead sensors, by ``seed.device``.
 
     The training's own number of dead sensors, or a device per gesture, does not count.

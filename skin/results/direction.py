@@ -14,14 +14,14 @@ from rich.progress import track
 from rich.table import Table
 
 from skin.config import checked, fingerprint
-from skin.errors import InputError
+from skin.results.asked import DirectionSettings
 from skin.results.moving_runs import children_of
 from skin.results.study import paired, verdict
 from skin.results.table import markdown, write
 from skin.run import train
 from skin.tracking import Store
 
-__all__ = ["Line", "Settings", "comparison", "publish", "train_lines"]
+__all__ = ["Line", "comparison", "publish", "train_lines"]
 
 _HEAD = ("row", "skin", "degrees", "within 45", "labels", "difference", "seeds", "verdict")
 _OWN = ("direction.", "out=", "simulator=")
@@ -32,42 +32,6 @@ touch to its last, over the 4000 test gestures' touches that slide and do not go
 four, per cent. Mean and deviation over seeds. Difference in degrees from the row's first skin, mean and
 standard error over the same seeds; "better" or "worse" only beyond two standard errors over three or more.
 """
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is compared; ``conf/direction.yaml`` explains the fields and holds their values.
-
-    Raises:
-        InputError: no row, no seed, or no friction.
-    """
-
-    rows: Sequence[str]
-    seeds: Sequence[int]
-    shear: float
-    tilted: str
-
-    def __post_init__(self) -> None:
-        for name in ("rows", "seeds"):
-            if not isinstance(getattr(self, name), list) or not getattr(self, name):
-                raise InputError(
-                    f"direction.{name} must list some, as in direction.{name}=[{_EXAMPLE[name]}]"
-                )
-        if not self.shear > 0:
-            raise InputError(f"direction.shear must be above 0, got {self.shear}: as in direction.shear=0.5")
-
-    @property
-    def skins(self) -> dict[str, list[str]]:
-        """Name -> overrides of each skin, the plain one first."""
-        friction = [f"touch.shear={self.shear}"]
-        return {
-            "upright": [],
-            "upright_shear": friction,
-            "tilted_shear": [*friction, "layout=file", f"layout.path={self.tilted}"],
-        }
-
-
-_EXAMPLE = {"rows": "features", "seeds": "0,1,2"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +48,7 @@ class Line:
         return f"{fmean(values):.1f}" + (f" ± {stdev(values):.1f}" if len(values) > 1 else "")
 
 
-def train_lines(overrides: Sequence[str], settings: Settings) -> list[Line]:
+def train_lines(overrides: Sequence[str], settings: DirectionSettings) -> list[Line]:
     """Train every row on every skin; what a finished run did before is not repeated.
 
     Args:

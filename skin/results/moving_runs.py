@@ -22,10 +22,11 @@ from skin.errors import InputError
 from skin.evaluation.metrics import metrics
 from skin.learner.base import AbstractLearner
 from skin.reload import changed, configuration, restore
+from skin.results.asked import MovingSettings
 from skin.run import PARENT, train
 from skin.tracking import Store
 
-__all__ = ["LINES", "Settings", "Trial", "children_of", "conditions", "latest", "train_lines", "try_run"]
+__all__ = ["LINES", "Trial", "children_of", "conditions", "latest", "train_lines", "try_run"]
 
 LINES = {
     "layout": [],
@@ -35,32 +36,6 @@ LINES = {
 """Overrides of the trainings that are compared."""
 # Neither the default device (0) nor the default skin's moduli (0) is among them.
 _FIRST = 1
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is tried; ``conf/moving.yaml`` explains the fields and holds their values.
-
-    Raises:
-        InputError: a setting that cannot be used.
-    """
-
-    rows: str | Sequence[str]
-    errors: Sequence[float]
-    variation: float
-    gestures: int
-    devices: int
-    train: bool
-    seeds: Sequence[int]
-
-    def __post_init__(self) -> None:
-        for name in ("errors", "seeds"):
-            given = getattr(self, name)
-            if not isinstance(given, list) or not given or not all(number >= 0 for number in given):
-                raise InputError(f"moving.{name} must list numbers from 0 up, got {given}: as in [0]")
-        for name in ("gestures", "devices"):
-            if getattr(self, name) < 1:
-                raise InputError(f"moving.{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -134,7 +109,7 @@ def conditions(
     ]
 
 
-def try_run(store: Store, run: Run, config: DictConfig, settings: Settings) -> list[Trial]:
+def try_run(store: Store, run: Run, config: DictConfig, settings: MovingSettings) -> list[Trial]:
     """Return what a finished run makes of misplaced sensors and of moduli that vary.
 
     Its figures are logged beside it, and taken from there when the same is asked again.
@@ -162,7 +137,7 @@ def try_run(store: Store, run: Run, config: DictConfig, settings: Settings) -> l
     ]
 
 
-def _try(store: Store, run: Run, config: DictConfig, settings: Settings) -> dict[str, float]:
+def _try(store: Store, run: Run, config: DictConfig, settings: MovingSettings) -> dict[str, float]:
     own = changed(configuration(store, run), config, [])
     device, learner = build_device(own), build_learner(own)
     if not isinstance(device, Simulated):

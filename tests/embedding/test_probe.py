@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from skin.build import build_device
-from skin.embedding.probe import FRAME, Settings, accuracy, explained, probe, strongest
+from skin.embedding.asked import Probing
+from skin.embedding.probe import FRAME, accuracy, explained, probe, strongest
 from skin.errors import InputError
 from skin.recording import Touches
 
@@ -16,7 +17,7 @@ SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "lay
 def found(configured):
     """Everything that a small probe of the naive skin finds."""
     device = build_device(configured("simulator=naive"))
-    return {(one.attribute, one.name): one for one in probe(device, Settings(**SMALL), None)}
+    return {(one.attribute, one.name): one for one in probe(device, Probing(**SMALL), None)}
 
 
 def test_an_svm_reads_what_is_there_and_no_more():
@@ -66,7 +67,7 @@ def test_readings_tell_what_presses_but_one_frame_no_duration(found):
 
 def test_touches_of_another_seed_are_others(configured, found):
     device = build_device(configured("simulator=naive"))
-    other = next(probe(device, Settings(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
+    other = next(probe(device, Probing(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
     assert other.space.labels.shape == (240, 4)
     assert (other.space.labels != found["degree", "Graph2Vec"].space.labels).any()
 
@@ -81,4 +82,4 @@ def test_touches_of_another_seed_are_others(configured, found):
 )
 def test_settings_of_no_use_are_refused(given, words):
     with pytest.raises(InputError, match=words.replace("[", r"\[")):
-        Settings(**given)
+        Probing(**given)

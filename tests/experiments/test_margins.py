@@ -31,4 +31,4 @@ def test_a_finished_run_is_sorted_by_margins(run, tmp_path):
         assert picture.size[0] > 800
     done = run(tmp_path, "margins.py", "run=latest", "gestures=0")
     assert done.returncode == 2
-    assert "test_gestures must be at least 1, got 0" in done.stderr
+    assert "margins need touches, got gestures=0" in done.stderr

@@ -3,7 +3,8 @@
 import pytest
 
 from skin.errors import InputError
-from skin.results.direction import Line, Settings, comparison, publish
+from skin.results.asked import DirectionSettings
+from skin.results.direction import Line, comparison, publish
 
 GIVEN = {"rows": ["gru"], "seeds": [0, 1, 2], "shear": 0.5, "tilted": "x.csv"}
 
@@ -40,11 +41,11 @@ def test_it_is_written_whole(tmp_path, capsys):
 @pytest.mark.parametrize(("name", "wrong"), [("rows", []), ("seeds", 3), ("shear", 0.0)])
 def test_what_compares_nothing_is_refused(name, wrong):
     with pytest.raises(InputError, match=rf"direction.{name} must"):
-        Settings(**GIVEN | {name: wrong})
+        DirectionSettings(**GIVEN | {name: wrong})
 
 
 def test_skins_differ_by_friction_and_then_by_layout():
-    skins = Settings(**GIVEN).skins
+    skins = DirectionSettings(**GIVEN).skins
     assert skins["upright"] == []
     assert skins["upright_shear"] == ["touch.shear=0.5"]
     assert skins["tilted_shear"] == ["touch.shear=0.5", "layout=file", "layout.path=x.csv"]

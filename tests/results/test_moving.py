@@ -11,8 +11,9 @@ from skin.device._truth import true_sensors
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.layout.grid import Grid
+from skin.results.asked import MovingSettings
 from skin.results.moving import Change, _changes, change
-from skin.results.moving_runs import Settings, Trial, conditions
+from skin.results.moving_runs import Trial, conditions
 from skin.results.moving_table import comparison, publish
 from skin.simulator.fem import PlatesAndBeams
 
@@ -116,4 +117,4 @@ def test_files_are_written_whole(tmp_path, capsys):
 @pytest.mark.parametrize(("name", "value"), [("seeds", 2), ("errors", [-1]), ("devices", 0), ("gestures", 0)])
 def test_settings_that_mean_nothing_are_refused_by_name(name, value):
     with pytest.raises(InputError, match=rf"moving\.{name}"):
-        Settings(**(GIVEN | {"seeds": [0]} | {name: value}))
+        MovingSettings(**(GIVEN | {"seeds": [0]} | {name: value}))

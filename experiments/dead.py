@@ -1,8 +1,9 @@
 """What dead sensors cost finished runs: python experiments/dead.py rows=all
 
-Each run keeps the mask it was trained with. To compare masks, train pairs on devices that have dead sensors:
+Each run keeps the mask it was trained with. To compare masks, train pairs on devices that have dead sensors,
+more and fewer of them, or a mask that never varies is learnt as if it were always so:
 python experiments/train.py -m experiment=temporal_graph row=dead representation.mask=true,false
-    device.dead=3 device.randomise=true seed=0,1,2
+    device.dead=[0,5] device.randomise=true seed=0,1,2
 """
 
 from pathlib import Path

@@ -82,7 +82,7 @@ class Simulated(AbstractDevice):
     offset: float = 0.1
     noise: float = 0.05
     clip: float = 10.0
-    dead: int = 0
+    dead: int | Sequence[int] = 0
     position_error: float = 0.0
     tare: bool = False
     stuck: int = 0

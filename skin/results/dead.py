@@ -63,7 +63,8 @@ def newest(store: Store, config: DictConfig, rows: str | Sequence[str]) -> dict[
 
 
 def _line(row: str, own: DictConfig) -> str:
-    trained = f", trained with {own.device.dead} dead" if own.device.dead else ""
+    dead = own.device.dead if isinstance(own.device.dead, int) else " to ".join(map(str, own.device.dead))
+    trained = f", trained with {dead} dead" if dead else ""
     return f"{row}{_MASK if own.representation.get('mask') else ''}{trained}"
 
 

@@ -1,5 +1,6 @@
 """What a real device does to true readings: lag, gain, clip, noise, offset, rounding, dead sensors, tare."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -64,7 +65,8 @@ class Imperfection:
         offset: standard deviation of each sensor's offset, N, constant in a device.
         noise: standard deviation of the noise in every frame, N.
         clip: largest force that a sensor tells, N.
-        dead: how many sensors are dead: they read 0 and are marked invalid.
+        dead: how many sensors are dead, or [least, most], of which each device draws its number: they read 0
+            and are marked invalid.
         tare: subtract the idle baseline, the mean of 30 idle frames with their noise.
         stuck: how many more say one force all the time, between 0 and ``clip``; they are invalid too.
         saturated: how many more say ``clip`` all the time; they are invalid too.
@@ -85,7 +87,7 @@ class Imperfection:
     offset: float = 0.1
     noise: float = 0.05
     clip: float = 10.0
-    dead: int = 0
+    dead: int | Sequence[int] = 0
     tare: bool = False
     stuck: int = 0
     saturated: int = 0
@@ -99,11 +101,24 @@ class Imperfection:
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if entry.name != "calibration" and not value >= 0:
+            if entry.name not in ("calibration", "dead") and not value >= 0:
                 raise InputError(f"device.{entry.name} must be at least 0, got {value}")
+        least, most = self.dead_range
+        if not 0 <= least <= most:
+            raise InputError(
+                f"device.dead must be a number from 0 up or a range [least, most], got {self.dead}: as in "
+                "device.dead=3 or device.dead=[0,5]"
+            )
         for name, unit in (("clip", "N"), ("rate", "Hz")):
             if getattr(self, name) == 0:
                 raise InputError(f"device.{name} must be above 0 {unit}, got 0: as in device.{name}=10")
+
+    @property
+    def dead_range(self) -> tuple[int, int]:
+        """Least and most sensors that are dead in a device; (0, -1) where that is no range."""
+        ends = self.dead if isinstance(self.dead, (list, tuple)) else (self.dead, self.dead)
+        whole = len(ends) == 2 and all(isinstance(number, int) for number in ends)
+        return (ends[0], ends[1]) if whole else (0, -1)
 
     @classmethod
     def of(cls, settings: Any) -> "Imperfection":
@@ -144,16 +159,24 @@ class Imperfection:
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
         idle = generator.standard_normal(shape)
         drift = self.drift * generator.standard_normal(shape) if self.drift else np.zeros(shape)
-        level = np.where(rank < self.dead, 0.0, self.clip)
+        count = self._count(shape, generator)
+        level = np.where(rank < count, 0.0, self.clip)
         if self.stuck:
-            stuck = (rank >= self.dead) & (rank < self.dead + self.stuck)
+            stuck = (rank >= count) & (rank < count + self.stuck)
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
         same = ("noise", "clip", "hysteresis", "time_constant", "quantum")
         values = {name: np.asarray(float(getattr(self, name))) for name in same}
-        dead = rank < self.dead + self.stuck + self.saturated
+        dead = rank < count + self.stuck + self.saturated
         return values | {
             "gain": gain, "offset": offset, "dead": dead, "level": level, "drift": drift, "idle": idle
         }  # fmt: skip
+
+    def _count(self, shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
+        """Return how many sensors of each device are dead, (1,) or (B, 1, 1); a fixed number draws nothing."""
+        least, most = self.dead_range
+        if least == most:
+            return np.full((*shape[:-1], 1), least)
+        return generator.integers(least, most, (*shape[:-1], 1), endpoint=True)
 
     def _calibrated(
         self, calibration: Calibration, shape: tuple[int, ...], generator: np.random.Generator
@@ -162,7 +185,7 @@ class Imperfection:
         calibration.fits(shape[-1])
         values = calibration.values() if len(shape) == 1 else calibration.draw(shape, generator)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
-        more = rank < self.dead
+        more = rank < self._count(shape, generator)
         values["level"] = np.where(more, 0.0, values["level"])
         values["dead"] = values["dead"] | more
         return values | {"idle": generator.standard_normal(shape)}

@@ -78,6 +78,18 @@ def test_a_device_per_gesture():
     assert (~valid).sum(-1).eq(2).all()
 
 
+def test_every_device_draws_its_own_number_of_dead_sensors():
+    """1 to 4 of 25, equally often: 3000 draws leave a share of a quarter within 0.03 (4 standard errors)."""
+    constants = Imperfection(dead=[1, 4]).constants(25, generator(), gestures=3000)
+    counts = constants.dead.sum(-1).flatten()
+    assert counts.unique().tolist() == [1, 2, 3, 4]
+    assert ((counts.bincount()[1:] / 3000 - 0.25).abs() < 0.032).all()
+    one = Imperfection(dead=[3, 3]).constants(25, generator())
+    assert all(
+        torch.equal(*both) for both in zip(one, Imperfection(dead=3).constants(25, generator()), strict=True)
+    )
+
+
 def test_clipped_looks_at_living_sensors():
     imperfection = Imperfection(gain_spread=0, dead=1)
     constants = imperfection.constants(2, generator())
@@ -94,6 +106,9 @@ def test_bad_settings_are_refused():
         Imperfection(clip=0)
     with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
         Imperfection(dead=25).constants(25, generator())
+    for dead in (-1, 2.5, [3], [4, 2], [0, 1.5], "two"):
+        with pytest.raises(InputError, match=r"device.dead must be a number from 0 up or a range"):
+            Imperfection(dead=dead)
 
 
 def test_the_default_device_is_what_it_was():

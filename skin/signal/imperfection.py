@@ -172,7 +172,7 @@ class Imperfection:
         }  # fmt: skip
 
     def _count(self, shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
-        """Return how many sensors of each device are dead, (1,) or (B, 1, 1); a fixed number draws nothing."""
+        """Return how many sensors of each device are dead, (1,) or (B, 1, 1); a number draws nothing."""
         least, most = self.dead_range
         if least == most:
             return np.full((*shape[:-1], 1), least)

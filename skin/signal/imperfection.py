@@ -159,7 +159,7 @@ class Imperfection:
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
         idle = generator.standard_normal(shape)
         drift = self.drift * generator.standard_normal(shape) if self.drift else np.zeros(shape)
-        count = self._count(shape, generator)
+        count = generator.integers(*self.dead_range, (*shape[:-1], 1), endpoint=True)
         level = np.where(rank < count, 0.0, self.clip)
         if self.stuck:
             stuck = (rank >= count) & (rank < count + self.stuck)
@@ -171,13 +171,6 @@ class Imperfection:
             "gain": gain, "offset": offset, "dead": dead, "level": level, "drift": drift, "idle": idle
         }  # fmt: skip
 
-    def _count(self, shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
-        """Return how many sensors of each device are dead, (1,) or (B, 1, 1); a number draws nothing."""
-        least, most = self.dead_range
-        if least == most:
-            return np.full((*shape[:-1], 1), least)
-        return generator.integers(least, most, (*shape[:-1], 1), endpoint=True)
-
     def _calibrated(
         self, calibration: Calibration, shape: tuple[int, ...], generator: np.random.Generator
     ) -> dict[str, np.ndarray]:
@@ -185,7 +178,7 @@ class Imperfection:
         calibration.fits(shape[-1])
         values = calibration.values() if len(shape) == 1 else calibration.draw(shape, generator)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
-        more = rank < self._count(shape, generator)
+        more = rank < generator.integers(*self.dead_range, (*shape[:-1], 1), endpoint=True)
         values["level"] = np.where(more, 0.0, values["level"])
         values["dead"] = values["dead"] | more
         return values | {"idle": generator.standard_normal(shape)}

@@ -49,7 +49,7 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
     learnt = changed(stored, config, [one for one in given if not one.startswith(("device=", "device."))])
     said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
     of = start.trained(store, run, learnt)
-    engine = start.engine(of, patience, live["touch"])
+    engine = start.engine(of, patience, live["touch"], live["drift"])
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         # As late as this, because from now on frames come.
@@ -59,7 +59,7 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
         board = Board(Facts(run.info.run_name, source.name, places, of.device.size, live["top"], span))
         if config.web:
             said.print(f"page: {open_.enter_context(web.served(board, live['web_port']))}", highlight=False)
-        session = Session(skin, source.newtons, engine, board)
+        session = Session(skin, source.tare, engine, board)
         open_.callback(lambda: said.print(f"{session.verdicts} verdicts, {session.line}", highlight=False))
         open_.enter_context(terminal.shown(board, Console()))
         session.run(config.seconds)

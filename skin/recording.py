@@ -24,6 +24,8 @@ class Touches:
         rate: frames per second, Hz.
         motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
             None where nobody knows.
+        saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
+            where nobody knows.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -35,6 +37,7 @@ class Touches:
     labels: Tensor | None
     rate: float
     motion: Tensor | None = None
+    saturated: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.readings.ndim != 3 or self.valid.shape != self.readings.shape:
@@ -51,6 +54,8 @@ class Touches:
             )
         if self.motion is not None and tuple(self.motion.shape) != (batch, time, sensors, 3):
             raise ValueError(f"motion must be (B, T, S, 3), S = {sensors}, got {tuple(self.motion.shape)}")
+        if self.saturated is not None and self.saturated.shape != self.readings.shape:
+            raise ValueError(f"saturated must be (B, T, S), got {tuple(self.saturated.shape)}")
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
             raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
@@ -66,6 +71,7 @@ class Touches:
             None if self.labels is None else self.labels[index],
             self.rate,
             None if self.motion is None else self.motion[index],
+            None if self.saturated is None else self.saturated[index],
         )
 
     def to(self, device: torch.device | str) -> "Touches":
@@ -146,6 +152,7 @@ def join(parts: Sequence[Recording]) -> Recording:
         valid=torch.cat([part.touches.valid for part in parts]),
         labels=together(part.touches.labels for part in parts),
         motion=together(part.touches.motion for part in parts),
+        saturated=together(part.touches.saturated for part in parts),
     )
     return replace(
         first,

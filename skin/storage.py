@@ -2,9 +2,10 @@
 
 Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
 (N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
-rows. What is unknown has no column; a reading that means nothing (a dead sensor) is empty and is read back as
-0 and invalid. Everything else (units, layout, rate, seeds, versions) is JSON: in the Parquet file's schema
-under ``skin``, beside ``x.csv`` in ``x.csv.json``.
+rows, then ``saturated_00`` ...: 1 where a sensor is at its limit. What is unknown has no column; a reading
+that means nothing (a dead sensor) is empty and is read back as 0 and invalid. Everything else (units,
+layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in
+``x.csv.json``.
 """
 
 import json
@@ -116,10 +117,11 @@ def _columns(about: dict[str, Any]) -> dict[str, pa.DataType]:
         kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
         columns |= dict(zip(task["names"], kinds, strict=True))
     names = _numbered("reading", sensors) + ["force"] * about["force"]
+    limits = _numbered("saturated", sensors) if about.get("saturated") else []  # recordings of old do not say
     if about["displacement"]:
         names += _numbered("D_s", sensors) + _numbered("D_t", sensors)
     names += [f"gesture_{name}" for name in about["parameters"]]
-    return columns | dict.fromkeys(names, pa.float32())
+    return columns | dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
 
 
 def _describe(recording: Recording) -> dict[str, Any]:
@@ -137,6 +139,7 @@ def _describe(recording: Recording) -> dict[str, Any]:
         "labelled": touches.labels is not None,
         "force": recording.force is not None,
         "displacement": recording.displacement is not None,
+        "saturated": touches.saturated is not None,
         "parameters": list(recording.parameters),
         "metadata": recording.metadata,
     }
@@ -159,6 +162,8 @@ def _table(recording: Recording) -> pa.Table:
     if recording.displacement is not None:
         arrays += list(recording.displacement.permute(3, 2, 0, 1).reshape(2 * sensors, -1).cpu().numpy())
     arrays += [per_gesture(values) for values in recording.parameters.values()]
+    if touches.saturated is not None:
+        arrays += list(touches.saturated.reshape(-1, sensors).T.cpu().numpy())
     columns = _columns(_describe(recording))
     return pa.table(
         {
@@ -216,6 +221,7 @@ def _recording(table: pa.Table, about: dict[str, Any], path: Path) -> Recording:
         torch.tensor(about["positions"], dtype=torch.float32),
         torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
         about["rate"],
+        saturated=columns("saturated") > 0.5 if about.get("saturated") else None,
     )
     return Recording(
         touches,

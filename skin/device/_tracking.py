@@ -86,7 +86,7 @@ def _estimated(device: "Simulated") -> Tracker:
         motion = _motion(model, movie)
         force = movie.respond(model, displacement=False).readings
     constants = device.imperfection.constants(len(device.sensors), randomness, len(movie))
-    readings, _ = device.imperfection.apply(force, constants, randomness)
+    readings, *_ = device.imperfection.apply(force, constants, randomness)
     ridge = RidgeCV(_PENALTIES, fit_intercept=False, alpha_per_target=True)
     ridge.fit(readings.flatten(0, 1).double().numpy(), motion.flatten(2).flatten(0, 1).double().numpy())
     return Tracker(weights=torch.from_numpy(ridge.coef_.T.copy()).float())

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -25,10 +25,10 @@ from skin.port.text import Header
 from skin.port.wire import open_wire
 from skin.recording import Recording, Touches
 from skin.session.newtons import Newtons, newtons
-from skin.session.reduction import reduced
-from skin.session.settling import settle
 from skin.session.takes import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.session.tap import Tap
+from skin.session.taring import Tare, settle
+from skin.signal.resampling import Resampled, Window
 
 __all__ = ["Serial"]
 
@@ -121,7 +121,11 @@ class Serial(AbstractDevice):
 
     def blank(self) -> AbstractDevice:
         """Return a device of the same shapes whose touches are 0: a run is brought back without a touch."""
-        return Blank(self.task, self.size, self._touches([], count=1))
+        assert self.rate is not None
+        empty = torch.zeros(1, self.window, len(self.sensors))
+        positions = torch.from_numpy(self.sensors.positions).float()
+        touches = Touches(empty, empty == 0, positions, torch.zeros(1, len(self.task)), self.rate)
+        return Blank(self.task, self.size, touches)
 
     def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
         """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
@@ -135,15 +139,22 @@ class Serial(AbstractDevice):
         settings |= {"backoff": self.backoff}
         return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **settings), tap
 
-    def settle(self, skin: Skin) -> tuple[list[Frame], np.ndarray | None, Newtons]:
-        """Read the beginning: is it fast enough, and what does it say untouched?
+    def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
+        """Read the beginning: is the device fast enough, and what does it say untouched?
 
         Returns:
-            its frames, the baseline (S,) in the device's unit, None without tare, and what values mean.
+            all frames that came, and what values mean.
         """
         assert self.rate is not None
-        frames, baseline = settle(skin, self.rate, self.tare, _say)
-        return frames, baseline, self.meaning(baseline, skin.header)
+        tare = self.taring(skin)
+        frames = settle(skin, tare, self.rate, self.tare, _say)
+        assert tare.newtons is not None
+        return frames, tare.newtons
+
+    def taring(self, skin: Skin) -> Tare:
+        """Return what finds out what the values of an open skin mean."""
+        assert self.rate is not None
+        return Tare(self.meaning, self.tare, self.rate, lambda: skin.header)
 
     def meaning(self, baseline: np.ndarray | None, header: Header | None) -> Newtons:
         """Return what values mean, given a baseline (S,) and what the device tells of itself.
@@ -153,54 +164,62 @@ class Serial(AbstractDevice):
         """
         return newtons(len(self.sensors), baseline, self.scale, self._known, header)
 
-    def director(self, tap: Tap, meaning: Newtons, done: Collection[int] = ()) -> AbstractDirector:
-        """Return who says what a gesture is; those with a number in ``done`` are there already."""
+    def director(
+        self, tap: Tap, meaning: Newtons, first: Sequence[Frame], done: Collection[int] = ()
+    ) -> AbstractDirector:
+        """Return what finds the gestures of a stream.
+
+        Args:
+            tap: hears announcements.
+            meaning: of the values.
+            first: frames that came before.
+            done: numbers of gestures that are there already.
+        """
+        assert self.rate is not None
+        window = Window(self.window, self.rate, len(self.sensors))
+        for frame in first:
+            window.add(frame)
         if self.labels == "announced":
-            return Announced(self.length, tap, self.task)
+            return Announced(window, tap, self.task)
         if self.labels == "none":
-            touched = np.ones(len(self.sensors), dtype=bool)
+            known = np.ones(len(self.sensors), dtype=bool)
             return Continuous(
-                self.length,
+                window,
                 max(done, default=-1) + 1,
-                lambda values: bool((meaning(values, touched)[0] > self.trigger).any()),
+                lambda values: bool((meaning(values, known)[0] > self.trigger).any()),
             )
         wanted = enumerate(plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
         return Prompted(
-            self.length, (one for one in wanted if one[0] < self.gestures and one[0] not in done), _say
+            window, (one for one in wanted if one[0] < self.gestures and one[0] not in done), _say
         )
 
     def stored(self, takes: Sequence[Take], meaning: Newtons) -> Recording:
         """Return gestures as a recording."""
-        touches = self._touches([self._shown(take, meaning) for take in takes])
+        touches = self._touches([take.seen for take in takes if take.seen is not None], meaning)
         if takes and takes[0].labels is not None:
             rows = [[float(value) for value in take.labels.values()] for take in takes if take.labels]
-            touches = Touches(
-                touches.readings, touches.valid, touches.positions, torch.tensor(rows), touches.rate
-            )
+            touches = replace(touches, labels=torch.tensor(rows))
         about = {"source": "serial", "lost": [take.lost for take in takes]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
 
-    def _shown(self, take: Take, meaning: Newtons) -> tuple[np.ndarray, np.ndarray]:
+    def _touches(self, windows: Sequence[Resampled], meaning: Newtons) -> Touches:
+        """Return windows in the device's unit as touches."""
         assert self.rate is not None
-        return meaning(*reduced(take.frames, take.begin, self.rate, self.window))
-
-    def _touches(self, windows: Sequence[tuple[np.ndarray, np.ndarray]], count: int = 0) -> Touches:
-        """Return windows (readings, valid) as touches, or ``count`` of zeros where there are none."""
-        assert self.rate is not None
-        shape, positions = (count, self.window, len(self.sensors)), torch.from_numpy(self.sensors.positions)
-        readings = torch.zeros(shape) if not windows else torch.from_numpy(np.stack([w[0] for w in windows]))
-        valid = torch.ones(shape, dtype=torch.bool)
-        valid = valid if not windows else torch.from_numpy(np.stack([w[1] for w in windows]))
-        labels = torch.zeros(count, len(self.task)) if count else None
-        return Touches(readings, valid, positions.float(), labels, self.rate)
+        readings, valid = meaning(
+            np.stack([window.values for window in windows]), np.stack([window.valid for window in windows])
+        )
+        saturated = valid & np.stack([window.saturated for window in windows])
+        positions = torch.from_numpy(self.sensors.positions).float()
+        known = [torch.from_numpy(values) for values in (readings, valid, saturated)]
+        return Touches(known[0], known[1], positions, None, self.rate, saturated=known[2])
 
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin falls silent, or a person ends it."""
         takes: list[Take] = []
         skin, tap = self.open()
         with skin:
-            _, _, meaning = self.settle(skin)
-            director = self.director(tap, meaning)
+            first, meaning = self.settle(skin)
+            director = self.director(tap, meaning, first)
             _say(f"waiting for {self.gestures} gestures, labels {self.labels}")
             for take in self._takes(skin, director):
                 takes.append(take)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from skin import __version__
 from skin.body.base import AbstractBody
@@ -121,6 +122,11 @@ class Simulated(AbstractDevice):
         self.tracker = tracker(self.track, self)
         self._kept: dict[str, Recording] = {}
 
+    @property
+    def idle(self) -> Tensor:
+        """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
+        return (self.constants.offset - self.constants.baseline).masked_fill(self.constants.dead, 0.0)
+
     def replace(self, **changes: Any) -> "Simulated":
         """Return a device with other settings, such as ``seed=3`` for another device of the same kind."""
         return replace(self, **changes)
@@ -221,18 +227,16 @@ class Simulated(AbstractDevice):
         return self._felt_strip(true, generator(Stream.NOISE, self.seed, *key))
 
     def _felt_strip(self, true: Strip, noise: np.random.Generator) -> Strip:
-        frames = true.whole.touches.readings[0, :, None]
-        clipped = self.imperfection.clipped(frames, self.constants)
-        return Strip(true.timeline, self._felt(true.whole, noise), clipped)
+        return Strip(true.timeline, self._felt(true.whole, noise))
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings as the device tells them."""
         force, constants = true.touches.readings, self.constants
         if self.randomise:
             constants = self.imperfection.constants(len(self.sensors), noise, len(true))
-        readings, valid = self.imperfection.apply(force, constants, noise)
-        clipped = {"clipped": self.imperfection.clipped(force, constants).float()}
-        touches = replace(true.touches, readings=readings, valid=valid)
+        readings, valid, saturated = self.imperfection.apply(force, constants, noise)
+        clipped = {"clipped": saturated.flatten(1).any(1).float()}
+        touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
         return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from skin.emulator.faults import BANNER, KINDS, Faults
 from skin.emulator.gestures import Converter, Gesture, gestures, in_time
 from skin.emulator.outlet import AbstractOutlet
 from skin.errors import InputError
-from skin.port.binary import encode_frame
+from skin.port.binary import encode_comment, encode_frame
 from skin.port.frame import Check
 from skin.port.text import Header, encode_header, encode_line
 from skin.session.takes import sentence
@@ -87,7 +87,7 @@ class Emulator:
         outlet: where it is plugged in.
         settings: how it plays.
         faults: what goes wrong.
-        binary: COBS frames instead of lines; they carry neither header nor announcements.
+        binary: COBS frames instead of lines; there are no announcements among them.
         told: is given a sentence about what happens, with the device's time, s.
 
     Attributes:
@@ -205,11 +205,12 @@ class Emulator:
         self._header()
 
     def _header(self) -> None:
-        if self.binary:
-            return
         settings, unit = self.settings, "N" if self.settings.bits is None else "adc"
         header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, settings.id)
-        self._send(encode_header(header, settings.check))
+        if self.binary:
+            self._send(encode_comment(encode_header(header, "none").rstrip()))
+        else:
+            self._send(encode_header(header, settings.check))
 
     def _announce(self, number: int, gesture: Gesture) -> None:
         t, frames = self._number / self.settings.rate, len(gesture.force) * self.settings.rate

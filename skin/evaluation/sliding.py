@@ -97,10 +97,11 @@ def slide(
     """
     if not isinstance(device, Simulated):
         raise InputError(f"streams are simulated, {type(device).__name__} has none: add device=simulated")
-    streamed = device if device.stream else device.replace(stream=True)
-    known = streamed.touches("validation")
+    # One device feels the whole stream, and its baseline is known as after a tare.
+    streamed = device.replace(stream=True, randomise=False)
+    known, idle = streamed.touches("validation"), streamed.idle
     assert known.labels is not None
-    threshold = Threshold.tuned(rise(known), known.labels[:, -1] > 0.5)
+    threshold = Threshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
     all_gates = gates(threshold, device.task)
     recording = streamed.recording("test")
     touches, labels = recording.touches, recording.touches.labels

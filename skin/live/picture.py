@@ -27,17 +27,35 @@ class Picture:
 
     def __init__(self, positions: np.ndarray, size: tuple[float, float], pixels: int, top: float) -> None:
         self.pixels, self.top = pixels, top
-        points, targets = np.asarray(positions, dtype=float)[:, :2], centres(size, pixels)
-        flat = len(points) < _FEWEST or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2
-        found = (
-            weights(points, targets, "nearest")
-            if flat
-            else weights(points, _inside(points, targets), "linear")
-        )
-        self._matrix = found.astype(np.float32)
+        self._points, self._targets = np.asarray(positions, dtype=float)[:, :2], centres(size, pixels)
+        self._known = np.ones(len(self._points), dtype=bool)
+        self._matrix = self._weights()
 
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Return the picture of readings (S,), N, as (pixels, pixels), uint8: 255 is ``top`` and above."""
+    def _weights(self) -> np.ndarray:
+        """Return the weights (P, S) of the known sensors."""
+        points, found = (
+            self._points[self._known],
+            np.zeros((len(self._targets), len(self._known)), np.float32),
+        )
+        if len(points):
+            flat = len(points) < _FEWEST or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2
+            if flat:
+                found[:, self._known] = weights(points, self._targets, "nearest")
+            else:
+                found[:, self._known] = weights(points, _inside(points, self._targets), "linear")
+        return found
+
+    def __call__(self, values: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+        """Return the picture of readings (S,), N, as (pixels, pixels), uint8: 255 is ``top`` and above.
+
+        Args:
+            values: N.
+            known: (S,), bool; the others are left out, not shown as 0; None: all are known.
+        """
+        known = np.ones(len(values), dtype=bool) if known is None else known
+        if not np.array_equal(known, self._known):
+            self._known = known.copy()
+            self._matrix = self._weights()
         image = self._matrix @ values.astype(np.float32)
         return (255 * np.clip(image / self.top, 0, 1)).astype(np.uint8).reshape(self.pixels, self.pixels)
 

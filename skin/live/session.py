@@ -7,11 +7,11 @@ import numpy as np
 
 from skin.live.board import Board
 from skin.live.engine import Engine
-from skin.live.newtons import Newtons
 from skin.live.verdict import Verdict
 from skin.port.errors import SkinDisconnected, SkinTimeout
 from skin.port.frame import Frame
 from skin.port.live import Skin
+from skin.session.taring import Tare
 
 __all__ = ["Session"]
 
@@ -29,7 +29,7 @@ class Session:
 
     Args:
         skin: open.
-        newtons: what its numbers mean.
+        tare: finds out what its values mean.
         engine: what gives verdicts.
         board: where they are shown.
 
@@ -37,8 +37,8 @@ class Session:
         verdicts: how many there were.
     """
 
-    def __init__(self, skin: Skin, newtons: Newtons, engine: Engine, board: Board) -> None:
-        self._skin, self._newtons, self._engine, self._board = skin, newtons, engine, board
+    def __init__(self, skin: Skin, tare: Tare, engine: Engine, board: Board) -> None:
+        self._skin, self._tare, self._engine, self._board = skin, tare, engine, board
         self._delays: deque[float] = deque(maxlen=_DELAYS)
         self._told = -np.inf
         self.verdicts = 0
@@ -54,7 +54,7 @@ class Session:
             try:
                 frames = self._skin.read(1, _PATIENCE)
             except SkinTimeout as silent:
-                self._board.say(None, str(silent).split(": ", 1)[-1])
+                self._board.say(None, str(silent).split(": ", 1)[-1], self._engine.alarm)
             except SkinDisconnected:
                 return
             else:
@@ -74,15 +74,24 @@ class Session:
             return few.frames
 
     def _take(self, frames: list[Frame]) -> None:
-        known = [frame for frame in map(self._newtons, frames) if frame is not None]
-        for frame in known:
-            self._board.show(frame)
-        if not known:
-            self._board.say(None, self._newtons.waiting)
-            return
-        for frame in known[:-1]:
+        if self._board.tare.is_set():
+            self._board.tare.clear()
+            self._tare.again()
+        taken = self._tare.count
+        for frame in frames:
+            self._tare.add(frame)
+        newtons = self._tare.newtons
+        for frame in frames[:-1]:
             self._engine.add(frame)
-        verdict = self._engine.push(known[-1])
+        if newtons is None:
+            self._engine.add(frames[-1])
+            self._board.say(None, self._tare.waiting)
+            return
+        if self._tare.count > taken:
+            self._engine.tared()
+        for frame in frames:
+            self._board.show(frame, newtons)
+        verdict = self._engine.push(frames[-1], newtons)
         if verdict is None:
             self._board.say(None, f"filling the window: {100 * self._engine.window.filled:.0f} %")
         else:
@@ -114,6 +123,7 @@ class Session:
             f"sensor {number} {state}" for number, state in enumerate(self._skin.channels) if state != "ok"
         ]
         parts = [
+            self._tare.waiting if self._tare.newtons is not None else "",
             f"{stats.rate_hz:.1f} Hz",
             *(f"{count} {name}" for name, count in counts.items() if count),
             *sick[:3],

@@ -13,19 +13,21 @@ from skin.device.serial import Serial
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.report import Answers
-from skin.live.engine import Engine
-from skin.live.newtons import Newtons
+from skin.live.engine import Detection, Engine
 from skin.live.verdict import Patience
 from skin.port.live import Skin
 from skin.port.opening import open_skin
 from skin.reload import restore
 from skin.session.newtons import newtons
-from skin.signal.gate import Threshold, gates, rise
+from skin.session.taring import Tare
+from skin.signal.contact import DRIFT
+from skin.signal.gate import Threshold, rise
 from skin.tracking import Store
 
 __all__ = ["Source", "Trained", "engine", "source", "trained"]
 
 _FEW = 10  # gestures, where only their shape matters
+_FAINT = 0.3  # N that end a contact where nothing else is known
 _MANY = 4000  # windows of streams, a tenth of which tunes what touch is
 
 
@@ -55,12 +57,12 @@ class Source:
     Attributes:
         name: of it, for a person.
         skin: open.
-        newtons: what its numbers mean.
+        tare: finds out what its values mean.
     """
 
     name: str
     skin: Skin
-    newtons: Newtons
+    tare: Tare
 
 
 def source(device: AbstractDevice) -> Source:
@@ -71,10 +73,7 @@ def source(device: AbstractDevice) -> Source:
     """
     if isinstance(device, Serial):
         skin, _ = device.open(reconnect=True)
-        assert device.rate is not None
-        return Source(
-            str(device.port), skin, Newtons(device.meaning, device.tare, device.rate, lambda: skin.header)
-        )
+        return Source(str(device.port), skin, device.taring(skin))
     # Its readings are N, and what a run has learnt from such is without a baseline too.
     if isinstance(device, Recorded):
         return Source(device.path, open_skin(device.path, device.sensors), _plain(len(device.sensors)))
@@ -86,8 +85,8 @@ def source(device: AbstractDevice) -> Source:
     )
 
 
-def _plain(sensors: int) -> Newtons:
-    return Newtons(lambda baseline, header: newtons(sensors, None, 1.0, None, None), 0.0, 1.0)
+def _plain(sensors: int) -> Tare:
+    return Tare(lambda baseline, header: newtons(sensors, None, 1.0, None, None), 0.0, 1.0)
 
 
 def trained(store: Store, run: Run, config: DictConfig) -> Trained:
@@ -113,30 +112,41 @@ def trained(store: Store, run: Run, config: DictConfig) -> Trained:
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate)
 
 
-def engine(of: Trained, patience: Patience, touch: float | None = None) -> Engine:
+def engine(of: Trained, patience: Patience, touch: float | None = None, drift: float = 600 * DRIFT) -> Engine:
     """Return the engine of a run.
 
     Args:
         of: the run.
         patience: how long answers must hold.
-        touch: N above its baseline from which on a reading is a touch; None: as the run learned it, or else
-            tuned on simulated streams of its device.
+        touch: N above its baseline from which on a reading is a touch; None: tuned on simulated streams of
+            its device, and what the run has learned about touch counts too.
+        drift: N in ten minutes that the baseline may follow while nothing touches.
 
     Raises:
         InputError: neither learned nor given, and no device that has streams.
     """
     task = of.device.task
-    least = touch if touch is not None else 0.0 if task.gate else _tuned(of.device)
-    gate = gates(Threshold(least), task)
-    chosen = gate["learned"] if touch is None and task.gate else gate["threshold"]
-    return Engine(of.learner, task, of.positions, of.window, of.rate, chosen, patience)
+    learned = touch is None and task.gate is not None
+    least = _tuned(of.device, learned) if touch is None else touch
+    detection = Detection(least, drift / 600, learned, _longest(of))
+    return Engine(of.learner, task, of.positions, of.window, of.rate, detection, patience)
 
 
-def _tuned(device: AbstractDevice) -> float:
+def _longest(of: Trained) -> float:
+    """Return the longest touch that a run was trained on, s; two thirds of its window if nobody knows."""
+    frames = of.window * 2 / 3
+    if isinstance(of.device, Simulated):
+        frames = of.device.sampler.settings.press[1]
+    return frames / of.rate
+
+
+def _tuned(device: AbstractDevice, learned: bool) -> float:
     if not isinstance(device, Simulated):
+        if learned:
+            return _FAINT
         raise InputError(
             "this run does not know what no touch is: give live.touch=0.3 (N), or train on streams"
         )
-    known = device.replace(stream=True, direction=False, gestures=_MANY).touches("validation")
+    known = device.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches("validation")
     assert known.labels is not None
     return Threshold.tuned(rise(known), known.labels[:, -1] > 0.5).least

@@ -1,7 +1,10 @@
 """The skin in a terminal; where output is no terminal, a line for each change of the verdict."""
 
+import signal
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import datetime, timedelta
 from threading import Thread
 from typing import Any
 
@@ -15,19 +18,26 @@ from rich.text import Text
 from skin.live.board import Board, Look
 from skin.live.picture import Picture
 from skin.live.verdict import Verdict
+from skin.session.takes import typed
 
-__all__ = ["lines", "screen", "shown"]
+__all__ = ["lines", "screen", "shown", "since"]
 
 _HERTZ = 8
 _PIXELS = 24
 _BAR = 20  # characters
+_SHORT, _LONG = 3.0, 60.0  # s of contact after which it is told, and after which it may be drift
+_KEYS = "t and Enter: a new tare, nothing may touch the skin; Ctrl-C ends"
 # Dark blue, teal, yellow, white: lighter means more to any eye.
 _SCALE = ((13, 22, 48), (24, 92, 122), (92, 170, 120), (240, 200, 70), (255, 250, 230))
 
 
 @contextmanager
 def shown(board: Board, console: Console) -> Iterator[None]:
-    """Show the board while the block runs."""
+    """Show the board while the block runs, and hear what the operator types."""
+    with suppress(AttributeError, ValueError):  # Windows; another thread than the main one
+        # Where the program is sent to the background, keys are no longer heard; it must not be stopped.
+        signal.signal(signal.SIGTTIN, signal.SIG_IGN)
+    Thread(target=_hear, args=(board,), name="skin-keys", daemon=True).start()
     if not console.is_terminal:
         thread = Thread(target=lines, args=(board, console), name="skin-lines", daemon=True)
         thread.start()
@@ -45,6 +55,14 @@ def shown(board: Board, console: Console) -> Iterator[None]:
             board.closed.set()
 
 
+def _hear(board: Board) -> None:
+    """Ask for a new tare at every line ``t``, until the input ends."""
+    with suppress(OSError, ValueError):  # no input, or a closed one
+        for text in typed(sys.stdin.fileno()):
+            if text.strip().lower() == "t":
+                board.tare.set()
+
+
 def lines(board: Board, console: Console) -> None:
     """Print what is said whenever it changes, until the board is closed."""
     before = ""
@@ -59,12 +77,12 @@ def lines(board: Board, console: Console) -> None:
 
 
 def _sentence(look: Look) -> str:
-    verdict = look.verdict
+    verdict, alarm = look.verdict, "DANGEROUS: " if look.alarm else ""
     if verdict is None:
-        return look.trouble.split(":")[0]
+        return alarm + look.trouble.split(":")[0]
     if not verdict.touched:
         return "no touch"
-    return ("DANGEROUS: " if verdict.dangerous else "") + " ".join(word for word, _ in verdict.words())
+    return alarm + " ".join(word for word, _ in verdict.words())
 
 
 class _Screen:
@@ -84,10 +102,10 @@ class _Screen:
 def screen(board: Board, look: Look, picture: Picture) -> RenderableType:
     """Return the skin beside what is said of it, and the line about the stream below."""
     facts, beside = board.facts, Table.grid(padding=(0, 3))
-    beside.add_row(_map(picture(look.values)), _said(look))
-    border = "bold red" if look.verdict is not None and look.verdict.dangerous else "dim"
+    beside.add_row(_map(picture(look.values, look.valid)), _said(look))
+    border = "bold red" if look.alarm else "dim"
     panel = Panel(beside, title=f"{facts.title} on {facts.port}", border_style=border, expand=False)
-    return Group(panel, Text(look.line or " ", style="dim"), Text("Ctrl-C ends", style="dim"))
+    return Group(panel, Text(look.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
 def _map(image: Any) -> Text:
@@ -109,13 +127,29 @@ def _colour(level: int) -> str:
 
 
 def _said(look: Look) -> RenderableType:
-    verdict = look.verdict
+    verdict, alarm = look.verdict, Text("DANGEROUS", "bold white on red")
     if verdict is None:
-        return Text(look.trouble or "waiting", style="yellow")
+        trouble = Text(look.trouble or "waiting", style="yellow")
+        return Group(alarm, Text(), trouble) if look.alarm else trouble
     if not verdict.touched:
         return Text("no touch", style="dim")
-    head = Text("DANGEROUS", "bold white on red") if verdict.dangerous else Text("touch", "bold")
-    return Group(head, Text(), _bars(verdict), Text("frames are missing" if verdict.gap else "", "yellow"))
+    head, notes = alarm if verdict.dangerous else Text("touch", "bold"), [since(verdict.contact)]
+    notes += [f"{count} sensors at their limit"] if (count := int(look.saturated.sum())) else []
+    notes += ["frames are missing"] * verdict.gap
+    return Group(head, Text(), _bars(verdict), Text("\n".join(notes), "yellow"))
+
+
+def since(contact: float | None) -> str:
+    """Return since when something touches the skin, by the clock on the wall; empty if nothing does.
+
+    Args:
+        contact: for how long, s.
+    """
+    if contact is None or contact < _SHORT:
+        return ""
+    began = datetime.now() - timedelta(seconds=contact)
+    hint = "; if nothing touches the skin, take a new tare" if contact >= _LONG else ""
+    return f"contact since {began:%H:%M:%S} ({contact:.0f} s){hint}"
 
 
 def _bars(verdict: Verdict) -> Table:

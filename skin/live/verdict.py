@@ -15,12 +15,14 @@ class Verdict:
     Attributes:
         t: s, the device's clock at the latest frame.
         t_host: s, the host's clock at that frame.
-        chances: label -> its probability in this window.
+        chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
+            raised, as long as it lasts.
         touched: debounced; False: nothing touches the skin, and the labels mean nothing.
         said: label -> debounced answer; empty without touch.
-        dangerous: what alarms; never without touch.
+        dangerous: what alarms, until the contact ends; never without touch.
         gap: frames are missing in the window.
         masked: sensors that say nothing in the whole window.
+        contact: for how long something has touched the skin, s; None: nothing does now.
     """
 
     t: float
@@ -31,6 +33,7 @@ class Verdict:
     dangerous: bool
     gap: bool
     masked: tuple[int, ...] = ()
+    contact: float | None = None
 
     def words(self) -> list[tuple[str, float]]:
         """Return what is said in words, each with its probability in this window; nothing without touch."""

@@ -22,6 +22,7 @@ from starlette.routing import Route
 from skin.errors import InputError
 from skin.live.board import Board, Look
 from skin.live.picture import Picture
+from skin.live.terminal import since
 
 __all__ = ["HERTZ", "message", "served"]
 
@@ -70,15 +71,18 @@ def message(look: Look, picture: Picture) -> dict[str, Any]:
             "touched": verdict.touched,
             "dangerous": verdict.dangerous,
             "gap": verdict.gap,
+            "since": since(verdict.contact),
             "words": verdict.words(),
         }
     return {
         "number": look.number,
         "values": [round(value, 3) for value in look.values.tolist()],
         "valid": look.valid.tolist(),
-        "picture": base64.b64encode(picture(look.values).tobytes()).decode(),
+        "saturated": look.saturated.tolist(),
+        "picture": base64.b64encode(picture(look.values, look.valid).tobytes()).decode(),
         "verdict": said,
         "trouble": look.trouble,
+        "alarm": look.alarm,
         "line": look.line,
     }
 
@@ -98,9 +102,17 @@ def _application(board: Board) -> Starlette:
     async def pictures(request: Request) -> Response:
         return StreamingResponse(_events(board, picture), media_type="text/event-stream")
 
+    async def tare(request: Request) -> Response:
+        # Another site's page can send a plain POST here, but not with a header of its own.
+        if request.headers.get("x-skin") != "tare":
+            return Response(status_code=403)
+        board.tare.set()
+        return Response(status_code=204)
+
     # Names that lead here from elsewhere are refused: another site's page must not read the skin.
     here = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
     routes = [Route("/", page), Route("/skin.json", skin), Route("/pictures", pictures)]
+    routes.append(Route("/tare", tare, methods=["POST"]))
     return Starlette(routes=routes, middleware=[here])
 
 

@@ -1,7 +1,9 @@
 """The binary protocol: COBS with 0x00 between frames, little-endian.
 
 A frame: u8 0xA5, u8 type (1 u16, 2 i16, 3 f32), u16 seq, u32 t_us, u16 n, n values, u16 CRC-16/CCITT-FALSE of
-all before it. COBS: Cheshire and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7 (1999).
+all before it. A comment, such as the header: u8 0xA5, u8 type 35 (``#``), a comment line of the text protocol
+without its checksum, u16 CRC. COBS: Cheshire and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7
+(1999).
 """
 
 import struct
@@ -13,11 +15,21 @@ import numpy as np
 from skin.port.checksum import crc16
 from skin.port.frame import FrameError
 
-__all__ = ["Kind", "Payload", "decode_frame", "encode_frame", "stuff", "unstuff"]
+__all__ = [
+    "Kind",
+    "Payload",
+    "decode_comment",
+    "decode_frame",
+    "encode_comment",
+    "encode_frame",
+    "stuff",
+    "unstuff",
+]
 
 Kind = Literal["u16", "i16", "f32"]
 
 _MAGIC = 0xA5
+_COMMENT = ord("#")
 _HEAD = struct.Struct("<BBHIH")
 _TAIL = struct.Struct("<H")
 _NUMBER: dict[Kind, int] = {"u16": 1, "i16": 2, "f32": 3}
@@ -66,6 +78,22 @@ def decode_frame(data: bytes) -> Payload:
     if number == 3 and not np.isfinite(values).all():
         raise FrameError("number")
     return Payload(seq, t_us, values)
+
+
+def encode_comment(text: bytes) -> bytes:
+    """Return a comment, such as ``# skin proto=1 n=25 bits=10``, stuffed, 0x00 at its end."""
+    body = bytes((_MAGIC, _COMMENT)) + text
+    return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
+
+
+def decode_comment(data: bytes) -> bytes | None:
+    """Return the text of what stands between two zeros; None if that is no comment, or a damaged one."""
+    try:
+        body = unstuff(data)
+    except FrameError:
+        return None
+    sound = body[:2] == bytes((_MAGIC, _COMMENT)) and _TAIL.pack(crc16(body[:-2])) == body[-2:]
+    return body[2:-2] if sound else None
 
 
 def stuff(data: bytes) -> bytes:

@@ -125,8 +125,9 @@ class Decoder:
             return None
 
     def _comment(self, piece: bytes) -> None:
-        if piece.startswith(b"#"):
-            self.header = parse_header(piece.removesuffix(b"\r")) or self.header
+        assert self.speech is not None
+        if text := self.speech.comment(piece):
+            self.header = parse_header(text) or self.header
 
     def _count_bad(self, bad: FrameError) -> None:
         if not self._synchronous and not self._missing:

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 
 from skin.errors import InputError
-from skin.port.binary import decode_frame
+from skin.port.binary import decode_comment, decode_frame
 from skin.port.frame import Check, FrameError
 from skin.port.order import steps
 from skin.port.text import Header, Line, parse_header, parse_line
@@ -51,6 +51,9 @@ class Speech(Protocol):
     def read(self, piece: bytes) -> Raw | None:
         """Return what a piece between two delimiters says, None for a comment or nothing; or FrameError."""
 
+    def comment(self, piece: bytes) -> bytes | None:
+        """Return a piece as a comment line; None if it is none."""
+
 
 @dataclass(frozen=True)
 class Text:
@@ -79,6 +82,10 @@ class Text:
             raise FrameError("number")
         return Raw(int(seq), t_us, np.array(fields[2:]))
 
+    def comment(self, piece: bytes) -> bytes | None:
+        """Return a comment line."""
+        return piece.removesuffix(b"\r") if piece.startswith(b"#") else None
+
 
 @dataclass(frozen=True)
 class Binary:
@@ -91,12 +98,16 @@ class Binary:
 
     def read(self, piece: bytes) -> Raw | None:
         """Return what stands between two zeros."""
-        if not piece:
+        if not piece or self.comment(piece) is not None:
             return None
         seq, t_us, values = decode_frame(piece)
         if len(values) != self.sensors:
             raise FrameError("fields", len(values))
         return Raw(seq, t_us, values)
+
+    def comment(self, piece: bytes) -> bytes | None:
+        """Return the text of a comment."""
+        return decode_comment(piece)
 
 
 @dataclass(frozen=True)

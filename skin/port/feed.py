@@ -10,10 +10,12 @@ import numpy as np
 
 from skin.port.decoder import Decoder
 from skin.port.frame import After, Frame
-from skin.port.health import Health, State
+from skin.port.health import Health, Limits, State
 from skin.port.wire import ByteStream
 
-__all__ = ["Feed", "Player", "Wire"]
+__all__ = ["Feed", "Piece", "Player", "Wire"]
+
+Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 _log = logging.getLogger("skin.port")
 
@@ -50,10 +52,11 @@ class Wire:
     patient = False
 
     def __init__(
-        self, stream: ByteStream, decoder: Decoder, limits: tuple[float | None, float | None] | None
+        self, stream: ByteStream, decoder: Decoder, limits: Limits | None, health: Health | None = None
     ) -> None:
         self._stream, self._decoder, self._limits = stream, decoder, limits
-        self._health: Health | None = None
+        self._health = health or Health()
+        self._told = False
         self._said = Counter(decoder.counters.bad)
         self._said_at = monotonic()
 
@@ -61,8 +64,8 @@ class Wire:
         """Return the frames that ended in what came; InputError if nothing can be read at all."""
         data, now = self._stream.read(), monotonic()
         frames = self._decoder.feed(data, now) if data else []
-        if frames and self._health is None:
-            self._health = self._first()
+        if frames:
+            self._prepare()
         elif data and not frames and (refusal := self._decoder.refusal()):
             raise refusal
         if now - self._said_at >= 1:
@@ -71,26 +74,28 @@ class Wire:
 
     def states(self) -> tuple[State, ...]:
         """Return what is wrong with each channel."""
-        return self._health.states() if self._health else ()
+        return self._health.states()
 
     def close(self) -> None:
         """Close the port."""
         self._stream.close()
 
-    def _first(self) -> Health:
-        """Say what protects the frames, and find their limits."""
+    def _prepare(self) -> None:
+        """Say once what protects the frames; take limits from the header whenever it comes."""
         speech, header = self._decoder.speech, self._decoder.header
-        if speech is not None and speech.check in _WEAK:
+        if not self._told and speech is not None and speech.check in _WEAK:
             _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[speech.check])
+        self._told = True
         if self._limits is not None:
-            return Health(self._limits)
-        return Health((None, 2**header.bits - 1 if header and header.bits else None))
+            self._health.limits = self._limits
+        elif header is not None and header.bits:
+            self._health.limits = (None, 2**header.bits - 1)
 
     def _judged(self, frame: Frame) -> Frame:
-        assert self._health is not None
         if frame.after not in ("", "gap"):
             self._health.restart()
-        return frame._replace(valid=self._health.valid(frame.values, frame.t))
+        valid, saturated = self._health.judge(frame.values, frame.t)
+        return frame._replace(valid=valid, saturated=saturated)
 
     def _say(self, now: float) -> None:
         fresh = self._decoder.counters.bad - self._said
@@ -105,24 +110,22 @@ class Player:
     """Frames from memory, in real time or as fast as they are taken.
 
     Args:
-        pieces: values (F, S) and valid (F, S) of each piece; a window should not span two of them.
+        pieces: values, valid and saturated, (F, S) each, of each piece; a window should not span two of them.
         rate: frames per second, Hz.
         realtime: False: as fast as they are taken.
     """
 
-    def __init__(
-        self, pieces: Iterable[tuple[np.ndarray, np.ndarray]], rate: float, realtime: bool = True
-    ) -> None:
+    def __init__(self, pieces: Iterable[Piece], rate: float, realtime: bool = True) -> None:
         self.patient = not realtime
         self._rate, self._start = rate, monotonic()
         self._frames = enumerate(self._all(pieces))
         self._next = self._take()
 
-    def _all(self, pieces: Iterable[tuple[np.ndarray, np.ndarray]]) -> Iterator[Frame]:
-        for segment, (values, valid) in enumerate(pieces):
-            for place in range(len(values)):
+    def _all(self, pieces: Iterable[Piece]) -> Iterator[Frame]:
+        for segment, (values, valid, saturated) in enumerate(pieces):
+            for place, row in enumerate(values):
                 after: After = "cut" if segment and not place else ""
-                yield Frame(None, 0.0, 0.0, values[place], valid[place], segment, 0, after)
+                yield Frame(None, 0.0, 0.0, row, valid[place], segment, 0, after, saturated[place])
 
     def _take(self) -> Frame | None:
         number, frame = next(self._frames, (0, None))

@@ -24,10 +24,12 @@ class Frame(NamedTuple):
         t: s, the device's clock, unwrapped, within a segment; the host's where the device tells no time.
         t_host: s, the host's monotonic clock (``time.monotonic``), never before the frame before.
         values: (S,), float64, what the device sends (raw counts, or N from a recording): never re-scaled.
-        valid: (S,), bool: False where a value means nothing (saturated, stuck or dead channel).
+        valid: (S,), bool: False where a value means nothing (stuck or dead channel).
         segment: counts restarts, reconnections and cuts: no window should span two.
         lost: how many frames are known to be missing just before this one; 0 where nobody can know.
         after: what lies before this frame; empty if it follows the one before without a gap.
+        saturated: (S,), bool: the channel is at its limit, so the force is at least what it says; None: no
+            channel is.
     """
 
     seq: int | None
@@ -38,6 +40,7 @@ class Frame(NamedTuple):
     segment: int = 0
     lost: int = 0
     after: After = ""
+    saturated: np.ndarray | None = None
 
     def behind(self, dropped: "Frame") -> "Frame":
         """Return this frame as it is told where the one before it was dropped: the gap is never hidden."""

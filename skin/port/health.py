@@ -1,58 +1,77 @@
-"""Which channels mean something: none that is saturated, stuck or dead."""
+"""Which channels can be used: none that is stuck or dead; one at its limit feels at least that."""
 
 from typing import Literal
 
 import numpy as np
 
-__all__ = ["Health", "State"]
+__all__ = ["Health", "Limits", "State"]
 
 State = Literal["ok", "saturated", "stuck", "dead"]
+Limits = tuple[float | None, float | None]
 
 _SILENT = 5.0  # s without any change
 _LIVELY = 1.0  # s within which most channels change, if their noise can be seen at all
+_FAR = 20  # smallest steps of a channel: more than its noise ranges over
 
 
 class Health:
     """Judges channels frame by frame.
 
-    A value at a limit is saturated. A channel that does not change at all for five seconds in which most
-    others kept changing is stuck, or dead if it never changed. Where the noise of an untouched skin is below
-    one count, neither can be told, and neither is. One change, and the channel counts again.
+    A value at a limit is saturated, and valid: the force is at least that. A channel that does not change at
+    all for five seconds in which most others kept changing is stuck, or dead if it never changed. Where the
+    noise of an untouched skin is below one count, neither can be told, and neither is. One change, and the
+    channel counts again. A channel that stays at the largest value that it ever sent, far above its smallest,
+    has a limit that nobody told: it is saturated, not stuck, because a held press must not be masked.
 
     Args:
         limits: smallest and largest value a channel can send; None where a value at rest may lie there, as
             at 0 of a resistor that conducts only under load.
+
+    Attributes:
+        limits: as given; another value holds from the next frame on.
     """
 
-    def __init__(self, limits: tuple[float | None, float | None] = (None, None)) -> None:
-        low, high = limits
-        self._low = -np.inf if low is None else low
-        self._high = np.inf if high is None else high
-        self.restart()
+    def __init__(self, limits: Limits = (None, None)) -> None:
+        self.limits = limits
+        self._last: np.ndarray | None = None
+        self._begin_time = True
+        self._ever, self._smallest = np.zeros(0, dtype=bool), np.zeros(0)
 
     def restart(self) -> None:
-        """Forget the past: the device started anew."""
-        self._last: np.ndarray | None = None
+        """Forget times: the device started anew. What channels can send stays known."""
+        self._begin_time = True
 
-    def valid(self, values: np.ndarray, t: float) -> np.ndarray:
-        """Return which values (S,) mean something, (S,), bool.
+    def judge(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return which values (S,) are valid and which are saturated, (S,), bool each.
 
         Args:
             values: as sent.
             t: s, rising.
         """
         if self._last is None or len(values) != len(self._last):
-            self._begin(values, t)
-        self._saturated = (values >= self._high) | (values <= self._low)
-        changed = values != self._last
+            self._last = self._begin(values)
+        if self._begin_time:
+            self._changed_at, self._lively_since, self._begin_time = np.full(len(values), t), t, False
+        step = np.abs(values - self._last)
+        changed = step > 0
         self._last = values
         self._changed_at[changed] = t
         self._ever |= changed
+        self._smallest = np.minimum(self._smallest, np.where(changed, step, np.inf))
+        np.minimum(self._least, values, out=self._least)
+        np.maximum(self._most, values, out=self._most)
         silent = t - self._changed_at
         if 2 * np.count_nonzero(silent < _LIVELY) <= len(values):
             self._lively_since = t
         self._silent = (silent >= _SILENT) & (t - self._lively_since >= _SILENT)
-        return ~(self._saturated | self._silent)
+        low, high = self.limits
+        at_limit = (values >= (np.inf if high is None else high)) | (
+            values <= (-np.inf if low is None else low)
+        )
+        loaded = self._ever & (self._most - self._least >= _FAR * self._smallest)
+        self._saturated = at_limit | (self._silent & loaded & (values >= self._most))
+        self._silent &= ~self._saturated
+        return ~self._silent, self._saturated
 
     def states(self) -> tuple[State, ...]:
         """Return what is wrong with each channel as of the last frame; empty before the first."""
@@ -63,9 +82,10 @@ class Health:
         worst = np.where(dead, 3, np.where(self._silent, 2, np.where(self._saturated, 1, 0)))
         return tuple(kinds[number] for number in worst)
 
-    def _begin(self, values: np.ndarray, t: float) -> None:
-        self._last = values
-        self._changed_at = np.full(len(values), t)
+    def _begin(self, values: np.ndarray) -> np.ndarray:
+        self._begin_time = True
+        self._least, self._most = np.array(values, dtype=float), np.array(values, dtype=float)
+        self._smallest = np.full(len(values), np.inf)
         self._ever = np.zeros(len(values), dtype=bool)
-        self._saturated = self._silent = np.zeros(len(values), dtype=bool)
-        self._lively_since = t
+        self._saturated, self._silent = self._ever.copy(), self._ever.copy()
+        return values

@@ -12,13 +12,15 @@ import numpy as np
 from skin.errors import InputError
 from skin.port.decoder import Decoder
 from skin.port.detect import Format
-from skin.port.feed import Feed, Player, Wire
+from skin.port.feed import Feed, Piece, Player, Wire
+from skin.port.health import Health, Limits
 from skin.port.live import Skin
 from skin.port.reader import Reader
 from skin.port.wire import ByteStream, open_wire
 
 if TYPE_CHECKING:
     from skin.device.simulated import Simulated
+    from skin.recording import Touches
 
 __all__ = ["Settings", "open_skin"]
 
@@ -104,17 +106,19 @@ def open_skin(
     return Skin(reader, decoder, chosen.timeout, baseline)
 
 
-def _wire(
-    opener: Callable[[], ByteStream], decoder: Decoder, limits: tuple[float | None, float | None] | None
-) -> Callable[[], Feed]:
-    """Return what connects; from the second time on the decoder begins anew."""
-    connections = count()
+def _wire(opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None) -> Callable[[], Feed]:
+    """Return what connects; from the second time on the decoder begins anew.
+
+    What channels can send stays known: a cable may come loose under a press that drives them to their limit.
+    """
+    connections, health = count(), Health()
 
     def connect() -> Feed:
         stream = opener()
         if next(connections):
             decoder.restart()
-        return Wire(stream, decoder, limits)
+            health.restart()
+        return Wire(stream, decoder, limits, health)
 
     return connect
 
@@ -134,8 +138,7 @@ def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
             f"{path} has {found} sensors, the layout has {sensors}: give the layout it was recorded with, "
             "as in layout=file layout.path=FILE.csv"
         )
-    values, valid = touches.readings.double().numpy(), touches.valid.numpy()
-    return Player(zip(values, valid, strict=True), touches.rate, realtime)
+    return Player(_pieces(touches), touches.rate, realtime)
 
 
 def _simulated(device: "Simulated | None", realtime: bool) -> Player:
@@ -144,7 +147,11 @@ def _simulated(device: "Simulated | None", realtime: bool) -> Player:
     return Player(_strips(device), device.rate, realtime)
 
 
-def _strips(device: "Simulated") -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _strips(device: "Simulated") -> Iterator[Piece]:
     for number in count():
-        touches = device.strip(max(1, round(_STRIP * device.rate)), number=number).whole.touches
-        yield touches.readings[0].double().numpy(), touches.valid[0].numpy()
+        yield from _pieces(device.strip(max(1, round(_STRIP * device.rate)), number=number).whole.touches)
+
+
+def _pieces(touches: "Touches") -> Iterator[Piece]:
+    saturated = touches.valid & False if touches.saturated is None else touches.saturated
+    yield from zip(touches.readings.double().numpy(), touches.valid.numpy(), saturated.numpy(), strict=True)

@@ -15,7 +15,7 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.recording import Touches
 from skin.results.figures import COLOURS, save
-from skin.session.reduction import highest
+from skin.signal.resampling import resample
 from skin.streams import Stream, generator
 
 __all__ = ["Comparison", "Press", "Verdicts", "agreement", "compare", "figure", "page", "read", "touches"]
@@ -160,14 +160,12 @@ def _press(found: Comparison, number: int) -> Press | None:
 def touches(found: Comparison, positions: np.ndarray, rate: float, window: int) -> tuple[Touches, Touches]:
     """Return the presses as a model sees them, simulated and recorded: a window from each one's beginning."""
     time, gauge = found.bench.session.time, found.bench.gauge
-    both = []
+    begins = [gauge.time[gauge.first[press.number]] for press in found.presses]
+    length, both = window / rate - 0.5 * float(np.median(np.diff(time))), []
     for values in (found.simulated, found.recorded):
         valid = np.isfinite(values) & found.valid
-        clean = np.where(valid, values, 0.0)
-        rows = [
-            highest(time, clean, valid, gauge.time[gauge.first[press.number]], rate, window)
-            for press in found.presses
-        ]
+        clean, never = np.where(valid, values, 0.0), np.zeros_like(valid)
+        rows = [resample(time, clean, valid, never, begin + length, 1 / rate, window) for begin in begins]
         readings, marks = (torch.from_numpy(np.stack([row[part] for row in rows])) for part in (0, 1))
         places = torch.from_numpy(positions).float()
         both.append(Touches(readings.float() * marks, marks, places, None, rate))

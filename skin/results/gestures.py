@@ -16,7 +16,6 @@ from skin.errors import InputError
 from skin.labels import TOUCH
 from skin.recording import Touches
 from skin.session import log
-from skin.session.reduction import reduced
 from skin.session.takes import sentence
 from skin.streams import Stream, generator
 
@@ -122,8 +121,7 @@ def read(device: Simulated, path: str, seed: int) -> Gestures:
     else:
         drawn = alike(device, np.array([[one[name] for name in TOUCH.names] for one in labels]), seed)
     felt = _felt(device, drawn)
-    window, rate = device.window, device.rate
-    recorded = [meaning(*reduced(take.frames, take.begin, rate, window)) for take, meaning in takes]
+    recorded = [meaning(take.seen.values, take.seen.valid) for take, meaning in takes if take.seen]
     working = ~device.constants.dead.numpy()
     pairs = [
         Pair(number, known, one.applied, simulated, values.astype(float), valid & working)
@@ -132,7 +130,7 @@ def read(device: Simulated, path: str, seed: int) -> Gestures:
         )
     ]
     seen = [pair for pair in pairs if pair.valid.any(axis=0).any() and pair.simulated.any()]
-    return Gestures(seen, same, device.sensors.positions, rate)
+    return Gestures(seen, same, device.sensors.positions, device.rate)
 
 
 def _fits(device: Simulated, about: Mapping[str, Any], path: str) -> None:

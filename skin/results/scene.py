@@ -41,7 +41,7 @@ def simulated(device: Simulated, labels: Sequence[str], shape: str | None, seed:
     wanted = np.array([[name in labels for name in TOUCH.names]])
     movie = device.sampler.sample(1, generator, wanted)
     true = movie.respond(device.model, displacement=False).readings
-    readings, _ = device.imperfection.apply(true, device.constants, generator)
+    readings, *_ = device.imperfection.apply(true, device.constants, generator)
     pressure = movie.pressure()[0]
     moved = None
     found = surface_motion(device.model, device.body, movie.frames) if field else None

@@ -20,6 +20,7 @@ from skin.errors import InputError
 from skin.port.frame import Frame
 from skin.session.newtons import Newtons
 from skin.session.takes import Take
+from skin.signal.resampling import Window
 
 __all__ = ["Log", "Stored", "read"]
 
@@ -57,7 +58,7 @@ class Log:
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any], sensors: int) -> None:
-        self._invalid: list[int] = []
+        self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
         self._segment, self._anchor = -1, 0.0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -111,10 +112,13 @@ class Log:
         """Add a frame, raw."""
         if frame.after:
             self.mark("gap", after=frame.after, lost=frame.lost)
-        invalid = np.flatnonzero(~frame.valid).tolist()
-        if invalid != self._invalid:
-            self.mark("invalid", channels=invalid)
-            self._invalid = invalid
+        none = np.zeros(len(frame.values), dtype=bool)
+        marks = {"invalid": ~frame.valid, "saturated": none if frame.saturated is None else frame.saturated}
+        for event, found in marks.items():
+            channels = np.flatnonzero(found).tolist()
+            if channels != self._marked[event]:
+                self.mark(event, channels=channels)
+                self._marked[event] = channels
         self._last = self._time(frame)
         values = ",".join(f"{value:.9g}" for value in frame.values.tolist())
         self._line(f"{self._last:.9f},{'' if frame.seq is None else frame.seq},{values}")
@@ -150,35 +154,70 @@ def read(path: Path) -> Stored:
     """
     try:
         about = json.loads(path.with_name(path.name + ".json").read_text(encoding="utf-8"))
-        stored, take, meaning = Stored(about), None, None
-        invalid: list[int] = []
+        stored = _Reading(Stored(about))
         for text in _whole_lines(path):
-            if not text.startswith("#"):
-                frame = _frame(text, invalid)
-                stored.frames, stored.end = stored.frames + 1, frame.t
-                if take is not None:
-                    take.frames.append(frame)
-                continue
-            said = json.loads(text[1:])
-            match said.pop("event"):
-                case "meaning":
-                    meaning = Newtons(**{name: np.array(value) for name, value in said.items()})
-                    invalid, take = [], None
-                case "begin":
-                    take = Take(said["number"], said["labels"], said["time"], 0)
-                case "end" if take is not None and meaning is not None:
-                    take.lost = said["lost"]
-                    stored.takes[take.number] = take, meaning
-                    take = None
-                case "broken":
-                    take = None
-                case "invalid":
-                    invalid = said["channels"]
+            stored.line(text)
     except OSError as error:
         raise InputError(f"no session {path}: experiments/record.py out={path} makes one") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(f"{path} is damaged or no session of experiments/record.py: {error}") from error
-    return stored
+    return stored.stored
+
+
+class _Reading:
+    """Goes through the lines of a session."""
+
+    def __init__(self, stored: Stored) -> None:
+        self.stored = stored
+        self._take: Take | None = None
+        self._meaning: Newtons | None = None
+        self._window: Window | None = None
+        self._lost = 0
+        self._marked: dict[str, list[int]] = {}
+
+    def line(self, text: str) -> None:
+        if text.startswith("#"):
+            self._event(json.loads(text[1:]))
+            return
+        frame = self._frame(text)
+        stored, about = self.stored, self.stored.about
+        stored.frames, stored.end = stored.frames + 1, frame.t
+        if self._window is None:
+            self._window = Window(about.get("window", 30), about.get("rate", 10.0), len(frame.values))
+        self._window.add(frame)
+        if self._take is not None:
+            self._take.frames.append(frame)
+
+    def _event(self, said: dict[str, Any]) -> None:
+        match said.pop("event"):
+            case "meaning":
+                self._meaning = Newtons(**{name: np.array(value) for name, value in said.items()})
+                self._marked, self._take = {}, None
+            case "begin":
+                self._take = Take(said["number"], said["labels"], said["time"], 0)
+            case "end" if self._take is not None and self._meaning is not None and self._window is not None:
+                self._take.lost, self._take.seen = said["lost"], self._window.since(self._take.begin)
+                self.stored.takes[self._take.number] = self._take, self._meaning
+                self._take = None
+            case "broken":
+                self._take = None
+            case "gap":
+                self._lost = max(said["lost"], 1)
+            case ("invalid" | "saturated") as event:
+                self._marked[event] = said["channels"]
+
+    def _frame(self, text: str) -> Frame:
+        t, seq, *values = text.split(",")
+        row = np.array([float(value) for value in values])
+        valid, saturated = np.ones(len(row), dtype=bool), np.zeros(len(row), dtype=bool)
+        valid[self._marked.get("invalid", [])] = False
+        saturated[self._marked.get("saturated", [])] = True
+        if self.stored.about.get("format") == 1 and (bits := self.stored.about.get("bits")):
+            # Sessions of old called a channel at its limit invalid.
+            saturated = row >= 2**bits - 1
+            valid |= saturated
+        lost, self._lost = self._lost, 0
+        return Frame(int(seq) if seq else None, float(t), float(t), row, valid, 0, lost, "", saturated)
 
 
 def _whole_lines(path: Path) -> Iterator[str]:
@@ -187,14 +226,6 @@ def _whole_lines(path: Path) -> Iterator[str]:
         for text in file:
             if text.endswith("\n"):
                 yield text
-
-
-def _frame(text: str, invalid: list[int]) -> Frame:
-    t, seq, *values = text.split(",")
-    row = np.array([float(value) for value in values])
-    valid = np.ones(len(row), dtype=bool)
-    valid[invalid] = False
-    return Frame(int(seq) if seq else None, float(t), float(t), row, valid)
 
 
 def _write_about(path: Path, about: Mapping[str, Any]) -> None:

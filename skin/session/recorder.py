@@ -32,7 +32,7 @@ def record(
     """
     skin, tap = device.open(reconnect=True)
     with skin:
-        first, _, meaning = device.settle(skin)
+        first, meaning = device.settle(skin)
         log = Log(path, _about(device, skin.header), len(device.sensors))
         try:
             log.meaning(meaning)
@@ -42,9 +42,9 @@ def record(
             begin = log.time - (first[-1].t - first[0].t)
             if log.done:
                 tell(f"{path} has {len(log.done)} gestures: going on")
-            director = device.director(tap, meaning, log.done)
+            director = device.director(tap, meaning, first, log.done)
             if free:
-                director = Continuous(device.length, max(log.done, default=-1) + 1)
+                director = Continuous(director.window, max(log.done, default=-1) + 1)
             wanted = None if free else device.gestures
             for frame in skin:
                 take, before = director.take, len(log.done)
@@ -67,7 +67,7 @@ def record(
 def _about(device: Serial, header: Header | None) -> dict[str, Any]:
     """Return what stands beside a session."""
     return {
-        "format": 1,
+        "format": 2,
         "unit": header.unit if header and header.unit else "adc",
         "bits": header.bits if header else None,
         "id": header.id if header else None,

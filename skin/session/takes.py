@@ -14,9 +14,10 @@ from skin.errors import InputError
 from skin.labels import OPPOSITE, Task
 from skin.port.frame import Frame
 from skin.session.tap import Tap
+from skin.signal.resampling import Resampled, Window
 from skin.streams import Stream, generator
 
-__all__ = ["AbstractDirector", "Announced", "Continuous", "Prompted", "Take", "plan", "sentence"]
+__all__ = ["AbstractDirector", "Announced", "Continuous", "Prompted", "Take", "plan", "sentence", "typed"]
 
 Labels = Mapping[str, int]
 
@@ -35,6 +36,7 @@ class Take:
         frames: of the window.
         lost: frames that are known to be missing in it.
         broken: the device started anew within it: it cannot be used.
+        seen: the window at the model's rate, in the device's unit; None until it is over.
     """
 
     number: int
@@ -44,6 +46,7 @@ class Take:
     frames: list[Frame] = field(default_factory=list)
     lost: int = 0
     broken: bool = False
+    seen: Resampled | None = None
 
 
 def plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
@@ -59,11 +62,11 @@ def sentence(labels: Labels) -> str:
     return ", ".join(name if on else OPPOSITE.get(name, f"not {name}") for name, on in labels.items())
 
 
-def _typed() -> Iterator[str]:
-    """Yield the lines that a person types."""
+def typed(file: int) -> Iterator[str]:
+    """Yield the lines that a person types into an open file."""
     rest = b""
     # Not from sys.stdin: a thread that waits there cannot be left when the program ends.
-    while data := os.read(sys.stdin.fileno(), 1024):
+    while data := os.read(file, 1024):
         *lines, rest = (rest + data).split(b"\n")
         yield from (line.decode(errors="replace") for line in lines)
 
@@ -72,19 +75,25 @@ class AbstractDirector(ABC):
     """Is shown every frame and says which make a gesture.
 
     Args:
-        length: of a window, s.
+        window: of the model; frames that came before the first one shown may have been added to it.
+
+    Attributes:
+        window: as given.
         take: the window that is being filled; None between two.
         over: nothing more will come.
     """
 
-    def __init__(self, length: float) -> None:
-        self._length = length
+    def __init__(self, window: Window) -> None:
+        self.window, self._length = window, window.frames / window.rate
         self.take: Take | None = None
         self.over = False
 
     def show(self, frame: Frame) -> Take | None:
         """Take a frame; return the gesture whose window ended before it, or one that broke off."""
         done = self._close(frame)
+        if done is not None and not done.broken:
+            done.seen = self.window.since(done.begin)
+        self.window.add(frame)
         if self.take is None:
             self.take = self._begin(frame)
         if self.take is not None:
@@ -112,7 +121,7 @@ class Announced(AbstractDirector):
     """Takes the windows and labels that an emulated skin announces.
 
     Args:
-        length: of a window, s.
+        window: as in :class:`AbstractDirector`.
         tap: what hears the announcements.
         task: the labels that are wanted; ``touch`` is always true.
 
@@ -120,8 +129,8 @@ class Announced(AbstractDirector):
         InputError: on a frame without a number, or an announcement without a label.
     """
 
-    def __init__(self, length: float, tap: Tap, task: Task) -> None:
-        super().__init__(length)
+    def __init__(self, window: Window, tap: Tap, task: Task) -> None:
+        super().__init__(window)
         self._heard, self._task = tap.heard, task
 
     def _begin(self, frame: Frame) -> Take | None:
@@ -147,7 +156,7 @@ class Prompted(AbstractDirector):
     """Asks a person for each gesture and begins when Enter is pressed: s skips one, q ends.
 
     Args:
-        length: of a window, s.
+        window: as in :class:`AbstractDirector`.
         wanted: (number, labels) of the gestures.
         tell: says a sentence to the person.
         lines: what the person types; None: standard input. What is typed before it is asked for counts,
@@ -156,19 +165,19 @@ class Prompted(AbstractDirector):
 
     def __init__(
         self,
-        length: float,
+        window: Window,
         wanted: Iterator[tuple[int, Labels]],
         tell: Callable[[str], None],
         lines: Iterator[str] | None = None,
     ) -> None:
-        super().__init__(length)
+        super().__init__(window)
         self._wanted, self._tell = wanted, tell
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
         self._over_now = False
         self._hasty = lines is None and sys.stdin.isatty()
         # A thread, because frames come while a person thinks.
-        Thread(target=self._listen, args=(lines or _typed(),), daemon=True).start()
+        Thread(target=self._listen, args=(lines or typed(sys.stdin.fileno()),), daemon=True).start()
 
     def _listen(self, lines: Iterator[str]) -> None:
         for line in lines:
@@ -223,15 +232,15 @@ class Continuous(AbstractDirector):
     """Takes windows one after the other, without labels.
 
     Args:
-        length: of a window, s.
+        window: as in :class:`AbstractDirector`.
         first: number of the first.
         wanted: asked of every frame that could begin a window; None: each does.
     """
 
     def __init__(
-        self, length: float, first: int = 0, wanted: Callable[[np.ndarray], bool] | None = None
+        self, window: Window, first: int = 0, wanted: Callable[[np.ndarray], bool] | None = None
     ) -> None:
-        super().__init__(length)
+        super().__init__(window)
         self._number, self._wanted = first, wanted
 
     def _begin(self, frame: Frame) -> Take | None:

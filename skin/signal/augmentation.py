@@ -1,6 +1,6 @@
 """More touches from the same ones: changes of a recorded touch that leave its labels true."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -62,7 +62,8 @@ class Augmentation:
             readings = readings * (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
         if self.noise:
             readings = readings + self.noise * torch.randn(readings.shape, generator=generator)
-        return Touches(readings, valid, touches.positions, touches.labels, touches.rate)
+        saturated = None if touches.saturated is None else touches.saturated.gather(1, order)
+        return replace(touches, readings=readings, valid=valid, saturated=saturated)
 
     def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
         """Draw by how many frames each touch moves, (B,), so that none is torn apart."""

@@ -16,20 +16,17 @@ __all__ = ["Gate", "Threshold", "gates", "rise"]
 Gate = Callable[[Touches, Tensor], Tensor]
 """From windows and their probabilities (B, L) to which of them are said to be touched, (B,), bool."""
 
-_IDLE = 0.2  # a sensor rests for at least a fifth of a window: the longest press lasts 20 frames of 30
 
+def rise(touches: Touches, idle: Tensor | float = 0.0) -> Tensor:
+    """Return how far the readings of each window rise above the untouched skin's, (B,), N; at least 0.
 
-def rise(touches: Touches) -> Tensor:
-    """Return how far the readings of each window rise above their running baseline, (B,), N.
+    The baseline is not taken from the window: a touch that is held all through it would become the baseline.
 
-    Each sensor's baseline is the level under which a fifth of the window's own readings lie, so it follows
-    offset and drift with the window, needs no frame before it, and is not raised by a touch that lasts less
-    than four fifths of it. Readings that are not valid rise by nothing.
+    Args:
+        touches: readings that are not valid rise by nothing.
+        idle: (S,), N, what the untouched skin reads; 0 after a tare.
     """
-    readings = touches.readings.where(touches.valid, 0)
-    rank = 1 + int(_IDLE * (readings.shape[1] - 1))
-    baseline = readings.kthvalue(rank, dim=1, keepdim=True).values
-    return ((readings - baseline) * touches.valid).flatten(1).amax(dim=1)
+    return ((touches.readings - idle) * touches.valid).flatten(1).amax(dim=1).clamp(min=0)
 
 
 @dataclass(frozen=True)
@@ -38,17 +35,20 @@ class Threshold:
 
     Attributes:
         least: N.
+        idle: (S,), N, as in :func:`rise`.
     """
 
     least: float
+    idle: Tensor | float = 0.0
 
     @classmethod
-    def tuned(cls, rises: Tensor, touched: Tensor) -> "Threshold":
+    def tuned(cls, rises: Tensor, touched: Tensor, idle: Tensor | float = 0.0) -> "Threshold":
         """Return the threshold that tells best, by balanced accuracy.
 
         Args:
             rises: (B,), N, as :func:`rise` gives them, of windows that no test will see again.
             touched: (B,), bool.
+            idle: (S,), N, as in :func:`rise`.
 
         Raises:
             InputError: windows that are all touched, or none of them.
@@ -58,12 +58,12 @@ class Threshold:
                 f"{len(touched)} validation windows are all alike, with touch or all without: "
                 "give more with data.gestures"
             )
-        idle, found, levels = roc_curve(touched.numpy(), rises.numpy())
-        return cls(float(levels[int((found - idle).argmax())]))
+        alarms, found, levels = roc_curve(touched.numpy(), rises.numpy())
+        return cls(float(levels[int((found - alarms).argmax())]), idle)
 
     def touched(self, touches: Touches) -> Tensor:
         """Return which windows are touched, (B,), bool."""
-        return rise(touches) >= self.least
+        return rise(touches, self.idle) >= self.least
 
 
 def gates(threshold: Threshold, task: Task) -> dict[str, Gate]:

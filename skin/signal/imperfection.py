@@ -185,8 +185,8 @@ class Imperfection:
 
     def apply(
         self, readings: Tensor, constants: Constants, generator: np.random.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Return what the device says and which of it is valid.
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the device says, which of it is valid, and which is at a sensor's limit.
 
         Args:
             readings: (B, T, S), true readings, N.
@@ -194,11 +194,12 @@ class Imperfection:
             generator: where the noise comes from.
 
         Returns:
-            readings (B, T, S), N, float32, and valid (B, T, S), bool.
+            readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
         """
         constants = constants.to(readings.device)
         dead = constants.dead.expand(readings.shape)
-        return self._say(readings, constants, generator).masked_fill(dead, 0.0), ~dead
+        said, saturated = self._say(readings, constants, generator)
+        return said.masked_fill(dead, 0.0), ~dead, saturated & ~dead
 
     def raw(
         self,
@@ -216,7 +217,7 @@ class Imperfection:
             time: of every frame, (T,), s; None: at ``rate`` from 0.
         """
         constants = constants._replace(baseline=torch.zeros(())).to(readings.device)
-        said = self._say(readings, constants, generator, time)
+        said, _ = self._say(readings, constants, generator, time)
         return torch.where(constants.dead, constants.level, said)
 
     def _say(
@@ -225,7 +226,7 @@ class Imperfection:
         constants: Constants,
         generator: np.random.Generator,
         time: Tensor | None = None,
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         noise = torch.from_numpy(generator.standard_normal(readings.shape, dtype=np.float32))
         if time is None:
             time = torch.arange(readings.shape[1], device=readings.device) / self.rate
@@ -234,16 +235,11 @@ class Imperfection:
             force = unloading(force, constants.hysteresis)
         if constants.time_constant.any():
             force = lagged(force, constants.time_constant, time)
-        said = (force * constants.gain).clamp(-constants.clip, constants.clip)
+        felt = force * constants.gain
+        said, saturated = felt.clamp(-constants.clip, constants.clip), felt.abs() > constants.clip
         said += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
         if constants.drift.any():
             said += constants.drift * time[:, None]
         if constants.quantum.any():
             said = rounded(said + constants.baseline, constants.quantum) - constants.baseline
-        return said
-
-    def clipped(self, readings: Tensor, constants: Constants) -> Tensor:
-        """Return which gestures have a reading that is clipped, (B,), bool."""
-        constants = constants.to(readings.device)
-        force = (readings * constants.gain).abs() > constants.clip
-        return (force & ~constants.dead).flatten(1).any(1)
+        return said, saturated

@@ -134,12 +134,10 @@ class Strip:
     Attributes:
         timeline: what touches when.
         whole: the stream as one touch of F frames, (1, F, ...), whose windows have labels, not itself.
-        clipped: (F,), bool, frames in which a reading is clipped.
     """
 
     timeline: Timeline
     whole: Recording
-    clipped: Tensor
 
     @classmethod
     def of(cls, timeline: Timeline, gestures: Recording) -> "Strip":
@@ -169,7 +167,7 @@ class Strip:
             displacement=along(gestures.displacement),
             parameters={},
         )
-        return cls(timeline, whole, torch.zeros(timeline.length, dtype=torch.bool))
+        return cls(timeline, whole)
 
     def cut(self, starts: Tensor, window: int) -> Recording:
         """Return the windows (W, T, ...) of T = ``window`` frames that begin at ``starts`` (W,).
@@ -187,7 +185,9 @@ class Strip:
         known = {name: values[gesture] for name, values in self.timeline.movie.parameters.items()}
         known["onset"] = (self.timeline.begin[gesture] - starts).float()
         shown = {name: values.where(gesture >= 0, 0) for name, values in known.items()}
-        own = {"clipped": self.clipped[frames].any(1).float(), "share": share.float()}
+        saturated = windows(felt.saturated)
+        own = {} if saturated is None else {"clipped": saturated.flatten(1).any(1).float()}
+        own |= {"share": share.float()}
         return replace(
             whole,
             touches=replace(
@@ -196,6 +196,7 @@ class Strip:
                 valid=felt.valid[0][frames],
                 labels=labels,
                 motion=windows(felt.motion),
+                saturated=saturated,
             ),
             force=windows(whole.force),
             displacement=windows(whole.displacement),

@@ -6,11 +6,13 @@ import torch
 
 from skin.errors import InputError
 from skin.labels import TOUCH, Task
-from skin.live.engine import Engine
+from skin.live.engine import Detection, Engine
 from skin.live.verdict import Debounce, Patience
 from skin.port.frame import Frame
 from skin.recording import Touches
-from skin.signal.gate import Threshold, gates
+from skin.session.newtons import Newtons
+
+PLAIN = Newtons(np.ones(4), np.zeros(4), np.zeros(4, bool))
 
 
 class Loud:
@@ -31,16 +33,15 @@ def frame(t, values, segment=0, valid=None, **more):
     return Frame(None, t, t, values, np.ones(len(values), bool) if valid is None else valid, segment, **more)
 
 
-def engine(window=5, rate=10.0, sensors=4, task=TOUCH, **patience):
-    gate = gates(Threshold(0.5), task)
-    gate = gate.get("learned", gate["threshold"])
-    return Engine(Loud(), task, torch.zeros(sensors, 3), window, rate, gate, Patience(**patience))
+def engine(window=5, rate=10.0, sensors=4, task=TOUCH, threshold=0.5, longest=2.0, **patience):
+    detection = Detection(threshold, learned=task.gate is not None, longest=longest)
+    return Engine(Loud(), task, torch.zeros(sensors, 3), window, rate, detection, Patience(**patience))
 
 
 def play(engine, values, rate=100.0, start=0.0, segment=0):
     """Push frames and return the verdicts."""
     return [
-        engine.push(frame(start + number / rate, row, segment))
+        engine.push(frame(start + number / rate, row, segment), PLAIN)
         for number, row in enumerate(np.asarray(values))
     ]
 
@@ -48,7 +49,7 @@ def play(engine, values, rate=100.0, start=0.0, segment=0):
 def test_each_frame_repeated_gives_what_the_window_itself_gives():
     generator = torch.Generator().manual_seed(0)
     readings = torch.rand(40, 4, generator=generator)
-    subject = engine()
+    subject = engine(threshold=99.0)
     said = play(subject, readings.repeat_interleave(10, dim=0))
     for number in range(4, 40):
         window = readings[number - 4 : number + 1][None]
@@ -115,7 +116,7 @@ def test_frames_that_waited_slide_through_unasked():
     for number in range(20):
         subject.add(frame(1 + number / 100, [5.0] * 4))
     assert subject._learner.asked == asked
-    verdict = subject.push(frame(1.2, [0.0] * 4))
+    verdict = subject.push(frame(1.2, [0.0] * 4), PLAIN)
     assert verdict.chances["dangerous"] == 1
 
 
@@ -123,20 +124,24 @@ def test_masked_sensors_and_gaps_are_told():
     subject = engine()
     for number in range(60):
         valid = np.array([True, False, True, True])
-        verdict = subject.push(frame(number / 100, np.full(4, 3.0), valid=valid))
+        verdict = subject.push(frame(number / 100, np.full(4, 3.0), valid=valid), PLAIN)
     assert verdict.masked == (1,)
     assert not verdict.gap
-    verdict = subject.push(frame(0.65, np.zeros(4), lost=5, after="gap"))
+    verdict = subject.push(frame(0.65, np.zeros(4), lost=5, after="gap"), PLAIN)
     assert verdict.gap
 
 
-def test_a_restart_waits_for_a_window_and_forgets_the_alarm():
-    subject = engine()
-    play(subject, np.zeros((60, 4)))
-    assert play(subject, np.full((60, 4), 5.0), start=0.6)[-1].dangerous
-    said = play(subject, np.zeros((60, 4)), segment=1)
-    assert said[:48] == [None] * 48
-    assert not said[-1].dangerous
+def test_an_alarm_outlives_a_restart_of_the_device_until_the_contact_ends():
+    for force in (0.0, 5.0):
+        subject = engine()
+        play(subject, np.zeros((60, 4)))
+        assert play(subject, np.full((60, 4), 5.0), start=0.6)[-1].dangerous
+        said = play(subject, np.full((60, 4), force), start=1.2, segment=1)
+        if force:
+            assert all(verdict.dangerous for verdict in said)
+        else:
+            assert said[8:48] == [None] * 40
+            assert not said[-1].dangerous
 
 
 def test_labels_that_exclude_each_other_have_one_winner():

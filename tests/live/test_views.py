@@ -19,6 +19,7 @@ from skin.live.board import Board, Facts
 from skin.live.picture import Picture
 from skin.live.verdict import Verdict
 from skin.port.frame import Frame
+from skin.session.newtons import Newtons
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
 SIZE = 0.16, 0.12
@@ -26,6 +27,7 @@ AT = """
 const map = document.getElementById("map"), pen = map.getContext("2d");
 return [...pen.getImageData({} * map.width + 7, {} * map.height, 1, 1).data];
 """
+PLAIN = Newtons(np.ones(5), np.zeros(5), np.zeros(5, bool))
 PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "dangerous": True}, True, False)
 
 
@@ -50,10 +52,10 @@ def fetch(address, **headers):
 
 def test_no_peak_between_two_looks_is_missed():
     subject = board()
-    subject.show(frame(np.zeros(5)))
+    subject.show(frame(np.zeros(5)), PLAIN)
     seen = subject.look().number
     for height in (1, 7, 2):
-        subject.show(frame(height * np.eye(5)[3]))
+        subject.show(frame(height * np.eye(5)[3]), PLAIN)
     look = subject.look(seen)
     assert look.values.tolist() == [0, 0, 0, 7, 0]
     assert subject.look(look.number).values[3] == 2
@@ -110,7 +112,7 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
 
 def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     subject = board()
-    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
+    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
     subject.say(PRESSED)
     with web.served(subject, 0) as address:
         code, page = fetch(address)
@@ -165,7 +167,7 @@ def test_the_page_goes_when_the_watching_ends():
 
 def test_the_page_draws_what_it_is_sent(browser):
     subject = board()
-    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])))
+    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
     subject.say(PRESSED)
     subject.tell("99.9 Hz")
     with web.served(subject, 0) as address:

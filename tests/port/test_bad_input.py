@@ -18,6 +18,7 @@ from skin.port.opening import open_skin
 from skin.port.text import Header, encode_header, encode_line
 from skin.session.log import read
 from skin.session.recorder import record
+from skin.session.taring import Tare
 
 PATIENT = 300.0  # s: machines are busy at times
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
@@ -60,8 +61,8 @@ def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
         plug.send(encode_header(Header(n=6, bits=10)))
         plug.send(*(encode_line(row.tolist(), n, 10_000 * n) for n, row in enumerate(values)))
         frames = skin.read(800, timeout=PATIENT)
-        line = Session(skin, None, None, None).line
-    assert frames[-1].valid.tolist() == [True, False, False, False, True, True]
+        line = Session(skin, Tare(None, 0.0, 10.0), None, None).line
+    assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
     assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in line
 
 

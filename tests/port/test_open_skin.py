@@ -314,7 +314,8 @@ def test_channels_that_mean_nothing_are_masked_and_named(plug):
         frames = skin.read(800, timeout=PATIENT)
         assert skin.channels == ("ok", "dead", "stuck", "saturated", "ok", "ok")
     assert frames[100].valid.all()
-    assert frames[-1].valid.tolist() == [True, False, False, False, True, True]
+    assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
+    assert frames[-1].saturated.tolist() == [False, False, False, True, False, False]
 
 
 def test_tare_and_a_touch(plug):

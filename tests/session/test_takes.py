@@ -13,12 +13,17 @@ from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.port.frame import Frame
 from skin.session.takes import Announced, Continuous, Prompted, plan
 from skin.session.tap import Tap
+from skin.signal.resampling import Window
 
 LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}
 
 
 def frames(numbers, rate=100.0, segment=0):
     return [Frame(n, n / rate, n / rate, np.array([float(n)]), np.array([True]), segment) for n in numbers]
+
+
+def window(seconds):
+    return Window(round(10 * seconds), 10.0, 1)
 
 
 def heard(*said):
@@ -35,31 +40,35 @@ def shown(director, sequence):
 
 
 def test_an_announced_gesture_is_its_frames():
-    director = Announced(0.3, heard(Announcement(0, 10, 30, LABELS)), TOUCH)
+    director = Announced(window(0.3), heard(Announcement(0, 10, 30, LABELS)), TOUCH)
     (take,) = shown(director, frames(range(60)))
     assert [frame.seq for frame in take.frames] == list(range(10, 40))
     assert (take.labels, take.lost, take.broken) == (LABELS, 0, False)
 
 
 def test_a_window_keeps_its_place_where_its_first_frames_are_lost():
-    director = Announced(0.3, heard(Announcement(0, 10, 30, LABELS)), TOUCH)
+    director = Announced(window(0.3), heard(Announcement(0, 10, 30, LABELS)), TOUCH)
     (take,) = shown(director, frames([*range(10), *range(14, 60)]))
     assert take.begin == pytest.approx(0.1)
     assert (take.frames[0].seq, take.frames[-1].seq, take.lost) == (14, 39, 4)
 
 
 def test_a_gesture_that_was_half_over_is_none():
-    director = Announced(0.3, heard(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH)
+    director = Announced(
+        window(0.3), heard(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH
+    )
     assert [take.number for take in shown(director, frames(range(15, 70)))] == [1]
 
 
 def test_windows_that_touch_each_other_are_two():
-    director = Announced(0.1, heard(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH)
+    director = Announced(
+        window(0.1), heard(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH
+    )
     assert [take.number for take in shown(director, frames(range(25)))] == [0, 1]
 
 
 def test_a_restart_breaks_a_gesture_off():
-    director = Announced(0.3, heard(Announcement(0, 0, 30, LABELS)), TOUCH)
+    director = Announced(window(0.3), heard(Announcement(0, 0, 30, LABELS)), TOUCH)
     (take,) = shown(director, frames(range(10)) + frames(range(5), segment=1))
     assert take.broken
 
@@ -67,12 +76,13 @@ def test_a_restart_breaks_a_gesture_off():
 def test_a_label_that_is_not_announced_is_missed():
     with pytest.raises(InputError, match="no press"):
         shown(
-            Announced(0.3, heard(Announcement(0, 0, 30, {"big": 1, "dynamic": 1})), TOUCH), frames(range(3))
+            Announced(window(0.3), heard(Announcement(0, 0, 30, {"big": 1, "dynamic": 1})), TOUCH),
+            frames(range(3)),
         )
 
 
 def test_a_touch_is_always_a_touch():
-    director = Announced(0.1, heard(Announcement(0, 0, 10, LABELS)), TOUCH_OR_NOT)
+    director = Announced(window(0.1), heard(Announcement(0, 0, 10, LABELS)), TOUCH_OR_NOT)
     (take,) = shown(director, frames(range(20)))
     assert take.labels["touch"] == 1
 
@@ -87,7 +97,9 @@ def test_every_combination_once_per_repetition_in_another_order():
 
 def test_a_person_begins_skips_and_ends():
     said = []
-    director = Prompted(0.1, enumerate(plan(TOUCH.names, 1, 0)), said.append, iter(["\n", "s\n", "\n"]))
+    director = Prompted(
+        window(0.1), enumerate(plan(TOUCH.names, 1, 0)), said.append, iter(["\n", "s\n", "\n"])
+    )
     takes = []
     for frame in frames(range(2000)):
         if take := director.show(frame):
@@ -103,10 +115,10 @@ def test_a_person_begins_skips_and_ends():
 
 
 def test_windows_one_after_the_other():
-    takes = shown(Continuous(0.1, first=5), frames(range(35)))
+    takes = shown(Continuous(window(0.1), first=5), frames(range(35)))
     assert [(take.number, take.frames[0].seq) for take in takes] == [(5, 0), (6, 10), (7, 20)]
 
 
 def test_windows_that_wait_for_a_touch():
-    takes = shown(Continuous(0.1, wanted=lambda values: values[0] % 50 > 40), frames(range(120)))
+    takes = shown(Continuous(window(0.1), wanted=lambda values: values[0] % 50 > 40), frames(range(120)))
     assert [take.frames[0].seq for take in takes] == [41, 91]

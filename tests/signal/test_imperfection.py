@@ -23,14 +23,14 @@ def apply(readings: torch.Tensor, seed: int = 0, **settings):
 
 def test_a_perfect_device_says_the_truth():
     readings = torch.linspace(-3, 9, 24).view(2, 3, 4)
-    said, valid = apply(readings)
+    said, valid, _ = apply(readings)
     torch.testing.assert_close(said, readings)
     assert valid.all()
 
 
 def test_noise_and_offset_come_after_the_clip():
     """So what is said passes the clip, as in the report (2.1.4)."""
-    said, _ = apply(torch.full((400, 30, 25), 50.0), noise=0.05, offset=0.1)
+    said, *_ = apply(torch.full((400, 30, 25), 50.0), noise=0.05, offset=0.1)
     assert said.max() > 10.05
     frames, sensors = said.std(dim=(0, 1)), said.mean(dim=(0, 1)) - 10
     torch.testing.assert_close(frames, torch.full((25,), 0.05), rtol=0.05, atol=0)
@@ -38,23 +38,23 @@ def test_noise_and_offset_come_after_the_clip():
 
 
 def test_gain_comes_before_the_clip():
-    said, _ = apply(torch.full((2, 3, 1000), 50.0), gain_spread=0.05)
+    said, *_ = apply(torch.full((2, 3, 1000), 50.0), gain_spread=0.05)
     assert (said == 10).all()
-    below, _ = apply(torch.full((2, 3, 1000), 5.0), gain_spread=0.05)
+    below, *_ = apply(torch.full((2, 3, 1000), 5.0), gain_spread=0.05)
     assert 0.045 < below[0, 0].div(5).log().std() < 0.055
     assert torch.equal(below[0], below[1])
 
 
 def test_constants_belong_to_the_device_and_noise_does_not():
     idle = torch.zeros(5, 30, 25)
-    one, _ = apply(idle, offset=0.1)
+    one, *_ = apply(idle, offset=0.1)
     assert torch.equal(one[0, 0], one[4, 29])
-    other, _ = apply(idle, seed=1, offset=0.1)
+    other, *_ = apply(idle, seed=1, offset=0.1)
     assert not torch.equal(one, other)
 
 
 def test_dead_sensors_read_zero_and_are_invalid():
-    said, valid = apply(torch.full((5, 30, 25), 3.0), dead=4, offset=0.1, noise=0.05)
+    said, valid, _ = apply(torch.full((5, 30, 25), 3.0), dead=4, offset=0.1, noise=0.05)
     assert (~valid).sum(-1).eq(4).all()
     assert (said[~valid] == 0).all()
     assert (said[valid] > 2).all()
@@ -63,8 +63,8 @@ def test_dead_sensors_read_zero_and_are_invalid():
 
 def test_tare_removes_the_offset_but_for_the_noise_of_its_idle_frames():
     idle = torch.zeros(1, 1, 4000)
-    with_offset, _ = apply(idle, offset=0.1)
-    tared, _ = apply(idle, offset=0.1, noise=0.05, tare=True)
+    with_offset, *_ = apply(idle, offset=0.1)
+    tared, *_ = apply(idle, offset=0.1, noise=0.05, tare=True)
     assert with_offset.std() > 0.09
     assert abs(float(tared.std()) - 0.05 * np.sqrt(1 + 1 / 30)) < 0.003
 
@@ -72,7 +72,7 @@ def test_tare_removes_the_offset_but_for_the_noise_of_its_idle_frames():
 def test_a_device_per_gesture():
     imperfection = Imperfection(noise=0, dead=2)
     constants = imperfection.constants(25, generator(), gestures=6)
-    said, valid = imperfection.apply(torch.zeros(6, 30, 25), constants, generator(1))
+    said, valid, _ = imperfection.apply(torch.zeros(6, 30, 25), constants, generator(1))
     assert (said == said[:, :1]).all()
     assert not torch.equal(said[0], said[1])
     assert (~valid).sum(-1).eq(2).all()
@@ -90,13 +90,16 @@ def test_every_device_draws_its_own_number_of_dead_sensors():
     )
 
 
-def test_clipped_looks_at_living_sensors():
+def test_living_sensors_at_their_limit_are_saturated():
     imperfection = Imperfection(gain_spread=0, dead=1)
     constants = imperfection.constants(2, generator())
     readings = torch.zeros(3, 4, 2)
     living = int((~constants.dead).nonzero())
     readings[0, 2, living], readings[1, 2, 1 - living], readings[2, 0, living] = 11.0, 11.0, 9.9
-    assert imperfection.clipped(readings, constants).tolist() == [True, False, False]
+    said, valid, saturated = imperfection.apply(readings, constants, generator(1))
+    assert saturated.nonzero().tolist() == [[0, 2, living]]
+    assert valid[0, 2, living]
+    assert said[0, 2, living] == pytest.approx(10.0, abs=1.0)
 
 
 def test_bad_settings_are_refused():
@@ -116,7 +119,7 @@ def test_the_default_device_is_what_it_was():
     true = 8 * torch.randn(40, 30, 25, generator=torch.Generator().manual_seed(0)).abs()
     imperfection, draws, again = Imperfection(dead=2), generator(5), generator(5)
     constants = imperfection.constants(25, draws)
-    said, valid = imperfection.apply(true, constants, draws)
+    said, valid, _ = imperfection.apply(true, constants, draws)
     gain = torch.from_numpy(np.exp(0.05 * again.standard_normal(25))).float()
     offset = torch.from_numpy(0.1 * again.standard_normal(25)).float()
     dead = torch.from_numpy(again.random(25).argsort().argsort() < 2)
@@ -131,7 +134,7 @@ def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
     imperfection = Imperfection(dead=1, stuck=2, saturated=3)
     constants = imperfection.constants(25, generator())
     readings = torch.rand(2, 30, 25)
-    said, valid = imperfection.apply(readings, constants, generator(1))
+    said, valid, _ = imperfection.apply(readings, constants, generator(1))
     assert (~valid).sum(-1).eq(6).all()
     assert (said[~valid] == 0).all()
     raw = imperfection.raw(readings, constants, generator(1))
@@ -143,14 +146,14 @@ def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
 
 
 def test_drift_grows_with_time():
-    said, _ = apply(torch.zeros(1, 301, 1000), drift=0.02)
+    said, *_ = apply(torch.zeros(1, 301, 1000), drift=0.02)
     assert (said[0, 0] == 0).all()
     assert float(said[0, 300].std()) == pytest.approx(0.02 * 30, rel=0.1)
     torch.testing.assert_close(said[0, 100] * 3, said[0, 300])
 
 
 def test_a_tare_is_taken_after_the_converter():
-    said, _ = apply(torch.zeros(1, 50, 200), quantum=0.5, offset=2.0, tare=True, noise=0.01)
+    said, *_ = apply(torch.zeros(1, 50, 200), quantum=0.5, offset=2.0, tare=True, noise=0.01)
     steps = (said - said[:, :1]) / 0.5
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-4)
 
@@ -165,7 +168,7 @@ CALIBRATION = Calibration(
 def test_a_calibrated_device_is_the_real_one_whatever_the_seed():
     imperfection = Imperfection(gain_spread=3, noise=3, offset=3, dead=0, calibration=CALIBRATION)
     for seed in (0, 1):
-        said, valid = imperfection.apply(
+        said, valid, _ = imperfection.apply(
             torch.full((1, 2, 3), 10.0), imperfection.constants(3, generator(seed)), generator()
         )
         torch.testing.assert_close(said[0, 0], torch.tensor([8.1, 4.8, 0]))

@@ -1,0 +1,210 @@
+"""From the frames of a device to those of a model: the one resampler of live and recorded touches."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from skin.errors import InputError
+
+if TYPE_CHECKING:
+    from skin.port.frame import Frame
+
+__all__ = ["Resampled", "Window", "check_rate", "resample"]
+
+_SLOWER = 1.05  # a ceramic resonator may be that wrong, and a frame may be lost
+_FEW = 8  # frames from which no rate can be estimated
+_MANY = 256  # frames over which it is estimated
+
+
+class Resampled(NamedTuple):
+    """A window of a stream at the rate of a model.
+
+    Attributes:
+        values: (T, S), the largest valid value of each interval, in the unit of the frames; 0 without one.
+        valid: (T, S), bool: the interval has a valid value.
+        saturated: (T, S), bool: a valid value of the interval is at the sensor's limit.
+        gap: frames are missing in the window.
+    """
+
+    values: np.ndarray
+    valid: np.ndarray
+    saturated: np.ndarray
+    gap: bool = False
+
+
+def resample(
+    time: np.ndarray,
+    values: np.ndarray,
+    valid: np.ndarray,
+    saturated: np.ndarray,
+    end: float,
+    interval: float,
+    window: int,
+) -> Resampled:
+    """Return the maximum of each sensor over each of the ``window`` intervals before ``end``.
+
+    Invalid values do not count. An interval without frames is invalid: nothing is interpolated. Frames on the
+    edge between two intervals could fall in either: give an ``end`` halfway between two frames.
+
+    Args:
+        time: (F,), s, rising.
+        values: (F, S).
+        valid: (F, S), bool.
+        saturated: (F, S), bool.
+        end: of the window, s.
+        interval: s.
+        window: T.
+    """
+    age = np.floor((end - time) / interval)
+    inside = np.flatnonzero((age >= 0) & (age < window))
+    place = window - 1 - age[inside].astype(np.int64)
+    begins = np.searchsorted(place, np.arange(window))
+    some = np.diff(begins, append=len(place)) > 0
+    good = valid[inside]
+    highest = np.full((window, values.shape[1]), -np.inf)
+    limited = np.zeros(highest.shape, dtype=bool)
+    if some.any():
+        known = np.where(good, values[inside], -np.inf)
+        highest[some] = np.maximum.reduceat(known, begins[some], axis=0)
+        limited[some] = np.logical_or.reduceat(good & saturated[inside], begins[some], axis=0)
+    found = np.isfinite(highest)
+    return Resampled(np.where(found, highest, 0.0), found, limited)
+
+
+def check_rate(found: float, rate: float) -> None:
+    """Check that a device is fast enough for a model.
+
+    Args:
+        found: rate of the device, Hz.
+        rate: of the model, Hz.
+
+    Raises:
+        InputError: the device is slower by more than 5 %.
+    """
+    if _SLOWER * found < rate:
+        raise InputError(
+            f"the device sends {found:.3g} frames a second, the model needs {rate:g}: let the firmware send "
+            f"faster, or train a model at the device's rate, as in device.rate={found:.2g}"
+        )
+
+
+class Window:
+    """The latest frames of a stream; slides at every frame.
+
+    A faster stream is reduced by the maximum over each interval of the model. A device that is slower by up
+    to 5 % gives one frame to each interval. Another segment of the device's clock begins an empty window.
+
+    Args:
+        frames: T.
+        rate: of the model, Hz.
+        sensors: S.
+    """
+
+    def __init__(self, frames: int, rate: float, sensors: int) -> None:
+        self.frames, self.rate, self.sensors = frames, rate, sensors
+        self._clear(4 * frames)
+
+    def _clear(self, room: int) -> None:
+        self._times, self._lost = np.empty(room), np.zeros(room, dtype=np.int64)
+        self._values = np.empty((room, self.sensors))
+        self._valid, self._saturated = (np.empty((room, self.sensors), dtype=bool) for _ in range(2))
+        self._end, self._segment = 0, -1
+
+    @property
+    def period(self) -> float:
+        """Seconds from one frame of the device to the next; 0 if too few came.
+
+        The smaller of median and mean: a pause spoils the mean, frames that come in bursts spoil the median.
+        """
+        first = max(0, self._end - _MANY)
+        times, lost = self._times[first : self._end], self._lost[first : self._end]
+        if len(times) < _FEW:
+            return 0.0
+        mean = float(times[-1] - times[0]) / (len(times) - 1 + int(lost[1:].sum()))
+        median = float(np.median(np.diff(times)))
+        return min(mean, median) if median > 0 else mean
+
+    @property
+    def filled(self) -> float:
+        """How much of the window has come, from 0 to 1."""
+        if not self._end:
+            return 0.0
+        came = self._times[self._end - 1] - self._times[0]
+        return float(min(1.0, came * self.rate / self.frames))
+
+    def add(self, frame: "Frame") -> None:
+        """Add a frame."""
+        if frame.segment != self._segment:
+            self._clear(len(self._times))
+            self._segment = frame.segment
+        if self._end == len(self._times):
+            self._make_room()
+        here, self._end = self._end, self._end + 1
+        self._times[here], self._lost[here] = frame.t, max(frame.lost, int(frame.after == "gap"))
+        self._values[here], self._valid[here] = frame.values, frame.valid
+        self._saturated[here] = False if frame.saturated is None else frame.saturated
+
+    def read(self, partial: bool = False) -> Resampled | None:
+        """Return the window that ends with the latest frame; None before T intervals have come.
+
+        Args:
+            partial: do not wait for them; what has not come is invalid. None before the rate is known.
+
+        Raises:
+            InputError: the stream is slower than the model's rate.
+        """
+        period = self.period
+        if not period:
+            return None
+        check_rate(1 / period, self.rate)
+        interval, now = max(1 / self.rate, period), self._times[self._end - 1]
+        if not partial and now - self._times[0] + 1.5 * period < self.frames * interval:
+            return None
+        return self._until(now + 0.5 * period, interval)
+
+    def since(self, begin: float) -> Resampled:
+        """Return the window that began at ``begin``, s; read it before a frame behind its end is added.
+
+        It is the window that :meth:`read` returned at its last frame. Intervals without frames are invalid.
+        """
+        period = self.period or 1 / self.rate
+        interval = max(1 / self.rate, period)
+        end = begin + self.frames * interval - 0.5 * period
+        latest = self._times[self._end - 1] + 0.5 * period if self._end else end
+        # Where the last frames were lost, the window ends without them.
+        return self._until(latest if abs(latest - end) <= period else end, interval)
+
+    def _until(self, end: float, interval: float) -> Resampled:
+        times = self._times[: self._end]
+        first = int(np.searchsorted(times, end - (self.frames + 1) * interval))
+        part = slice(first, int(np.searchsorted(times, end)))
+        found = resample(
+            times[part],
+            self._values[part],
+            self._valid[part],
+            self._saturated[part],
+            end,
+            interval,
+            self.frames,
+        )
+        # A loss before the window's first frame is not in the window.
+        inside = times[part] > end - self.frames * interval
+        lost = self._lost[part][inside][1:].any()
+        ages = np.unique(np.floor((end - times[part][inside]) / interval))
+        return found._replace(gap=bool(lost) or len(ages) < self.frames)
+
+    def _make_room(self) -> None:
+        """Forget what no window will show again, and double the room if that is not half of it."""
+        since = self._times[self._end - 1] - 1.1 * _SLOWER * self.frames / self.rate
+        first = min(int(np.searchsorted(self._times[: self._end], since)), max(0, self._end - _MANY))
+        kept, segment = slice(first, self._end), self._segment
+        old = [array[kept] for array in self._arrays]
+        room, count = len(self._times), len(old[0])
+        self._clear(room if 2 * count <= room else 2 * room)
+        self._end, self._segment = count, segment
+        for target, source in zip(self._arrays, old, strict=True):
+            target[:count] = source
+
+    @property
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        return self._times, self._lost, self._values, self._valid, self._saturated

@@ -63,8 +63,8 @@ class Contact:
         if self._touched.any():
             if self.since is None:
                 idle = np.flatnonzero(~risen.any(axis=1))
-                rows = len(risen) - 1 - (idle[-1] if len(idle) else -1)
-                self.since = t - rows / self._rate
+                before = int(idle[-1]) if len(idle) else -1
+                self.since = t - (len(risen) - 2 - before) / self._rate
         else:
             self.since = None
             self._follow(readings[last], valid[last], 0.0 if self._at is None else t - self._at)

@@ -1,0 +1,143 @@
+"""Taps, held presses and slow ramps before an engine, in the time of the device: when is the alarm raised?"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from skin.device.simulated import Simulated
+from skin.emulator.gestures import alike, in_time
+from skin.errors import InputError
+from skin.live.engine import Engine
+from skin.port.frame import Frame
+from skin.session.newtons import Newtons
+from skin.streams import Stream, generator
+
+__all__ = ["COURSES", "Outcome", "played", "trials"]
+
+_IDLE = 4.0  # s without touch before each one
+_AFTER = 5.0  # s behind it
+_CLOSE = 3.0  # s after a change in which every frame is asked about
+_SPARSE = 2.0  # s from one frame that is asked about to the next otherwise
+_TAP = {"dynamic": 0, "press": 0, "dangerous": 1}
+_PRESS = {"dynamic": 0, "press": 1, "dangerous": 1}
+
+
+def _held(seconds: float, load: float = 1.0) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the load of a press (F,) at times (F,), s: full for half a second, then ``load``."""
+    return lambda t: np.interp(t, [0, 0.2, 0.5, 0.7, seconds, seconds + 0.2], [0, 1, 1, load, load, 0])
+
+
+def _ramp(seconds: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda t: np.interp(t, [0, seconds, seconds + 1, seconds + 1.2], [0, 1, 1, 0])
+
+
+COURSES: Mapping[str, Callable[[np.ndarray], np.ndarray] | None] = {
+    "tap": None,
+    "press": None,
+    "hold 1 s": _held(1.0),
+    "hold 1 s, 30 % load": _held(1.0, 0.3),
+    "hold 10 s": _held(10.0),
+    "hold 10 s, 30 % load": _held(10.0, 0.3),
+    "hold 600 s": _held(600.0),
+    "hold 600 s, 30 % load": _held(600.0, 0.3),
+    "ramp 10 s": _ramp(10.0),
+}
+"""How the load of a dangerous touch goes on over time; None: as the gesture itself does."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an engine said of one dangerous touch.
+
+    Attributes:
+        peak: largest true reading, N.
+        raised: s from the first force to the alarm; None: there was none.
+        kept: once raised, the alarm stayed until the force ended, but for readings below the contact
+            threshold.
+        cleared: s from the end of the force to the end of the alarm; None: there was none, or it stayed.
+        early: an alarm before the touch.
+    """
+
+    peak: float
+    raised: float | None
+    kept: bool
+    cleared: float | None
+    early: bool
+
+
+def trials(device: Simulated, course: str, count: int, seed: int = 0) -> Iterator[np.ndarray]:
+    """Yield the true readings (T, S), N, of dangerous touches that stand still, at the model's rate.
+
+    Args:
+        device: its gestures, which no training draws.
+        course: a name in ``COURSES``.
+        count: how many; half of them are big.
+        seed: of the gestures.
+
+    Raises:
+        InputError: there is no such course.
+    """
+    if course not in COURSES:
+        raise InputError(f"there is no course {course!r}: there are {', '.join(COURSES)}")
+    labels = _TAP if course == "tap" else _PRESS
+    names = [name for name in device.task.names if name in (*labels, "big")]
+    rows = np.array(
+        [[number % 2 if name == "big" else labels[name] for name in names] for number in range(count)]
+    )
+    profile = COURSES[course]
+    for gesture in alike(device, rows, seed):
+        if profile is None:
+            yield gesture.force
+            continue
+        strongest = gesture.force[gesture.force.sum(axis=1).argmax()]
+        time = np.arange(0.0, 2000.0, 1 / device.rate)
+        load = profile(time)
+        yield load[: np.flatnonzero(load)[-1] + 2, None] * strongest
+
+
+def played(engine: Engine, device: Simulated, force: np.ndarray, rate: float, seed: int = 0) -> Outcome:
+    """Let an engine follow a touch frame by frame.
+
+    Args:
+        engine: new, or at rest.
+        device: feels the touch with its imperfections; its baseline is known as after a tare.
+        force: true readings, (T, S), N, at the model's rate.
+        rate: of the device, Hz.
+        seed: of the noise.
+    """
+    rest = [np.zeros((round(seconds * rate), force.shape[1])) for seconds in (_IDLE, _AFTER)]
+    true = np.concatenate([rest[0], in_time(force, device.rate, rate), rest[1]])
+    noise, time = generator(Stream.NOISE, seed, Stream.TEST, 6), np.arange(len(true)) / rate
+    imperfection, constants = device.imperfection, device.constants
+    said = (
+        imperfection.raw(torch.from_numpy(true)[None].float(), constants, noise, torch.from_numpy(time))[0]
+        .double()
+        .numpy()
+    )
+    dead = constants.dead.numpy()
+    newtons = Newtons(np.ones(len(dead)), constants.offset.double().numpy(), dead)
+    touched = np.flatnonzero(true.any(axis=1))
+    begin, end = time[touched[0]], time[touched[-1]]
+    engine.tared()
+    answers: list[tuple[float, bool, bool]] = []
+    for number, (t, row) in enumerate(zip(time.tolist(), said, strict=True)):
+        frame = Frame(number, t, t, row, ~dead, seed)
+        close = any(0 <= t - change < _CLOSE for change in (0.0, begin, end - 0.5))
+        if not close and number % max(1, round(_SPARSE * rate)):
+            engine.add(frame)
+        elif (verdict := engine.push(frame, newtons)) is not None:
+            answers.append((t, verdict.dangerous, verdict.contact is not None))
+    return _outcome(answers, float(np.abs(true).max()), begin, end)
+
+
+def _outcome(answers: list[tuple[float, bool, bool]], peak: float, begin: float, end: float) -> Outcome:
+    raised = next((t for t, alarm, _ in answers if alarm and t >= begin), None)
+    early = any(alarm for t, alarm, _ in answers if t < begin)
+    if raised is None:
+        return Outcome(peak, None, True, None, early)
+    kept = all(alarm for t, alarm, contact in answers if raised <= t <= end and contact)
+    last = max(t for t, alarm, _ in answers if alarm)
+    cleared = None if last >= answers[-1][0] else max(0.0, last - end)
+    return Outcome(peak, raised - begin, kept, cleared, early)

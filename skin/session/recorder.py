@@ -11,7 +11,8 @@ from skin.errors import InputError
 from skin.port.errors import SkinDisconnected, SkinTimeout
 from skin.port.text import Header
 from skin.recording import join
-from skin.session.log import Log, read
+from skin.session.lines import locked
+from skin.session.log import Log, check, read
 from skin.session.takes import Continuous
 from skin.storage import write
 
@@ -29,7 +30,17 @@ def record(
         seconds: of the session, an unplugged skin's too; None: no limit.
         free: whatever is done counts, in windows one after the other.
         tell: says a sentence to the person.
+
+    Raises:
+        InputError: another process records to the file, or it cannot be written; what it holds is kept.
     """
+    with locked(path):
+        _record(device, path, seconds, free, tell)
+
+
+def _record(
+    device: Serial, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
+) -> None:
     skin, tap = device.open(reconnect=True)
     with skin:
         first, _, meaning = device.settle(skin)
@@ -86,11 +97,11 @@ def finish(device: Serial, path: Path) -> tuple[Path, int]:
     """Write the whole gestures of a session as a recording beside it; return it and how many there are.
 
     Raises:
-        InputError: no session, none whole, or a session of another layout.
+        InputError: no session, none whole, or a session of another layout, window or rate.
     """
     stored = read(path)
-    if stored.about.get("positions") != device.sensors.positions.tolist():
-        raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
+    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
+    check(path, stored.about, now)
     takes = [stored.takes[number] for number in sorted(stored.takes)]
     if not takes:
         raise InputError(f"{path} has {stored.frames} frames and no whole gesture: record some more")

@@ -49,14 +49,14 @@ class Log:
         self._invalid: list[int] = []
         self._segment, self._anchor = -1, 0.0
         self._meaning: str | None = None
-        header = ",".join(["time", "seq", *(f"raw_{number:02d}" for number in range(sensors))])
+        header = ",".join(["time", "seq", *(f"raw_{number:02d}" for number in range(sensors))]) + "\n"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             stored = self._resume(path, about, header)
             self._about = stored.about if stored else dict(about) | {"started_unix": time.time()}
             if stored is None:
                 write_whole(path.with_name(path.name + ".json"), json.dumps(self._about) + "\n")
-                write_whole(path, header + "\n")
+                write_whole(path, header)
         except OSError as error:
             raise InputError(f"cannot write {path}: {error.strerror}: give another out=") from error
         self._lines = Lines(path)
@@ -65,7 +65,7 @@ class Log:
 
     @staticmethod
     def _resume(path: Path, about: Mapping[str, Any], header: str) -> Stored | None:
-        """Return what is there; None if that is nothing, or no more than the beginning of a header."""
+        """Return what is there; None if that is a header at most."""
         whole = path.read_bytes() if path.exists() else b""
         if header.encode().startswith(whole):
             return None

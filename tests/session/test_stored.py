@@ -112,7 +112,9 @@ def empty(line):
 
 def inside(lines, number):
     """Return the place of a frame within a gesture."""
-    return next(n for n, line in enumerate(lines) if b'"begin"' in line and b'"number": %d' % number in line) + 4
+    return (
+        next(n for n, line in enumerate(lines) if b'"begin"' in line and b'"number": %d' % number in line) + 4
+    )
 
 
 def test_an_intact_session_has_nothing_to_warn_of(lines, stored, caplog):
@@ -121,7 +123,9 @@ def test_an_intact_session_has_nothing_to_warn_of(lines, stored, caplog):
     assert not found.warnings
     assert not caplog.records
     assert found.takes[3][1].zero.tolist() == OTHER.zero.tolist()
-    assert [one.valid.tolist() for one in found.takes[3][0].frames] == [[True, True]] * 5 + [[True, False]] * 5
+    assert [one.valid.tolist() for one in found.takes[3][0].frames] == [[True, True]] * 5 + [
+        [True, False]
+    ] * 5
 
 
 @pytest.mark.parametrize("damage", [cut, garbled, lambda line: line[:4] + b"x" + line[5:]])
@@ -213,7 +217,9 @@ def test_a_gesture_without_frames_is_left_out_and_said(lines, stored):
 
 def test_a_clock_that_stood_still_is_said(lines, stored):
     still = [re.sub(rb"^[^,]*", b"1.5", line) if line[:1] not in (b"#", b"t") else line for line in lines]
-    still = [re.sub(rb'"time": [^,]*', b'"time": 1.5', line) if b'"sum"' not in line else line for line in still]
+    still = [
+        re.sub(rb'"time": [^,]*', b'"time": 1.5', line) if b'"sum"' not in line else line for line in still
+    ]
     found = stored(still)
     assert not found.takes
     assert b'"sum"' in lines[1] or "the device's clock stood still" in found.warnings[0]

@@ -206,8 +206,8 @@ class _Reading:
             case "end":
                 self._end(int(said["number"]), int(said["lost"]))
             case "gap":
-                # After it the device's clock begins anew.
-                if said["after"] in _STARTS:
+                # After it the device's clock begins anew; a gesture may begin with the frame behind it.
+                if said["after"] in _STARTS and self._take is not None and self._take.frames:
                     self._take = None
             case "invalid":
                 self._invalid = self._channels(said["channels"])

@@ -25,12 +25,14 @@ def frame(number, segment=0, valid=(True, True), after=""):
     return Frame(number, number / 100, time.monotonic(), values, np.array(valid), segment, 0, after)
 
 
-def gesture(log, number, first, broken=False):
+def gesture(log, number, first, broken=False, after=""):
     """Record ten frames; in the middle of every third gesture a channel falls ill."""
+    segment = int(bool(after))
     take = Take(number, {"big": number % 2, "dangerous": 1}, first / 100, 0)
-    log.begin(take, frame(first))
+    log.begin(take, frame(first, segment))
     for one in range(first, first + 10):
-        log.frame(frame(one, valid=(True, number % 3 != 0 or one < first + 5)))
+        valid = (True, number % 3 != 0 or one < first + 5)
+        log.frame(frame(one, segment, valid, after if one == first else ""))
     take.broken = broken
     log.end(take)
 
@@ -45,9 +47,8 @@ def session(tmp_path_factory):
         for place, number in enumerate(numbers):
             if number == 4:
                 gesture(log, 4, 900, broken=True)
-                log.frame(frame(0, segment=1, after="reset"))
-            gesture(log, number, 20 * place)
-            log.frame(frame(20 * place + 15))
+            gesture(log, number, 20 * place, after="reset" * (number == 4))
+            log.frame(frame(20 * place + 15, segment=int(number == 4)))
         log.close()
     return path
 

@@ -1,6 +1,7 @@
 """Tables of a bench: CSV or Parquet with a header, whatever wrote them."""
 
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,16 @@ from skin.errors import InputError
 __all__ = ["load", "numbers", "save"]
 
 _KEY = b"skin_session"
+_RECORDED = b"time,seq,raw_"  # of experiments/record.py: all its columns are numbers
+_NUMBERS = b"0123456789+-.e,"
+_log = logging.getLogger("skin.session")
 
 
 def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     """Return a table and what is known about it: JSON in a Parquet schema, or in ``x.csv.json`` beside it.
 
-    Lines of a CSV that start with ``#`` are comments.
+    Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of experiments/record.py are
+    skipped, with a warning.
 
     Raises:
         InputError: no such file, another ending, unreadable, or no rows.
@@ -35,9 +40,7 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
             table = pa.parquet.read_table(path)
             about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
         else:
-            lines = path.read_text(encoding="utf-8-sig").splitlines(keepends=True)
-            text = "".join(line for line in lines if not line.startswith("#"))
-            table = pa.csv.read_csv(pa.py_buffer(text.encode()))
+            table = pa.csv.read_csv(pa.py_buffer(_rows(path)))
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
     except (OSError, pa.ArrowException, ValueError) as error:
@@ -45,6 +48,22 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     if not len(table):
         raise InputError(f"the {what} {path} has no rows below its header")
     return table.rename_columns([name.strip() for name in table.column_names]), about
+
+
+def _rows(path: Path) -> bytes:
+    """Return a CSV without comments, and without damaged lines where it is known what lines look like."""
+    lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
+    rows = [(number, line) for number, line in enumerate(lines, 1) if not line.startswith(b"#")]
+    header = rows[0][1] if rows else b""
+    if header.startswith(_RECORDED):
+        columns = header.count(b",")
+        good = [
+            row for row in rows[1:] if not row[1].translate(None, _NUMBERS) and row[1].count(b",") == columns
+        ]
+        if damaged := [number for number, _ in sorted(set(rows[1:]) - set(good))]:
+            _log.warning("%s: %d damaged lines skipped, the first is line %d", path, len(damaged), damaged[0])
+        rows = [rows[0], *good]
+    return b"".join(line + b"\n" for _, line in rows)
 
 
 def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:

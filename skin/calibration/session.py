@@ -40,8 +40,19 @@ class Session:
     def __post_init__(self) -> None:
         if self.unit not in _UNITS:
             raise InputError(f"the session's unit must be {' or '.join(_UNITS)}, got {self.unit}")
-        if len(self.time) < 2 or (np.diff(self.time) <= 0).any():
-            raise InputError("a session needs at least two frames, and time that grows from frame to frame")
+        if len(self.time) < 2:
+            raise InputError(f"a session needs at least two frames, this one has {len(self.time)}")
+        if (self.time == self.time[0]).all():
+            raise InputError(
+                f"the device's clock stood still: all {len(self.time)} frames of the session have the time "
+                f"{self.time[0]:g} s; let it send micros() and record again"
+            )
+        if (back := np.flatnonzero(~(np.diff(self.time) > 0))).size:
+            before, after = self.time[back[0] : back[0] + 2]
+            raise InputError(
+                f"the session's time must grow from frame to frame: after frame {back[0]} it goes from "
+                f"{before:.9g} to {after:.9g} s"
+            )
 
 
 def read(path: str | Path, indenter: str, radius: float, unit: str | None = None) -> Session:

@@ -45,7 +45,7 @@ class Serial(AbstractDevice):
     Args:
         body: the sheet of the model.
         layout: where its sensors are; the device must send as many values.
-        port, baudrate, format, limits, timeout, backoff: as in :func:`skin.port.opening.open_skin`.
+        port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.port.opening.open_skin`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: how many.
         seed: of the order of prompts.
@@ -79,6 +79,7 @@ class Serial(AbstractDevice):
     limits: Sequence[float | None] | None = None
     timeout: float = 10.0
     backoff: Sequence[float] = (1.0, 10.0)
+    silence: float | None = 5.0
     window: int = 30
     rate: float | None = None
     stream: bool = False
@@ -136,7 +137,7 @@ class Serial(AbstractDevice):
         tap = Tap(partial(open_wire, self.port, self.baudrate))
         limits = None if self.limits is None else tuple(self.limits)
         settings: dict[str, Any] = {"format": self.format, "limits": limits, "timeout": self.timeout}
-        settings |= {"backoff": self.backoff}
+        settings |= {"backoff": self.backoff, "silence": self.silence}
         return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **settings), tap
 
     def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
@@ -144,10 +145,16 @@ class Serial(AbstractDevice):
 
         Returns:
             all frames that came, and what values mean.
+
+        Raises:
+            InputError: no frames come, they come too slowly, or nobody knows what values mean.
         """
         assert self.rate is not None
         tare = self.taring(skin)
-        frames = settle(skin, tare, self.rate, self.tare, _say)
+        try:
+            frames = settle(skin, tare, self.rate, self.tare, _say)
+        except (SkinTimeout, SkinDisconnected) as error:
+            raise InputError(f"{self.port}: {error}") from error
         assert tare.newtons is not None
         return frames, tare.newtons
 

@@ -1,6 +1,7 @@
 """What does the device speak? Two binary frames or three lines of one field count tell."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar, Literal, NamedTuple, Protocol
@@ -13,7 +14,7 @@ from skin.port.frame import Check, FrameError
 from skin.port.order import steps
 from skin.port.text import Header, Line, parse_header, parse_line
 
-__all__ = ["Binary", "Format", "Raw", "Speech", "Text", "detect", "refusal"]
+__all__ = ["Binary", "Format", "Raw", "Speech", "Text", "clock_stands_still", "detect", "refusal"]
 
 Format = Literal["auto", "text", "binary"]
 
@@ -147,6 +148,8 @@ def detect(data: bytes, sensors: int | None, wanted: Format) -> Found:
 
 def refusal(data: bytes, found: Found, sensors: int | None) -> InputError:
     """Return why nothing can be read, with what mends it."""
+    if _still(run := _lines(data)):
+        return clock_stands_still(len(run), run[0].fields[1])
     if found.sensors is not None and sensors is not None:
         return InputError(
             f"the device sends {found.sensors} values per frame, the layout has {sensors} sensors: give its "
@@ -156,6 +159,31 @@ def refusal(data: bytes, found: Found, sensors: int | None) -> InputError:
         f"no frame in {len(data)} bytes, which begin with {data[:64].hex(' ')}: is the baud rate right, "
         "as in device.baudrate=115200? Or give the format, as in device.format=text or device.format=binary"
     )
+
+
+def clock_stands_still(frames: int, t_us: float) -> InputError:
+    """Return why frames cannot be used whose clock does not move: no window would ever fill."""
+    return InputError(
+        f"the device's clock stands still: t_us was {t_us:.0f} in all of {frames} frames; let the firmware "
+        "send micros(), or lines of values alone"
+    )
+
+
+def _still(run: Sequence[Line]) -> bool:
+    """Return whether the first column counts while the next one, which should tell the time, is constant."""
+    run = [line for line in run if len(line.fields) > 2]
+    if len(run) < _LINES_UNKNOWN or len({line.fields[1] for line in run}) > 1:
+        return False
+    return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
+
+
+def _lines(data: bytes) -> list[Line]:
+    """Return the lines of numbers; the first piece may be half a line."""
+    found = []
+    for piece in data.split(b"\n")[1:-1]:
+        with suppress(FrameError):
+            found.append(parse_line(piece.removesuffix(b"\r")))
+    return found
 
 
 def _binary_counts(data: bytes) -> list[int]:
@@ -201,7 +229,7 @@ def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> Text | None
         return Text(count, False, check)
     if sensors is not None and count == sensors + 2 and counting:
         return Text(sensors, True, check)
-    if not learn or len(run) < _LINES_UNKNOWN:
+    if not learn or len(run) < _LINES_UNKNOWN or _still(run):
         return None
     counting = _all_count(run)
     return Text(count - 2 * counting, counting, check)

@@ -3,12 +3,14 @@
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from math import inf
 from time import monotonic, sleep
 from typing import Protocol
 
 import numpy as np
 
 from skin.port.decoder import Decoder
+from skin.port.detect import clock_stands_still
 from skin.port.frame import After, Frame
 from skin.port.health import Health, Limits, State
 from skin.port.wire import ByteStream
@@ -21,6 +23,7 @@ _log = logging.getLogger("skin.port")
 
 _WAIT = 0.1  # s
 _AT_ONCE = 256  # frames, where time does not matter
+_STILL = 2.0, 10  # s and frames: a device's clock that is the same for as long stands still
 _WEAK = {
     "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
     "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
@@ -47,27 +50,49 @@ class Feed(Protocol):
 
 
 class Wire:
-    """Frames from bytes, their channels judged; says in the log once a second what was wrong."""
+    """Frames from bytes, their channels judged; says in the log once a second what was wrong.
+
+    Args:
+        stream: of bytes.
+        decoder: turns them into frames.
+        limits: smallest and largest value of a channel.
+        silence: s without a byte after which the stream counts as gone.
+    """
 
     patient = False
 
     def __init__(
-        self, stream: ByteStream, decoder: Decoder, limits: Limits | None, health: Health | None = None
+        self,
+        stream: ByteStream,
+        decoder: Decoder,
+        limits: Limits | None,
+        silence: float = inf,
+        health: Health | None = None,
     ) -> None:
         self._stream, self._decoder, self._limits = stream, decoder, limits
         self._health = health or Health()
         self._told = False
         self._said = Counter(decoder.counters.bad)
-        self._said_at = monotonic()
+        self._said_at = self._heard_at = monotonic()
+        self._silence = silence
+        self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
 
     def poll(self) -> list[Frame]:
-        """Return the frames that ended in what came; InputError if nothing can be read at all."""
+        """Return the frames that ended in what came; InputError if nothing can be read at all, OSError if
+        nothing came for too long.
+        """
         data, now = self._stream.read(), monotonic()
+        if data:
+            self._heard_at = now
+        elif now - self._heard_at >= self._silence:
+            raise TimeoutError(f"nothing came for {self._silence:g} s")
         frames = self._decoder.feed(data, now) if data else []
         if frames:
             self._prepare()
         elif data and not frames and (refusal := self._decoder.refusal()):
             raise refusal
+        if frames:
+            self._check_clock(frames, now)
         if now - self._said_at >= 1:
             self._say(now)
         return [self._judged(frame) for frame in frames]
@@ -90,6 +115,15 @@ class Wire:
             self._health.limits = self._limits
         elif header is not None and header.bits:
             self._health.limits = (None, 2**header.bits - 1)
+
+    def _check_clock(self, frames: list[Frame], now: float) -> None:
+        """Raise InputError where frames come and the device's clock does not move."""
+        if frames[-1].t != self._clock:
+            self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
+        self._clock_frames += len(frames)
+        least, few = _STILL
+        if now - self._clock_since >= least and self._clock_frames >= few:
+            raise clock_stands_still(self._clock_frames, self._clock * 1e6)
 
     def _judged(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):

@@ -83,17 +83,21 @@ class Skin:
         """Yield frames as they come, to the end of a recording.
 
         Raises:
-            SkinTimeout: none came within the timeout the skin was opened with, while it was plugged in.
+            SkinTimeout: none came within the timeout the skin was opened with, though it was plugged in all
+                the time.
             SkinDisconnected: it was unplugged and is not tried again.
         """
         while True:
+            back = self._reader.reconnects
             frame = next(self._reader.take(1, self._timeout), None)
             if frame is not None:
                 self._taken += 1
                 yield frame
             elif isinstance(self._reader.error, EOFError):
                 return
-            elif not self._reader.away:
+            elif self._reader.error is not None or (
+                not self._reader.away and self._reader.reconnects == back
+            ):
                 self._explain(1, self._timeout, [])
 
     def read(self, count: int, timeout: float | None = None) -> list[Frame]:

@@ -40,6 +40,9 @@ class Settings:
         queue: frames that are kept for whoever is late.
         reconnect: wait for an unplugged skin; its first frame has ``after="reconnect"``.
         backoff: s before the first attempt to reconnect, and the longest between two.
+        silence: s without a byte after which a socket is closed and opened again, if ``reconnect``; None or
+            0: never. A computer that lost its power cannot say that it is gone. Serial ports are left open:
+            the system tells when one is unplugged, and opening one restarts many boards.
         realtime: False plays a recording or the simulator as fast as frames are taken.
 
     Raises:
@@ -53,6 +56,7 @@ class Settings:
     queue: int = 4096
     reconnect: bool = False
     backoff: tuple[float, float] = (1.0, 10.0)
+    silence: float | None = 5.0
     realtime: bool = True
 
     def __post_init__(self) -> None:
@@ -65,6 +69,8 @@ class Settings:
             raise InputError(f"device.limits must be [smallest, largest], got {list(self.limits)}")
         if len(self.backoff) != 2 or not 0 < self.backoff[0] <= self.backoff[1] < inf:
             raise InputError(f"device.backoff must be [first, longest] in s, got {list(self.backoff)}")
+        if self.silence is not None and not 0 <= self.silence < inf:
+            raise InputError(f"device.silence must be in s, or 0 for never, got {self.silence}")
 
 
 def open_skin(
@@ -98,7 +104,9 @@ def open_skin(
         connect = _player(_recorded(port, sensors, chosen.realtime))
     else:
         decoder = Decoder(sensors, chosen.format)
-        connect = _wire(opener or partial(open_wire, port, chosen.baudrate), decoder, chosen.limits)
+        watched = chosen.reconnect and port.startswith("socket://")
+        silence = (chosen.silence if watched else None) or inf
+        connect = _wire(opener or partial(open_wire, port, chosen.baudrate), decoder, chosen.limits, silence)
     try:
         reader = Reader(connect, chosen.queue, chosen.reconnect, chosen.backoff)
     except OSError as error:
@@ -106,7 +114,9 @@ def open_skin(
     return Skin(reader, decoder, chosen.timeout, baseline)
 
 
-def _wire(opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None) -> Callable[[], Feed]:
+def _wire(
+    opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float
+) -> Callable[[], Feed]:
     """Return what connects; from the second time on the decoder begins anew.
 
     What channels can send stays known: a cable may come loose under a press that drives them to their limit.
@@ -118,7 +128,7 @@ def _wire(opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | N
         if next(connections):
             decoder.restart()
             health.restart()
-        return Wire(stream, decoder, limits, health)
+        return Wire(stream, decoder, limits, silence, health)
 
     return connect
 

@@ -28,7 +28,7 @@ class Reader:
         connect: opens the source; called anew after an unplugged cable.
         queue: how many frames are kept at most.
         reconnect: try again when the source is gone.
-        backoff: s before the first attempt, and the longest between two; it doubles.
+        backoff: s before the first attempt, and the longest between two; it doubles until frames come.
 
     Attributes:
         dropped: frames that nobody took in time.
@@ -41,6 +41,7 @@ class Reader:
         self, connect: Callable[[], Feed], queue: int, reconnect: bool, backoff: tuple[float, float]
     ) -> None:
         self._connect, self._reconnect, self._backoff = connect, reconnect, backoff
+        self._wait = backoff[0]
         self.dropped = self.reconnects = 0
         self.away = False
         self.error: Exception | None = None
@@ -100,19 +101,19 @@ class Reader:
                 self.feed.close()
             if not self._reconnect:
                 raise SkinDisconnected(f"the skin was unplugged: {error}") from error
-            _log.warning("the skin was unplugged; trying again")
+            _log.warning("the skin was unplugged (%s); trying again", error)
             self._again()
             return
         if frames:
+            self._wait = self._backoff[0]
             self._push(frames)
             if not self.feed.patient:
                 self._stop.wait(_PAUSE)
 
     def _again(self) -> None:
-        wait, longest = self._backoff
         self.away = True
-        while not self._stop.wait(wait):
-            wait = min(2 * wait, longest)
+        while not self._stop.wait(self._wait):
+            self._wait = min(2 * self._wait, self._backoff[1])
             with suppress(OSError, InputError):
                 self.feed = self._connect()
                 self.reconnects += 1

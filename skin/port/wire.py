@@ -18,6 +18,8 @@ __all__ = ["ByteStream", "open_wire"]
 
 _WAIT = 0.1  # s
 _CONNECT = 5.0  # s
+# Who only reads never notices that the other side lost its power; by default the system asks after two hours.
+_KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, attempts
 _MOST = 65536  # bytes at once
 
 
@@ -74,12 +76,17 @@ class _Socket:
         except OSError as error:
             raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._socket.settimeout(_WAIT)
 
     def read(self) -> bytes:
         try:
             data = self._socket.recv(_MOST)
-        except TimeoutError:
+        except TimeoutError as error:
+            if error.errno is not None:  # ETIMEDOUT: nobody answers to keepalive
+                raise
             return b""
         if not data:
             raise ConnectionResetError("the other side closed the connection")

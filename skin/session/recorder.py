@@ -1,6 +1,7 @@
 """Records a session gesture by gesture, and makes a recording of it."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,11 +12,15 @@ from skin.errors import InputError
 from skin.port.errors import SkinDisconnected, SkinTimeout
 from skin.port.text import Header
 from skin.recording import join
-from skin.session.log import Log, read
-from skin.session.takes import Continuous
+from skin.session.lines import locked
+from skin.session.log import Log, Stored, check, read
+from skin.session.newtons import Newtons
+from skin.session.takes import Continuous, Take
 from skin.storage import write
 
 __all__ = ["finish", "record"]
+
+_log = logging.getLogger("skin.session")
 
 
 def record(
@@ -29,7 +34,17 @@ def record(
         seconds: of the session, an unplugged skin's too; None: no limit.
         free: whatever is done counts, in windows one after the other.
         tell: says a sentence to the person.
+
+    Raises:
+        InputError: another process records to the file, or it cannot be written; what it holds is kept.
     """
+    with locked(path):
+        _record(device, path, seconds, free, tell)
+
+
+def _record(
+    device: Serial, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
+) -> None:
     skin, tap = device.open(reconnect=True)
     with skin:
         first, meaning = device.settle(skin)
@@ -86,14 +101,42 @@ def finish(device: Serial, path: Path) -> tuple[Path, int]:
     """Write the whole gestures of a session as a recording beside it; return it and how many there are.
 
     Raises:
-        InputError: no session, none whole, or a session of another layout.
+        InputError: no session, none whole, or a session of another layout, window, rate or labels.
     """
     stored = read(path)
-    if stored.about.get("positions") != device.sensors.positions.tolist():
-        raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
-    takes = [stored.takes[number] for number in sorted(stored.takes)]
-    if not takes:
-        raise InputError(f"{path} has {stored.frames} frames and no whole gesture: record some more")
+    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
+    check(path, stored.about, now)
+    takes = _alike(device.task.names, path, stored)
     whole = join([device.stored([take], meaning) for take, meaning in takes])
     about = stored.about | {"source": "session", "session": path.name, "lost": [one.lost for one, _ in takes]}
     return write(replace(whole, metadata=about), path.with_suffix(".parquet")), len(takes)
+
+
+def _alike(names: Sequence[str], path: Path, stored: Stored) -> list[tuple[Take, Newtons]]:
+    """Return the whole gestures that have the labels, or all that have none where none has some."""
+    takes = [stored.takes[number] for number in sorted(stored.takes)]
+    if not takes:
+        raise InputError(
+            "; ".join(
+                [
+                    f"{path} has {stored.frames} frames and no whole gesture: record some more",
+                    *stored.warnings,
+                ]
+            )
+        )
+    free = [(take, meaning) for take, meaning in takes if take.labels is None]
+    labelled = [
+        (replace(take, labels={name: take.labels[name] for name in names}), meaning)
+        for take, meaning in takes
+        if take.labels is not None and set(take.labels) == set(names)
+    ]
+    kept = labelled or free
+    if not kept:
+        found = takes[0][0].labels or {}
+        raise InputError(
+            f"{path} has the labels {', '.join(found)}, the configuration has {', '.join(names)}: give "
+            f"data.stream={str('touch' in found).lower()}"
+        )
+    if others := len(takes) - len(kept):
+        _log.warning("%s: %d gestures without these labels left out", path, others)
+    return kept

@@ -105,7 +105,7 @@ def test_the_press_of_the_report(tmp_path, indenter):
     calibrated = Imperfection(noise=0, calibration=found)
     constants = calibrated.constants(6, np.random.default_rng(0))._replace(noise=torch.zeros(()))
     true = torch.from_numpy(40 * each).float()[None, None]
-    said, _ = calibrated.apply(true, constants, np.random.default_rng(0))
+    said, *_ = calibrated.apply(true, constants, np.random.default_rng(0))
     assert said[0, 0, sensor] - found.values()["offset"][sensor] == pytest.approx(2.0, rel=0.1)
 
 

@@ -93,13 +93,33 @@ def test_a_log_of_a_microcontroller_is_a_session(tmp_path):
     assert found.gauge is None
 
 
+def test_a_recorded_session_is_read_without_its_damaged_lines(tmp_path, caplog):
+    path = tmp_path / "s.csv"
+    frames = [b"%.2f,%d,5,%d" % (number / 100, number, number % 9) for number in range(100)]
+    for number, damage in (
+        (10, b"0.1\xff,10,5,1"),
+        (20, b"0.20,2"),
+        (30, b"0.30,30,5,x"),
+        (40, b"\0" * 4096),
+    ):
+        frames[number] = damage
+    path.write_bytes(b"\n".join([b"time,seq,raw_00,raw_01", b"# {\xff", *frames, b"\0" * 99]))
+    found = session.read(path, "disc", 0.01, "adc")
+    assert len(found.time) == 96
+    np.testing.assert_array_equal(found.raw[10], [5, 2])
+    assert caplog.messages == [f"{path}: 5 damaged lines skipped, the first is line 13"]
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("time,a\n", "no rows"),
         ("time\n1\n2\n", "no column of a sensor"),
         ("a,b\n1,2\n3,4\n", "no column time"),
-        ("time,a\n1,2\n1,3\n", "time that grows"),
+        ("time,a\n1,2\n", "at least two frames, this one has 1"),
+        ("time,a\n1,2\n1,3\n", "clock stood still: all 2 frames of the session have the time 1 s"),
+        ("t_us,a\n5,2\n5,3\n5,2\n", "clock stood still: all 3 frames of the session have the time 5e-06 s"),
+        ("time,a\n1,2\n2,2\n1.5,3\n", "after frame 1 it goes from 2 to 1.5 s"),
         ("time,a\n1,2\n1,2,3\n", "cannot read"),
     ],
 )

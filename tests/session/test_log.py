@@ -132,7 +132,7 @@ def test_gaps_and_bad_channels_are_told(tmp_path):
 
 def test_another_layout_is_refused(tmp_path):
     recorded(tmp_path / "x.csv", 0).close()
-    with pytest.raises(InputError, match="another positions"):
+    with pytest.raises(InputError, match="another layout"):
         Log(tmp_path / "x.csv", ABOUT | {"positions": [[1.0, 0.0, 0.0]] * 2}, 2)
 
 
@@ -151,5 +151,5 @@ def test_another_file_is_refused(tmp_path, text):
         read(path)
     path.write_text(text)
     path.with_name("x.csv.json").write_text("{}")
-    with pytest.raises(InputError, match=r"damaged or no session"):
+    with pytest.raises(InputError, match=r"damaged or no session's: it has no positions"):
         read(path)

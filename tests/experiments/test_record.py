@@ -1,0 +1,211 @@
+"""Recording goes wrong: the person reads one sentence, and nothing that was recorded is lost."""
+
+import re
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+from itertools import count
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+
+pytest.importorskip("fcntl", reason="file limits need a POSIX system")
+
+from skin.config import ROOT
+from skin.port.text import Header, encode_header, encode_line
+from skin.session.lines import locked
+from skin.session.log import read as read_session
+from skin.storage import read
+
+SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
+FREE = [*SKIN, "record.free=true", "device.tare=1", "device.backoff=[0.05,0.1]"]
+PACE = 0.001  # s of the wall for 10 ms of the device
+
+
+@contextmanager
+def skin(*lives):
+    """Serve a skin at 100 Hz, in N, to one reader after the other; give its address.
+
+    A life is what the skin is like in a connection: ``frames`` after which it falls silent without closing,
+    its ``sensors``, and ``period`` of its clock. The last one is that of all further connections.
+    """
+    server, stop, peers = socket.create_server(("127.0.0.1", 0)), Event(), []
+
+    def serve():
+        rng = np.random.default_rng(0)
+        for number in count():
+            try:
+                peers.append(server.accept()[0])
+                if stop.is_set():
+                    return
+                life = {"frames": 10**9, "sensors": 4, "period": 10_000} | lives[min(number, len(lives) - 1)]
+                if life["frames"]:
+                    peers[-1].sendall(encode_header(Header(n=life["sensors"], rate=100.0, unit="N")))
+                for seq in range(life["frames"]):
+                    values = rng.normal(scale=0.02, size=life["sensors"]).round(4)
+                    peers[-1].sendall(encode_line(values, seq, life["period"] * seq))
+                    if stop.wait(PACE):
+                        return
+            except OSError:
+                continue
+
+    thread = Thread(target=serve, daemon=True)
+    thread.start()
+    yield f"device.port=socket://127.0.0.1:{server.getsockname()[1]}"
+    stop.set()
+    # It waits in accept() otherwise.
+    socket.create_connection(server.getsockname()).close()
+    thread.join(60)
+    server.close()
+    for peer in peers:
+        peer.close()
+
+
+@pytest.fixture
+def record(run, tmp_path):
+    """Run record.py in a folder of its own."""
+    return lambda *arguments: run(tmp_path, "record.py", "out=s.csv", *arguments, store=False)
+
+
+@pytest.fixture(scope="module")
+def once(run, tmp_path_factory):
+    """Record a few gestures; give the folder."""
+    folder = tmp_path_factory.mktemp("once")
+    with skin({}) as port:
+        done = run(folder, "record.py", "out=s.csv", *FREE, port, "seconds=6", store=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture
+def recorded(once, tmp_path):
+    """Return the path of a session of a few gestures, with nothing made of it."""
+    for name in ("s.csv", "s.csv.json"):
+        shutil.copy(once / name, tmp_path)
+    return tmp_path / "s.csv"
+
+
+def refused(done, reason):
+    """Check that a command ended with 2 and one sentence; what it asks of the person stands before."""
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert re.search(reason, done.stderr.splitlines()[-1]), done.stderr
+
+
+def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, starter, tmp_path):
+    path, whole = tmp_path / "s.csv", resource.prlimit(starter.pid, resource.RLIMIT_FSIZE)
+    with skin({}) as port:
+        resource.prlimit(starter.pid, resource.RLIMIT_FSIZE, (20_001, whole[1]))
+        try:
+            refused(
+                record(*FREE, port, "seconds=60"), r"^cannot write s\.csv: File too large; what it holds is"
+            )
+        finally:
+            resource.prlimit(starter.pid, resource.RLIMIT_FSIZE, whole)
+        before = path.read_bytes()
+        assert 19_800 < len(before) <= 20_001
+        assert before.endswith(b"\n")
+        done = len(read_session(path).takes)
+        assert done >= 2
+        assert not (tmp_path / "s.parquet").exists()
+        again = record(*FREE, port, "seconds=3")
+    assert again.returncode == 0, again.stderr
+    assert f"s.csv has {done} gestures: going on" in again.stderr
+    assert path.read_bytes().startswith(before)
+    assert len(read(tmp_path / "s.parquet")) > done
+
+
+def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
+    with locked(tmp_path / "s.csv"), skin({}) as port:
+        refused(
+            record(*FREE, port), r"^s\.csv is being recorded by another process: end that, or give another"
+        )
+    assert not (tmp_path / "s.csv").exists()
+
+
+@pytest.mark.slow
+def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, tmp_path):
+    with skin({}) as port:
+        command = [sys.executable, ROOT / "experiments" / "record.py", "out=s.csv", *FREE, port]
+        with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as first:
+            for line in first.stderr:
+                if line.startswith("2 of"):
+                    break
+            refused(record(*FREE, port), "being recorded by another process")
+            first.send_signal(signal.SIGKILL)
+            first.communicate(timeout=60)
+    with skin({}) as port:
+        done = record(*FREE, port, "seconds=3")
+    assert done.returncode == 0, done.stderr
+    assert "going on" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            "touch.window=7",
+            "windows of 5 frames at 10 Hz, the configuration has 7 at 10 Hz: give touch.window=5 ",
+        ),
+        ("device.rate=5", "5 frames at 10 Hz, the configuration has 5 at 5 Hz: give .* device.rate=10$"),
+    ],
+)
+def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, recorded, change, reason):
+    before = recorded.read_bytes()
+    refused(record(*SKIN, change, "record.finish=true"), reason)
+    with skin({}) as port:
+        refused(record(*FREE, change, port, "device.tare=2", "seconds=6"), reason)
+    assert recorded.read_bytes() == before
+    assert not recorded.with_suffix(".parquet").exists()
+
+
+def test_damaged_lines_are_skipped_and_named(record, recorded):
+    lines, whole = recorded.read_bytes().split(b"\n"), len(read_session(recorded).takes)
+    begins = [place for place, line in enumerate(lines) if b'"event": "begin"' in line]
+    lines[begins[1] + 5] = b"\xff" + lines[begins[1] + 5]
+    lines[begins[2]] = lines[begins[2]][:30]
+    recorded.write_bytes(b"\n".join(lines) + b"\0" * 4096 + b"\n")
+    done = record(*SKIN, "record.finish=true")
+    assert (done.returncode, done.stdout) == (0, f"s.parquet: {whole - 1} gestures\n"), done.stderr
+    named = f"{begins[1] + 6}, {begins[2] + 1}, {len(lines)}"
+    assert done.stderr.splitlines()[0] == f"s.csv: 3 damaged lines skipped: {named}"
+    assert read(recorded.with_suffix(".parquet")).metadata["lost"][1] == 1
+
+
+def test_a_half_open_socket_is_opened_anew(record, tmp_path):
+    with skin({"frames": 400}, {}) as port:
+        done = record(*FREE, port, "seconds=8", "device.silence=0.5")
+    assert done.returncode == 0, done.stderr
+    assert "the skin was unplugged (nothing came for 0.5 s); trying again" in done.stderr
+    text = (tmp_path / "s.csv").read_text()
+    assert text.count('"event": "gap", "after": "reconnect"') == 1
+    whole = len(read(tmp_path / "s.parquet"))
+    assert text.count('"event": "end"') == whole >= 8
+
+
+@pytest.mark.parametrize(
+    ("lives", "reason"),
+    [
+        ([{"frames": 0}], r"^socket://\S+: 0 of 1 frames came within 1 s: port open, nothing received"),
+        ([{"period": 0}], "the device's clock stands still: t_us was 0 in all of"),
+        ([{"frames": 400}, {"sensors": 3}], "sends 3 values per frame, the layout has 4 sensors"),
+    ],
+)
+def test_what_cannot_be_recorded_is_one_sentence(record, tmp_path, lives, reason):
+    with skin(*lives) as port:
+        refused(record(*FREE, port, "seconds=30", "device.timeout=1", "device.silence=0.3"), reason)
+    assert not (tmp_path / "s.parquet").exists()
+    if (tmp_path / "s.csv").exists():
+        assert not read_session(tmp_path / "s.csv").warnings
+
+
+def test_a_silence_that_is_none_is_refused(record):
+    refused(
+        record(*FREE, "device.port=socket://127.0.0.1:1", "device.silence=-1"),
+        r"device\.silence must be in s",
+    )

@@ -89,7 +89,7 @@ def _line(result: tuple[Law, Outcome]) -> str:
     law, outcome = result
     worst = max(
         outcome.findings,
-        key=lambda one: max(one.error, _rounding(one)) / one.tolerance if one.error == one.error else math.inf,
+        key=lambda one: math.inf if math.isnan(one.error) else max(one.error, _rounding(one)) / one.tolerance,
     )
     verdict = "holds" if all(one.ok for one in outcome.findings) else "**fails**"
     return (

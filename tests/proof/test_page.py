@@ -57,7 +57,7 @@ def test_the_page_is_the_same_where_rounding_differs():
         single = compared("single", 66867.31 * (1 + 1e-7 * noise), 66867.31, 1e-6)
         nothing = compared("nothing", 1e-14 * noise, 0.0, 1e-10)
         real = compared("real", 0.98361523 * (1 + 1e-9 * noise), 0.98768812, 0.05)
-        return page([(LAW, Outcome([exact, nothing])), (LAW, Outcome([exact, single])), (LAW, Outcome([real]))])
+        return page([(LAW, Outcome(found)) for found in ([exact, nothing], [exact, single], [real])])
 
     text = written(0.0)
     assert all(written(noise) == text for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))

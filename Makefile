@@ -6,9 +6,15 @@ READY := $(VENV)/.ready
 BUDGET ?= full
 SEEDS ?= 1
 PEERS := .venv-peers
+TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile -rs
+# Each rounds sums of floating-point numbers in its own way; the first is the suite's default.
+ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
+	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
+NUMERICAL := $(addprefix tests/,body calibration contact embedding evaluation fusion layout learner model proof \
+	representation session signal simulator test_classifier.py test_labels.py test_material.py touch)
 
 .DEFAULT_GOAL := help
-.PHONY: help install test check bench physics peers ui reproduce-table clean
+.PHONY: help install test roundings slow check bench physics peers ui reproduce-table clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -21,8 +27,16 @@ $(READY): pyproject.toml constraints.txt
 
 install: $(READY)  ## build .venv; the other targets call it
 
-test: $(READY)  ## the test suite
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+test: $(READY)  ## the test suite; says which tests were skipped and why
+	$(TEST)
+
+roundings: $(READY)  ## the numerical tests (TESTS=tests: all) under settings that round differently
+	@failed=; for setting in $(ROUNDINGS); do \
+		echo "== $$setting"; env $$setting $(TEST) $(or $(TESTS),$(NUMERICAL)) || failed="$$failed $$setting"; \
+	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
+
+slow: $(PEERS)/.ready  ## the test suite under all of these settings, with the real peers
+	$(MAKE) roundings TESTS=tests
 
 check: $(READY)  ## lint, format and types
 	$(BIN)/ruff check .

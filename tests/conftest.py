@@ -3,8 +3,10 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 
 # Where tests run in the background Ctrl-C may be ignored, and commands that they start would inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -14,7 +16,9 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from time import monotonic, sleep
 
 import pytest
 import torch
@@ -35,6 +39,48 @@ def own_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SKIN_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_thread_survives():
+    """Fail where a thread that the tests of a file started goes on after them."""
+    before = set(threading.enumerate())
+    yield
+    deadline = monotonic() + 10
+    while left := [thread for thread in threading.enumerate() if thread not in before]:
+        if monotonic() > deadline:
+            pytest.fail(f"still running: {left}")
+        sleep(0.01)
+
+
+@pytest.fixture
+def played() -> Iterator[Callable[[Callable[[socket.socket, threading.Event], None]], str]]:
+    """Return a function that serves one reader after the other with ``say(reader, stop)`` at an address."""
+    running = []
+
+    def begin(say: Callable[[socket.socket, threading.Event], None]) -> str:
+        server, stop = socket.create_server(("127.0.0.1", 0)), threading.Event()
+
+        def serve() -> None:
+            while not stop.is_set():
+                with suppress(OSError):
+                    reader, _ = server.accept()
+                    with reader:
+                        if not stop.is_set():
+                            say(reader, stop)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        running.append((server, stop, thread))
+        return f"socket://127.0.0.1:{server.getsockname()[1]}"
+
+    yield begin
+    for server, stop, thread in running:
+        stop.set()
+        # To close it would not wake a thread that waits in accept().
+        with suppress(OSError), socket.create_connection(server.getsockname(), timeout=5):
+            thread.join(20)
+        server.close()
 
 
 @pytest.fixture(scope="session")

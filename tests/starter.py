@@ -1,14 +1,16 @@
 """Runs commands, each in a fork of a process that has imported the heavy libraries once.
 
 A line of standard input is a job, the answering line its exit code. A job has a process of its own, with its
-own folder, environment, output and end, as one that a shell starts; only imports are shared. Where there is
-no fork (Windows), or none that libraries bear (macOS), it is started anew.
+own folder, environment, output and end, as one that a shell starts; only imports are shared, and the empty
+database that MLflow takes seconds to make. Where there is no fork (Windows), or none that libraries bear
+(macOS), it is started anew.
 """
 
 import gc
 import json
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -38,6 +40,7 @@ def main() -> None:
             print(_started(json.loads(line)), flush=True)
         return
     made = _warm()
+    _share_database(Path(os.environ["SKIN_CACHE"]) / "empty.db")
     assert threading.active_count() == 1, "a fork keeps one thread"
     gc.freeze()  # else every fork would copy what it never changes
     for line in sys.stdin:
@@ -54,6 +57,27 @@ def _warm() -> dict[str, str]:
     for name in WARM:
         import_module(name)
     return {name: value for name, value in os.environ.items() if before.get(name) != value}
+
+
+def _share_database(empty: Path) -> None:
+    """Let a store that does not exist yet begin as a copy of an empty one."""
+    from mlflow import MlflowClient
+
+    from skin.tracking import Store
+
+    if (child := os.fork()) == 0:  # which takes its connections with it
+        MlflowClient(f"sqlite:///{empty}").search_experiments()
+        os._exit(0)
+    os.waitpid(child, 0)
+    as_it_is = Store.open
+
+    def opened(settings: Any) -> Store:
+        path = Path((settings.uri or "").removeprefix("sqlite:///"))
+        if settings.uri and empty.exists() and path.parent.is_dir() and not path.exists():
+            shutil.copy(empty, path)
+        return as_it_is(settings)
+
+    Store.open = opened  # type: ignore[method-assign, assignment]
 
 
 def _become(job: dict[str, Any], made: dict[str, str]) -> None:

@@ -13,8 +13,10 @@ from skin.labels import measure
 
 __all__ = ["Found", "seek"]
 
-# A peak is met when it is this near to what is wanted.
+# A peak is met when it is this near to what is wanted; an end of its range must be met better than any other
+# before the draw is given up there, so that it does not matter from which side the search has come.
 _NEAR = 1.03
+_END = 1.0003
 _STEPS = 24
 
 
@@ -127,11 +129,13 @@ class _Search:
         """
         target, least, most = self.target[rows], self.least[rows], self.most[rows]
         up, down = ((wrong & side).any(1) for side in (self.wanted[rows], ~self.wanted[rows]))
-        met = np.abs(np.log(highest / target)) < np.log(_NEAR)
+        away = np.abs(np.log(highest / target))
+        met = away < np.log(_NEAR)
         done = met & ~up & ~down
         self.result[rows[done]] = self.load[rows[done]]
         # Nothing is left to try: both ways at once, or already at the end.
-        over = met & ((up & down) | (up & (target >= most)) | (down & (target <= least)))
+        at_end = (away < np.log(_END)) & ((up & (target >= most)) | (down & (target <= least)))
+        over = met & up & down | at_end
         self.area[rows[over]] = wrong[over, 0]
         self.failed[rows[lost]] = True
         for side, end in ((met & up, most), (met & down, least)):

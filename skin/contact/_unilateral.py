@@ -9,6 +9,8 @@ __all__ = ["Equilibrium", "solve"]
 
 # Problems solved at once: their vectors then stay in the cache.
 _PART = 256
+# Errors under pressure this much smaller than the tolerance are rounding: no direction is taken from them.
+_REST = 0.1
 
 
 class Equilibrium(NamedTuple):
@@ -41,7 +43,9 @@ def solve(
 
     The method is that of Polonsky and Keer (Wear 231, 1999): conjugate gradients in the cells in contact;
     pressures that turn negative leave, cells that overlap join and restart the directions. Every iteration is
-    one or two products of all pressures with C. Problems that are solved leave the batch.
+    one or two products of all pressures with C. Problems that are solved leave the batch. Where the cells in
+    contact are at rest and only others overlap, as under symmetric objects, there is no direction: what is
+    left of their errors is rounding, which differs from one processor to the next, or exactly 0.
 
     Args:
         compliance: C (N, N), m/Pa, symmetric and positive definite; its dtype is that of the solution.
@@ -78,7 +82,7 @@ def _solve_part(
     found = Equilibrium(
         torch.zeros_like(gap), torch.full_like(total, torch.inf), torch.zeros(len(gap), dtype=torch.long)
     )
-    state = _State(compliance, gap, total, start)
+    state = _State(compliance, gap, total, start, _REST * tolerance)
     rows = torch.arange(len(gap))
     for step in range(iterations + 1):
         residual = state.residual()
@@ -100,8 +104,11 @@ def _solve_part(
 class _State:
     """The problems still to be solved, one per row."""
 
-    def __init__(self, compliance: Tensor, gap: Tensor, total: Tensor, start: Tensor | None) -> None:
+    def __init__(
+        self, compliance: Tensor, gap: Tensor, total: Tensor, start: Tensor | None, rest: float
+    ) -> None:
         self.compliance = compliance
+        self.rest = rest  # share of the largest deflection
         self.total = total
         self.allowed = gap.isfinite()
         self.gap = gap.where(self.allowed, 0)
@@ -134,22 +141,25 @@ class _State:
     def keep(self, rows: Tensor) -> None:
         """Forget the other problems."""
         for name, value in vars(self).items():
-            if name != "compliance":
+            if isinstance(value, Tensor) and name != "compliance":
                 setattr(self, name, value[rows])
 
     def step(self) -> None:
         """Move every pressure along its direction as far as energy falls, and project it."""
         inside = self.error.where(self.touches, 0)
+        # A single cell in contact is always at rest.
+        moves = inside.abs().amax(1) > self.rest * self.deflection.amax(1)
+        inside = inside.where(moves[:, None], 0)
         square = (inside * inside).sum(1)
         share = torch.where(self.carried > 0, square / self.carried, 0)
         along = (inside + share[:, None] * self.direction).where(self.touches, 0)
         # Cells that have left took their part of the sum with them.
-        along = (along - (along.sum(1) / self.count)[:, None]).where(self.touches, 0)
+        along = (along - (along.sum(1) / self.count)[:, None]).where(self.touches & moves[:, None], 0)
         answer = along @ self.compliance
         curvature = (along * answer).sum(1)
-        # A single cell in contact has no direction; the dent of a cell alone tells what a joining one needs.
+        # Without a direction the dent of a cell alone tells what a joining one needs.
         length = torch.where(
-            self.count > 1, (inside * along).sum(1) / curvature, 1 / self.compliance.diagonal().mean()
+            moves, (inside * along).sum(1) / curvature, 1 / self.compliance.diagonal().mean()
         )
 
         trial = self.pressure - length[:, None] * along

@@ -90,7 +90,7 @@ class Rigid(AbstractContact):
         stands = (strokes.place[solved] == strokes.place[telling][strokes.owner[solved]]).all(axis=1)
         start = found.pressure[owner] * torch.from_numpy(stands)[:, None]
         states = solve(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
-        missed = strokes.owner[solved][(states.residual > self.tolerance).numpy()]
+        missed = strokes.owner[solved][(~(states.residual <= self.tolerance)).numpy()]
         lost += np.bincount(missed, minlength=len(force))
 
         frames = gap.isfinite().float()
@@ -133,7 +133,7 @@ class Rigid(AbstractContact):
             state = solve(
                 self.compliance, own[torch.from_numpy(rows)], total, start, self.tolerance, self.iterations
             )
-            return state, (state.residual > self.tolerance).numpy()
+            return state, (~(state.residual <= self.tolerance)).numpy()
 
         found = seek(solved, own.isfinite().float(), strokes.peak, strokes.wanted[:, [0, 3]], ground)
         return found, found.failed.astype(np.int64)

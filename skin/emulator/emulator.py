@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from itertools import islice
-from time import monotonic, sleep
+from threading import Event
+from time import monotonic
 from typing import Any, get_args
 
 import numpy as np
@@ -113,12 +114,13 @@ class Emulator:
         self._number = self._zero = 0
         self._held: np.ndarray | None = None
         self._silent_until = -1
+        self._over = Event()
         self._noise = generator(Stream.NOISE, device.seed, Stream.TEST, 2, settings.seed)
         self._chance = generator(Stream.TEST, 3, settings.seed)
         self._listed = {kind: faults.moments(kind, settings.rate) for kind in KINDS}
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
-        """Play until ``count`` gestures or ``seconds`` of the device are over, or without end."""
+        """Play until ``count`` gestures or ``seconds`` of the device are over, or until :meth:`stop`."""
         self.await_reader()
         end = None if seconds is None else round(seconds * self.settings.rate)
         self._start = monotonic()
@@ -129,10 +131,14 @@ class Emulator:
             if self._play(values, end):
                 return
 
+    def stop(self) -> None:
+        """Let :meth:`run` return before its next frame, wherever it waits; from another thread."""
+        self._over.set()
+
     def await_reader(self) -> None:
         """Wait until somebody opens the port."""
-        while not self.outlet.connected():
-            sleep(_LOOK)
+        while not self.outlet.connected() and not self._over.wait(_LOOK):
+            pass
 
     def _pieces(self, count: int | None) -> Iterator[tuple[np.ndarray, tuple[int, Gesture] | None]]:
         """Yield what the converter says at rest, then gesture by gesture, each with the gap behind it."""
@@ -161,7 +167,8 @@ class Emulator:
             if end is not None and self._number >= end:
                 return True
             due = self._start + self._number / (rate * self.settings.speed)
-            sleep(max(0.0, due - monotonic()))
+            if self._over.wait(max(0.0, due - monotonic())):
+                return True
             for kind in KINDS:
                 if chances[kind][place] or self._number in self._listed[kind]:
                     getattr(self, f"_{kind}")()
@@ -231,7 +238,8 @@ class Emulator:
         """Vanish, with the power: the clock stands still and begins anew."""
         self._told(self._number / self.settings.rate, f"unplugged for {self.faults.away:g} s")
         self.outlet.unplug()
-        sleep(self.faults.away / self.settings.speed)
+        if self._over.wait(self.faults.away / self.settings.speed):
+            return
         self.outlet.plug()
         self._told(self._number / self.settings.rate, f"plugged in again: {self.outlet.address}")
         self._start += self.faults.away / self.settings.speed

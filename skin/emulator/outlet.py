@@ -6,23 +6,29 @@ import socket
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from pathlib import Path
-from time import monotonic
+from threading import RLock
+from time import monotonic, sleep
 
 from skin.errors import InputError
 
 __all__ = ["AbstractOutlet", "outlet"]
 
 _PATIENCE = 1.0  # s that a reader may be late before bytes are lost, as in a device without flow control
+_PAUSE = 0.002  # s until a full buffer is tried again
 
 
 class AbstractOutlet(ABC):
-    """A port that somebody may be connected to.
+    """A port that somebody may be connected to; one thread may write while another unplugs it.
 
     Attributes:
         address: what ``device.port`` takes.
     """
 
     address: str
+
+    def __init__(self) -> None:
+        # Held by every method that uses or replaces what is open.
+        self._lock = RLock()
 
     @abstractmethod
     def connected(self) -> bool:
@@ -38,22 +44,23 @@ class AbstractOutlet(ABC):
 
     @abstractmethod
     def _send(self, data: bytes) -> int:
-        """Write some of ``data`` without waiting and return how much."""
-
-    @abstractmethod
-    def _handle(self) -> int:
-        """Return the file descriptor that is written to."""
+        """Write some of ``data`` without waiting and return how much; the lock is held."""
 
     def write(self, data: bytes) -> None:
         """Write; what nobody takes within a second is lost."""
         deadline = monotonic() + _PATIENCE
-        while data and self.connected() and monotonic() < deadline:
-            try:
-                data = data[self._send(data) :]
-            except BlockingIOError:
-                select.select([], [self._handle()], [], 0.05)
-            except OSError:
-                return
+        while data and monotonic() < deadline:
+            with self._lock:
+                if not self.connected():
+                    return
+                try:
+                    data = data[self._send(data) :]
+                    continue
+                except BlockingIOError:
+                    pass
+                except OSError:
+                    return
+            sleep(_PAUSE)
 
 
 def outlet(port: str, link: str | None) -> AbstractOutlet:
@@ -78,6 +85,7 @@ def outlet(port: str, link: str | None) -> AbstractOutlet:
 
 class _Pty(AbstractOutlet):
     def __init__(self, link: str | None) -> None:
+        super().__init__()
         self._link = None if link is None else Path(link).expanduser().absolute()
         if self._link and self._link.exists() and not self._link.is_symlink():
             raise InputError(f"link={link} would replace a file: give another name")
@@ -88,12 +96,13 @@ class _Pty(AbstractOutlet):
             import tty
         except ImportError as error:  # Windows
             raise InputError("there are no pseudo-terminals here: add port=tcp:5555") from error
-        self._master, slave = os.openpty()
-        tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        name = os.ttyname(slave)
-        # Opened and closed once, it tells when somebody opens it.
-        os.close(slave)
+        with self._lock:
+            self._master, slave = os.openpty()
+            tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            name = os.ttyname(slave)
+            # Opened and closed once, it tells when somebody opens it.
+            os.close(slave)
         self.address = name if self._link is None else str(self._link)
         if self._link is not None:
             partial = self._link.with_name(self._link.name + ".part")
@@ -105,56 +114,59 @@ class _Pty(AbstractOutlet):
                 raise InputError(f"cannot make link={self._link}: {error}") from error
 
     def connected(self) -> bool:
-        if self._master < 0:
-            return False
-        watch = select.poll()
-        watch.register(self._master, 0)
-        return not any(event & select.POLLHUP for _, event in watch.poll(0))
+        with self._lock:
+            if self._master < 0:
+                return False
+            watch = select.poll()
+            watch.register(self._master, 0)
+            return not any(event & select.POLLHUP for _, event in watch.poll(0))
 
     def unplug(self) -> None:
-        if self._master >= 0:
-            os.close(self._master)
-            self._master = -1
+        with self._lock:
+            if self._master >= 0:
+                os.close(self._master)
+                self._master = -1
         if self._link is not None and self._link.is_symlink():
             self._link.unlink()
 
     def _send(self, data: bytes) -> int:
         return os.write(self._master, data)
 
-    def _handle(self) -> int:
-        return self._master
-
 
 class _Tcp(AbstractOutlet):
     def __init__(self, number: int) -> None:
+        super().__init__()
         self._number = number
         self.plug()
 
     def plug(self) -> None:
-        try:
-            self._server = socket.create_server(("127.0.0.1", self._number))
-        except OSError as error:
-            raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
-        self._server.setblocking(False)
-        self._number = self._server.getsockname()[1]
-        self.address = f"socket://127.0.0.1:{self._number}"
-        self._client: socket.socket | None = None
+        with self._lock:
+            try:
+                self._server = socket.create_server(("127.0.0.1", self._number))
+            except OSError as error:
+                raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
+            self._server.setblocking(False)
+            self._number = self._server.getsockname()[1]
+            self.address = f"socket://127.0.0.1:{self._number}"
+            self._client: socket.socket | None = None
 
     def connected(self) -> bool:
-        if self._client is not None and self._left(self._client):
-            self._client.close()
-            self._client = None
-        if self._client is None:
-            with suppress(OSError):  # nobody comes, or it is unplugged
-                self._client, _ = self._server.accept()
-                self._client.setblocking(False)
-        return self._client is not None
+        with self._lock:
+            if self._client is not None and self._left(self._client):
+                self._client.close()
+                self._client = None
+            if self._client is None:
+                with suppress(OSError):  # nobody comes, or it is unplugged
+                    self._client, _ = self._server.accept()
+                    self._client.setblocking(False)
+            return self._client is not None
 
     def unplug(self) -> None:
-        if self._client is not None:
-            self._client.close()
-            self._client = None
-        self._server.close()
+        with self._lock:
+            if self._client is not None:
+                self._client.close()
+                self._client = None
+            self._server.close()
 
     @staticmethod
     def _left(client: socket.socket) -> bool:
@@ -167,6 +179,3 @@ class _Tcp(AbstractOutlet):
 
     def _send(self, data: bytes) -> int:
         return self._client.send(data) if self._client else len(data)
-
-    def _handle(self) -> int:
-        return self._client.fileno() if self._client else -1

@@ -73,7 +73,7 @@ def plates_and_beams(quick: bool) -> Outcome:
             ours = spsolve(structure.stiffness(), structure.load() @ pressure.ravel()).reshape(expected.shape)
             error = (np.abs(ours - expected).max((0, 1, 2)) / np.abs(expected).max((0, 1, 2))).max()
             case = f"all displacements, {name}, constraint={constraint}"
-            findings.append(Finding(case, np.abs(ours).max(), np.abs(expected).max(), float(error), 1e-6))
+            findings.append(Finding(case, np.abs(ours).max(), np.abs(expected).max(), float(error), 1e-8))
     return Outcome(findings)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from skin.proof.finding import Law, Outcome, Picture
+from skin.proof.finding import Finding, Law, Outcome, Picture
 from skin.results.table import write
 
 __all__ = ["as_json", "draw", "page", "publish"]
@@ -19,12 +19,16 @@ Results = Sequence[tuple[Law, Outcome]]
 _HEAD = """# Physics, proved
 
 Written by `make physics` (`python experiments/verify_physics.py`). Every law is checked against an answer
-that is not the simulator's own; one that does not hold ends the command with exit code 1. The same, for
-programs: `results/physics.json`.
+that is not the simulator's own; one that does not hold ends the command with exit code 1. Only digits that
+are the same on every processor are printed; errors of rounding stand as an upper bound. All digits of this
+machine, for programs: `results/physics.json`.
 
 | law | against | numbers | worst error | tolerance | |
 |---|---|---|---|---|---|
 """
+
+# Errors below this are rounding, in double and in single precision; the tolerance tells which of them it is.
+_DOUBLE, _SINGLE = 1e-10, 1e-6
 
 _LIMITS = """
 ## What this does not prove
@@ -85,11 +89,11 @@ def _line(result: tuple[Law, Outcome]) -> str:
     law, outcome = result
     worst = max(
         outcome.findings,
-        key=lambda one: one.error / one.tolerance if one.error == one.error else float("inf"),
+        key=lambda one: math.inf if math.isnan(one.error) else max(one.error, _rounding(one)) / one.tolerance,
     )
     verdict = "holds" if all(one.ok for one in outcome.findings) else "**fails**"
     return (
-        f"| [{law.name}](#{law.name}) | {law.reference} | {len(outcome.findings)} | {worst.error:.2g} | "
+        f"| [{law.name}](#{law.name}) | {law.reference} | {len(outcome.findings)} | {_error(worst)} | "
         f"{worst.tolerance:.0e} | {verdict} |\n"
     )
 
@@ -99,13 +103,23 @@ def _section(result: tuple[Law, Outcome]) -> str:
     lines = [f"\n## {law.name}\n\n{law.statement}\n\n"]
     lines.append("| | ours | reference | error | tolerance | |\n|---|---|---|---|---|---|\n")
     for one in outcome.findings:
+        ours = f"{one.ours:.5g}" if one.reference else _error(one)
         lines.append(
-            f"| {one.case} | {one.ours:.6g} | {one.reference:.6g} | {one.error:.2g} | {one.tolerance:.0e} | "
+            f"| {one.case} | {ours} | {one.reference:.5g} | {_error(one)} | {one.tolerance:.0e} | "
             f"{'ok' if one.ok else '**missed**'} |\n"
         )
     lines += [f"\n- {remark}" for remark in outcome.remarks]
     lines += [f"\n\n![{picture.title}](results/physics/{picture.name}.png)" for picture in outcome.pictures]
     return "".join(lines).rstrip("\n") + "\n"
+
+
+def _rounding(finding: Finding) -> float:
+    return _DOUBLE if finding.tolerance <= 1e-8 else _SINGLE
+
+
+def _error(finding: Finding) -> str:
+    bound = _rounding(finding)
+    return f"< {bound:.0e}" if finding.error < bound else f"{finding.error:.2g}"
 
 
 def draw(picture: Picture, path: Path) -> None:

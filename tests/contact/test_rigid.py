@@ -177,6 +177,45 @@ def test_the_force_is_raised_until_the_classes_hold(wanted):
     assert labels.tolist() == [wanted[0], wanted[3]]
 
 
+def rounded(compliance: torch.Tensor, seed: int) -> torch.Tensor:
+    """Return what another processor may make of a compliance: noise of 1e-12 to 1e-7, or fewer digits."""
+    if seed < 4:  # so few that sums are exact, whatever their order
+        unit = 2.0 ** (torch.log2(compliance.max()).floor() - 8 - 2 * seed)
+        return (compliance / unit).round() * unit
+    noise = np.random.default_rng(seed).standard_normal(compliance.shape)
+    size = 10.0 ** (-12 + seed % 6)
+    return (compliance.double() * (1 + size * torch.from_numpy(noise + noise.T))).float()
+
+
+@pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (1, 0, 0, 1), (0, 0, 0, 1)])
+def test_rounding_decides_nothing(wanted):
+    """The same force, class by class, on every processor; the fewest digits move it by their own size."""
+    where = ground(shapes=["blurred_disc"])
+    low = (where.settings.dangerous_peak if wanted[3] else where.settings.safe_peak)[0]
+    stroke = still(0.065 if wanted[0] else 0.03, peak=low, wanted=wanted)
+    contact = rigid(relief=0.002)
+    exact, forces = contact.compliance, []
+    for seed in range(28):
+        contact.compliance = rounded(exact, seed)
+        pressed = contact.press(stroke, where)
+        assert not pressed.refused.any(), seed
+        labels = movie_labels(pressed.frames[None], where.footprints, BODY.cell)[0, [0, 3]]
+        assert labels.tolist() == [wanted[0], wanted[3]], seed
+        forces.append(pressed.force.item())
+    assert forces == pytest.approx([forces[-1]] * 28, rel=0.02)
+    assert forces[4:] == pytest.approx([forces[-1]] * 24, rel=1e-4)
+
+
+@pytest.mark.parametrize("most", [82.7e3, 83.2e3, 83.4e3])
+def test_the_end_of_a_range_is_tried_itself(most):
+    """The ball is big from 82.5 kPa on: wherever the search begins, it must not stop a little below that."""
+    where, contact = ground(shapes=["blurred_disc"]), rigid(relief=0.002)
+    settings = GestureSettings(**dict(vars(where.settings), safe_peak=(10e3, 1.03 * most)))
+    for peak in np.linspace(10e3, 80e3, 9):
+        stroke = still(0.065, peak=peak, wanted=(1, 0, 0, 0))
+        assert not contact.press(stroke, where._replace(settings=settings)).refused.any(), peak
+
+
 def test_what_no_force_can_make_big_is_hopeless():
     where = ground(shapes=["fingertip"])
     pressed = rigid(relief=0.05).press(still(0.06, wanted=(1, 0, 0, 0)), where)

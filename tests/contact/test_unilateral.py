@@ -153,6 +153,25 @@ def test_the_start_changes_the_way_and_not_the_end():
         assert worst.max() < 1e-6
 
 
+@pytest.mark.parametrize("touching", [[0], [0, 4], [0, 2, 4, 6]])
+def test_cells_that_are_exactly_at_rest_let_others_join(touching):
+    """A ring of cells in whole numbers: the errors of the cells in contact are 0, without any rounding."""
+    row = torch.tensor([16.0, 6, 2, 1, 0, 1, 2, 6], dtype=torch.float64)
+    compliance = torch.stack([row.roll(turn) for turn in range(8)])
+    assert torch.linalg.eigvalsh(compliance).min() > 1
+    gap = torch.full((1, 8), 4.0, dtype=torch.float64)
+    gap[0, touching] = 0
+    start = (gap == 0).double()
+    for total in (1.0, 4.0, 32.0):
+        state = solve(compliance, gap, torch.tensor([total]), start, tolerance=1e-8)
+        assert state.residual <= 1e-8
+        height = compliance @ state.pressure[0] + gap[0]
+        touched = state.pressure[0] > 0
+        assert np.ptp(height[touched].numpy()) < 1e-6
+        assert height.min() > height[touched].mean() - 1e-6
+    assert touched.all()
+
+
 def test_what_is_not_found_is_told():
     compliance, gaps, totals = problems()
     state = solve(compliance, gaps, totals, tolerance=1e-8, iterations=2)

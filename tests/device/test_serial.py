@@ -36,19 +36,23 @@ def skin(**settings):
 @pytest.fixture
 def emulate():
     """Return a function that plays a device and gives the port; nothing is left behind."""
-    ports = []
+    playing = []
 
     def begin(device, faults=None, binary=False, **settings):
         port = outlet("tcp:0", None)
         chosen = Settings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
         emulator = Emulator(device, port, chosen, faults or Faults(), binary)
-        Thread(target=emulator.run, kwargs={"count": COUNT + 1}, daemon=True).start()
-        ports.append(port)
+        thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
+        thread.start()
+        playing.append((emulator, thread))
         return port.address
 
     yield begin
-    for port in ports:
-        port.unplug()
+    for emulator, thread in playing:
+        emulator.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+        emulator.outlet.unplug()
 
 
 def serial(port, layout=LAYOUT, **settings):

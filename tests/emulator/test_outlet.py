@@ -1,13 +1,16 @@
 """Ports of the emulator: who listens, what they hear, and what they see when it vanishes."""
 
 import os
+import select
+import socket
 import time
+from threading import Thread
 
 import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.emulator.outlet import outlet
+from skin.emulator.outlet import _Tcp, outlet
 from skin.errors import InputError
 from skin.port.wire import open_wire
 
@@ -50,6 +53,58 @@ def test_it_knows_who_listens_and_is_heard(plugged):
         assert gone(stream)
     finally:
         stream.close()
+
+
+def test_unplugging_while_the_other_thread_looks_who_listens(monkeypatch):
+    """The reader has left, and just then somebody unplugs the port: that waits until the look is over."""
+    port = outlet("tcp:0", None)
+    with socket.create_connection(("127.0.0.1", int(port.address.rpartition(":")[2]))):
+        deadline = time.monotonic() + 20
+        while not port.connected():
+            assert time.monotonic() < deadline
+    unplugging = Thread(target=port.unplug)
+    left = _Tcp._left
+
+    def slowly(client):
+        select.select([client], [], [], 20)  # the end of the stream may still be on its way
+        unplugging.start()
+        unplugging.join(0.1)
+        return left(client)
+
+    monkeypatch.setattr(_Tcp, "_left", staticmethod(slowly))
+    assert not port.connected()
+    unplugging.join(20)
+    assert not unplugging.is_alive()
+    assert not port.connected()
+
+
+def test_writing_while_it_is_unplugged_and_plugged_in(plugged):
+    """One thread writes, with a full buffer most of the time; another unplugs and plugs in."""
+    failures = []
+
+    def write():
+        try:
+            while not done:
+                plugged.write(bytes(1 << 16))
+        except BaseException as error:
+            failures.append(error)
+
+    done = []
+    writing = Thread(target=write)
+    writing.start()
+    try:
+        for _ in range(100):
+            stream = open_wire(plugged.address, 115200)
+            hear(stream, 1)
+            plugged.unplug()
+            stream.close()
+            plugged.plug()
+    finally:
+        done.append(True)
+        plugged.unplug()
+        writing.join(20)
+    assert not failures
+    assert not writing.is_alive()
 
 
 def test_a_link_leads_to_it_and_is_followed_again(tmp_path):

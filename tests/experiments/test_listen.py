@@ -2,12 +2,9 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tty
-from threading import Thread
-from time import sleep
 
 import pytest
 
@@ -29,25 +26,18 @@ def listen(*arguments):
 
 
 @pytest.fixture
-def address():
+def address(played):
     """Return the address of a skin of three sensors at 100 Hz, one line of ten spoilt."""
-    server = socket.create_server(("127.0.0.1", 0))
 
-    def run():
-        device, _ = server.accept()
-        with device:
-            device.sendall(b"boot\n" + encode_header(Header(n=3, rate=100.0, bits=10)))
-            for number in range(100_000):
-                line = encode_line([512, 500 + number % 2, 1023], number, 10_000 * number)
-                try:
-                    device.sendall(line.replace(b"512", b"513") if number % 10 == 9 else line)
-                except OSError:
-                    return
-                sleep(0.01)
+    def say(reader, stop):
+        reader.sendall(b"boot\n" + encode_header(Header(n=3, rate=100.0, bits=10)))
+        for number in range(100_000):
+            line = encode_line([512, 500 + number % 2, 1023], number, 10_000 * number)
+            reader.sendall(line.replace(b"512", b"513") if number % 10 == 9 else line)
+            if stop.wait(0.01):
+                return
 
-    Thread(target=run, daemon=True).start()
-    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-    server.close()
+    return played(say)
 
 
 def test_it_says_what_comes(address):

@@ -3,12 +3,11 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from contextlib import contextmanager
 from itertools import count
-from threading import Event, Thread, Timer
+from threading import Timer
 
 import numpy as np
 import pytest
@@ -26,32 +25,19 @@ PACE = 0.002  # s of the wall for 10 ms of the device
 
 
 @pytest.fixture
-def address():
+def address(played):
     """Return the address of a skin of four sensors at 100 Hz, in N; it serves one reader after the other."""
-    server, stop = socket.create_server(("127.0.0.1", 0)), Event()
 
-    def serve():
+    def say(reader, stop):
         rng = np.random.default_rng(0)
-        while not stop.is_set():
-            try:
-                device, _ = server.accept()
-            except OSError:
+        reader.sendall(encode_header(Header(n=4, rate=100.0, unit="N")))
+        for number in count():
+            values = rng.normal(scale=0.02, size=4) + 2.0 * (number > 600 and number % 100 > 80)
+            reader.sendall(encode_line(values.round(4), number, 10_000 * number))
+            if stop.wait(PACE):
                 return
-            with device:
-                try:
-                    device.sendall(encode_header(Header(n=4, rate=100.0, unit="N")))
-                    for number in count():
-                        values = rng.normal(scale=0.02, size=4) + 2.0 * (number > 600 and number % 100 > 80)
-                        device.sendall(encode_line(values.round(4), number, 10_000 * number))
-                        if stop.wait(PACE):
-                            return
-                except OSError:
-                    continue
 
-    Thread(target=serve, daemon=True).start()
-    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-    stop.set()
-    server.close()
+    return played(say)
 
 
 class Person:

@@ -4,9 +4,7 @@ import re
 import socket
 import subprocess
 import sys
-from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
 
 import pyarrow.parquet as pq
 import pytest
@@ -39,25 +37,6 @@ def stream(folder):
     return data, scale
 
 
-@contextmanager
-def played(data):
-    """Give the address of a port that says the same to whoever comes."""
-    server = socket.create_server(("127.0.0.1", 0))
-
-    def serve():
-        while True:
-            try:
-                reader, _ = server.accept()
-                with reader:
-                    reader.sendall(data)
-            except OSError:
-                return
-
-    Thread(target=serve, daemon=True).start()
-    yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-    server.close()
-
-
 def answers(folder, said):
     """Return the predictions that the latest evaluation has logged."""
     files = sorted(Path(folder).glob("a/**/predictions.parquet"), key=lambda path: path.stat().st_mtime)
@@ -66,7 +45,7 @@ def answers(folder, said):
 
 
 @pytest.mark.slow
-def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, tmp_path):
+def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, played, tmp_path):
     def tell(script, *overrides):
         done = run(tmp_path, script, *overrides)
         assert done.returncode == 0, done.stderr
@@ -75,14 +54,14 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, tmp_path):
     tell("train.py", "experiment=rules", *SKIN, *SMALL)
     data, scale = stream(tmp_path)
     assert data.count(b"# gesture") == COUNT
-    with played(data) as port:
-        there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]
-        live = answers(tmp_path, tell("evaluate.py", "device=serial", *there, f"out={tmp_path}/live"))
-        said = tell("record.py", *SKIN, "out=s.csv", "device.labels=announced", *there)
-        assert said == f"s.parquet: {COUNT} gestures\n"
-        sheet = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
-        direct = Serial(body=sheet, layout=Grid(3, 3), port=port, scale=float(scale), gestures=COUNT)
-        felt = direct.touches("test")
+    port = played(lambda reader, stop: reader.sendall(data))
+    there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]
+    live = answers(tmp_path, tell("evaluate.py", "device=serial", *there, f"out={tmp_path}/live"))
+    said = tell("record.py", *SKIN, "out=s.csv", "device.labels=announced", *there)
+    assert said == f"s.parquet: {COUNT} gestures\n"
+    sheet = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+    direct = Serial(body=sheet, layout=Grid(3, 3), port=port, scale=float(scale), gestures=COUNT)
+    felt = direct.touches("test")
     stored = read(tmp_path / "s.parquet").touches
     assert torch.equal(felt.readings, stored.readings)
     assert torch.equal(felt.valid, stored.valid)

@@ -1,8 +1,6 @@
 """make physics through its command: every law in its quick version, files, exit codes."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
@@ -43,23 +41,18 @@ def test_an_unknown_law_is_refused(run, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_a_law_that_fails_ends_with_one(tmp_path):
+def test_a_law_that_fails_ends_with_one(run, tmp_path):
     """A solid whose stiffness is wrong by a tenth does not pass for the right one."""
-    spoilt = (
-        "import sys; from skin.simulator._hexahedra import Hexahedra;"
-        "right = Hexahedra.stiffness; Hexahedra.stiffness = lambda mesh: 1.1 * right(mesh);"
-        "sys.path.insert(0, 'experiments'); sys.argv[0] = 'verify_physics.py';"
-        "import verify_physics; verify_physics.main()"
+    spoilt = tmp_path / "verify_physics.py"
+    spoilt.write_text(
+        f"import sys; sys.path.insert(0, {str(ROOT / 'experiments')!r})\n"
+        "from skin.simulator._hexahedra import Hexahedra\n"
+        "right = Hexahedra.stiffness; Hexahedra.stiffness = lambda mesh: 1.1 * right(mesh)\n"
+        "from verify_physics import main; main()\n"
     )
-    command = [
-        sys.executable,
-        "-c",
-        spoilt,
-        "physics.quick=true",
-        "physics.laws=[confined]",
-        f"out={tmp_path}",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)
+    done = run(
+        tmp_path, spoilt, "physics.quick=true", "physics.laws=[confined]", f"out={tmp_path}", store=False
+    )
     assert done.returncode == 1, done.stderr
     assert "confined: FAILS" in done.stdout
     assert "**missed**" in (tmp_path / "physics.md").read_text()

@@ -49,6 +49,23 @@ def test_a_miss_is_written_as_one(tmp_path):
     assert "NaN" not in as_json([(LAW, Outcome([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
 
 
+def test_the_page_is_the_same_where_rounding_differs():
+    """Noise of double and of single precision, of either sign, and other laws worst by it."""
+
+    def written(noise: float) -> str:
+        exact = compared("exact", 2.23588314 * (1 + 1e-13 * noise), 2.23588314, 1e-8)
+        single = compared("single", 66867.31 * (1 + 1e-7 * noise), 66867.31, 1e-6)
+        nothing = compared("nothing", 1e-14 * noise, 0.0, 1e-10)
+        real = compared("real", 0.98361523 * (1 + 1e-9 * noise), 0.98768812, 0.05)
+        return page([(LAW, Outcome(found)) for found in ([exact, nothing], [exact, single], [real])])
+
+    text = written(0.0)
+    assert all(written(noise) == text for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))
+    assert "| exact | 2.2359 | 2.2359 | < 1e-10 | 1e-08 | ok |" in text
+    assert "| nothing | < 1e-10 | 0 | < 1e-10 | 1e-10 | ok |" in text
+    assert "| real | 0.98362 | 0.98769 | 0.0041 | 5e-02 | ok |" in text
+
+
 def test_laws_are_chosen_by_name():
     assert chosen("all") == list(LAWS)
     assert [law.name for law in chosen(["punch", "hertz"])] == ["punch", "hertz"]

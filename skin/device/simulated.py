@@ -102,12 +102,10 @@ class Simulated(AbstractDevice):
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if self.stream and self.direction:
             raise InputError(
-                "a window of a stream shows a part of a path, not where the whole leads: give either "
-                "data.direction=true or data.stream=true"
+                "a window of a stream shows part of a path: give data.direction=true or data.stream=true"
             )
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
-        self.size = self.body.size
-        self.sensors = self.layout.sensors(self.body)
+        self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         true = true_sensors(self)
         self.model = true_model(self, true)
         contact = self.contact and self.contact(self.body, self.model)
@@ -128,6 +126,10 @@ class Simulated(AbstractDevice):
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split; fixed ones are drawn once and kept."""
         return self._split(split, epoch, complete=False).touches
+
+    def fresh_touches(self, count: int) -> Touches:
+        """Return touches that belong to no split, for choosing a threshold after the training."""
+        return self._draw(False, Stream.ALARM, count, self.data_seed).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the same touches with the applied force and the gestures' parameters.
@@ -221,8 +223,7 @@ class Simulated(AbstractDevice):
         return self._felt_strip(true, generator(Stream.NOISE, self.seed, *key))
 
     def _felt_strip(self, true: Strip, noise: np.random.Generator) -> Strip:
-        frames = true.whole.touches.readings[0, :, None]
-        clipped = self.imperfection.clipped(frames, self.constants)
+        clipped = self.imperfection.clipped(true.whole.touches.readings[0, :, None], self.constants)
         return Strip(true.timeline, self._felt(true.whole, noise), clipped)
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:

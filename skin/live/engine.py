@@ -42,6 +42,7 @@ class Engine:
         self.task = task
         self._learner, self._positions, self._gate = learner, positions, gate
         self._patience = patience or Patience()
+        self._above = 0.5 if self._patience.above is None else self._patience.above
         self._segment: int | None = None
         self._restart()
 
@@ -89,7 +90,7 @@ class Engine:
             return debounce(answer, frame.t, period)
 
         dangerous = settled(
-            self._labels["dangerous"], touched and chances.get("dangerous", 0.0) > self._patience.above
+            self._labels["dangerous"], touched and chances.get("dangerous", 0.0) > self._above
         )
         # An alarm does not wait until the touch is settled.
         shown = settled(self._touch, touched) or dangerous

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 SMALL = ["layout=grid", "simulator=naive", "data.gestures=200", "device.test_gestures=64"]
-SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
+SMALL += ["evaluation.devices=0", "evaluation.layouts=0", "evaluation.safe_gestures=64"]
 WAYS = ("threshold", "reading")
 
 

@@ -133,8 +133,7 @@ def test_live_refuses_an_alarm_that_cannot_be_raised(run, folder):
     assert "no alarm will be raised: give live.patience.above=0.5" in done.stderr
 
 
-@pytest.mark.parametrize("wrong", ["evaluation.false_alarm_rate=0", "evaluation.safe_gestures=0"])
-def test_bad_input_is_one_sentence(run, tmp_path, wrong):
-    done = run(tmp_path, "train.py", "experiment=rules", *SKIN, wrong)
+def test_bad_input_is_one_sentence(run, tmp_path):
+    done = run(tmp_path, "train.py", "experiment=rules", *SKIN, "evaluation.false_alarm_rate=0")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert wrong.partition("=")[0] in done.stderr
+    assert "evaluation.false_alarm_rate=0.02" in done.stderr

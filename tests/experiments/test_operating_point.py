@@ -31,17 +31,20 @@ def query(folder, *statement):
         return database.execute(*statement).fetchall()
 
 
+def tag(folder):
+    """Return the id of the training run, which is the oldest, and the operating point that it stores."""
+    known = "select run_uuid, value from tags join runs using (run_uuid) where key='operating_point'"
+    return query(folder, f"{known} order by start_time limit 1")[0]
+
+
 def stored(folder):
-    """Return the operating point that the oldest run stores."""
-    order = "from tags join runs using (run_uuid) where key='operating_point' order by start_time limit 1"
-    return json.loads(query(folder, f"select value {order}")[0][0])
+    return json.loads(tag(folder)[1])
 
 
 @contextmanager
 def changed(folder, **values):
     """Store another operating point, or none, for a while."""
-    text = query(folder, "select value from tags where key='operating_point' limit 1")[0][0]
-    run = query(folder, "select run_uuid from runs order by start_time limit 1")[0][0]
+    run, text = tag(folder)
     write = "update tags set key=?, value=? where run_uuid=? and value=?"
     name, new = ("operating_point", json.dumps(json.loads(text) | values)) if values else ("old", text)
     query(folder, write, (name, new, run, text))
@@ -128,7 +131,7 @@ def test_live_raises_the_alarm_where_the_run_does(run, folder, threshold, given,
 
 def test_live_refuses_an_alarm_that_cannot_be_raised(run, folder):
     with changed(folder, threshold=1.000001):
-        done = run(folder, "live.py", "live.touch=0.3")
+        done = run(folder, "live.py", "live.touch=0.3", "seconds=1")
     assert (done.returncode, done.stdout) == (2, "")
     assert "no alarm will be raised: give live.patience.above=0.5" in done.stderr
 

@@ -16,7 +16,7 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.device.serial import Serial
     from skin.evaluation.report import evaluate
-    from skin.reload import changed, configuration, find, restore
+    from skin.reload import changed, configuration, find, operating_point, restore
     from skin.results.show import report
     from skin.results.verdicts import publish, verdicts
     from skin.run import conclude
@@ -26,10 +26,12 @@ def main(config: DictConfig) -> None:
     store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
     run = find(store, config.run)
     given = overrides()
-    config = changed(configuration(store, run), config, given)
+    stored = configuration(store, run)
+    config = changed(stored, config, given)
     device, learner = build_device(config), build_learner(config)
     shapes = device.blank() if isinstance(device, Serial) else device
     restore(store, run, learner, build_data(config, shapes))
+    point = operating_point(run, learner, stored, config.evaluation)
     if isinstance(device, Serial):
         device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     name = f"evaluation_{config.device['_target_'].split('.')[-2]}"
@@ -38,11 +40,11 @@ def main(config: DictConfig) -> None:
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         if isinstance(device, Serial) and device.touches("test").labels is None:
             chances = learner.probabilities(device.touches("test"))
-            said, path = verdicts(chances, device.task, folder / f"{name}.csv")
+            said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
             store.client.log_artifact(evaluation.info.run_id, str(path))
             print(f"{title}\n{said}\n{path}")
             return
-        found = evaluate(learner, device, config.evaluation)
+        found = evaluate(learner, device, config.evaluation, point)
         conclude(store, evaluation, found, device.task, {})
         about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
         written = publish(folder / f"{name}.md", found, device.task, run.info.run_name, about)

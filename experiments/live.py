@@ -50,6 +50,9 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
     said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
     of = start.trained(store, run, learnt)
     engine = start.engine(of, patience, live["touch"], live["drift"])
+    if of.point is not None:
+        given = patience.above is not None
+        said.print(f"alarm above {patience.above:g}" if given else of.point.sentence(), highlight=False)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         # As late as this, because from now on frames come.

@@ -21,7 +21,7 @@ def main(config: DictConfig) -> None:
     from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
     from skin.evaluation.margins import margins
-    from skin.reload import changed, configuration, find, restore
+    from skin.reload import changed, configuration, find, operating_point, restore
     from skin.results.margins import line, publish
     from skin.tracking import Store
 
@@ -29,10 +29,12 @@ def main(config: DictConfig) -> None:
     store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
     run = find(store, config.run)
     given = [one for one in overrides() if one.lstrip("+~").split("=")[0] not in _OWN]
-    own = changed(configuration(store, run), config, given)
+    stored = configuration(store, run)
+    own = changed(stored, config, given)
     device, learner = build_device(own), build_learner(own)
     restore(store, run, learner, build_data(own, device))
-    found = margins(learner, device, config.gestures, own.evaluation.false_alarm_rate)
+    point = operating_point(run, learner, stored, own.evaluation)
+    found = margins(learner, device, config.gestures, point)
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"margins of {run.info.run_name}", tags, run.info.run_id) as logged:
         title = f"{run.info.run_name}, run {run.info.run_id[:8]}, {config.gestures} touches"

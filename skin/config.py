@@ -67,6 +67,7 @@ class Evaluation:
     layouts: int
     gestures: int
     false_alarm_rate: float
+    safe_gestures: int = 5000  # runs of old have none
 
 
 @dataclass

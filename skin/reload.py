@@ -1,5 +1,6 @@
 """A finished run, brought back: its configuration with changes, and what it learned."""
 
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,13 +11,18 @@ from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import checked
+from skin.build import build_device
+from skin.config import Evaluation, checked
 from skin.datamodule import TouchData
 from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint, choose, read
 from skin.learner.base import AbstractLearner
 from skin.tracking import Store
 
-__all__ = ["changed", "configuration", "find", "restore"]
+__all__ = ["TAG", "changed", "configuration", "find", "operating_point", "restore"]
+
+TAG = "operating_point"
+"""Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
 
 # What a run learned fits these as they were; the rest may be tried with others.
 _FIXED = (
@@ -107,6 +113,41 @@ def restore(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -
             raise InputError(
                 f"what run {run.info.run_id} learned does not fit these touches: {reason}"
             ) from error
+
+
+def operating_point(
+    run: Run, learner: AbstractLearner, stored: DictConfig, settings: Evaluation
+) -> OperatingPoint | None:
+    """Return where a run raises the alarm; None where its task has no label ``dangerous``.
+
+    It is stored with the run. If the run stores none for the target rate that is asked for, it is chosen now,
+    where the device draws fresh gestures; else it is 0.5. Both are told on standard error.
+
+    Args:
+        run: a finished training.
+        learner: what it learned.
+        stored: its configuration as :func:`configuration` gives it: the device it was trained on.
+        settings: the target rate and the number of safe gestures.
+
+    Raises:
+        InputError: the stored one cannot be read.
+    """
+    text, target = run.data.tags.get(TAG), settings.false_alarm_rate
+    known = None if text is None else read(text)
+    if text is not None and (known is None or known.target == target):
+        return known
+    lacks = f"run {run.info.run_id} stores no alarm threshold for {100 * target:g} % false alarms"
+    if "simulator" in stored.device:
+        point = choose(learner, build_device(stored), settings)
+        said = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
+    else:
+        point = known or OperatingPoint.default(target)
+        said = (
+            f"{lacks} and its device draws no fresh gestures: {point.sentence()}; train it again to store one"
+        )
+    if said:
+        print(said, file=sys.stderr, flush=True)
+    return point
 
 
 def _follow(whole: DictConfig, composed: DictConfig) -> None:

@@ -1,6 +1,8 @@
 """One run: build, learn, evaluate, log."""
 
+import math
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,10 +15,12 @@ from pytorch_lightning.loggers import MLFlowLogger
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.console import quiet
+from skin.evaluation.operating_point import check, choose
 from skin.evaluation.report import Report, evaluate
 from skin.labels import Task
 from skin.peers.exchange import digest
 from skin.recording import Touches
+from skin.reload import TAG
 from skin.results.figures import confusions, save
 from skin.results.show import report as show
 from skin.tracking import Store
@@ -52,6 +56,7 @@ def train(config: DictConfig) -> bool:
         if PARENT not in os.environ:
             print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
         return False
+    check(config.evaluation)
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
@@ -60,7 +65,8 @@ def train(config: DictConfig) -> bool:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         describe(store, run.info.run_id, config, data.touches("train"))
         learner.fit(data, logger)
-        report = evaluate(learner, device, config.evaluation)
+        point = choose(learner, device, config.evaluation)
+        report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
         with tempfile.TemporaryDirectory() as folder:
             path = learner.save(Path(folder))
@@ -111,8 +117,18 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
 
 
 def conclude(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
-    """Log what an evaluation found, with its predictions and confusion matrices, and further values."""
-    store.log_metrics(run, report.metrics | values)
+    """Log what an evaluation found, with its predictions and confusion matrices, and further values.
+
+    The operating point is stored as the tag ``TAG``, from which :func:`skin.reload.operating_point` takes it.
+    """
+    point = report.point
+    if point is not None:
+        values = values | {"alarm/threshold": point.threshold, "alarm/safe_gestures": point.safe}
+        if point.warning():
+            print(f"warning: {point.warning()}", file=sys.stderr)
+    store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
+    defined = {name: value for name, value in report.metrics.items() if not math.isnan(value)}
+    store.log_metrics(run, defined | values)
     with tempfile.TemporaryDirectory() as folder:
         _write(report, task, Path(folder))
         store.client.log_artifacts(run.info.run_id, folder)

@@ -21,6 +21,7 @@ class Stream(IntEnum):
     POSITION = 7
     MODULUS = 8
     TRACKING = 9
+    ALARM = 10
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

@@ -1,12 +1,15 @@
 """A run comes back as it was, but for what the command line names."""
 
+from types import SimpleNamespace
+
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from skin.config import CONF, Tracking, checked, plain
+from skin.config import CONF, Evaluation, Tracking, checked, plain
 from skin.errors import InputError
-from skin.reload import changed, find
+from skin.evaluation.operating_point import OperatingPoint
+from skin.reload import TAG, changed, find, operating_point
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -99,3 +102,39 @@ def test_the_beginning_of_an_id_is_enough(store):
 def test_a_name_that_means_no_single_run_is_refused(store, name, reason):
     with pytest.raises(InputError, match=reason):
         find(store, name)
+
+
+RECORDED = OmegaConf.create({"device": {"_target_": "skin.device.recording.Recorded"}})
+
+
+def tagged(text=None):
+    """Return as much of a run as its operating point is read from."""
+    data = SimpleNamespace(tags={} if text is None else {TAG: text})
+    return SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc"))
+
+
+def settings(rate=0.02):
+    return Evaluation(devices=0, layouts=0, gestures=1, false_alarm_rate=rate)
+
+
+def test_an_operating_point_comes_back_as_it_was_stored(capsys):
+    point = OperatingPoint(0.8782987594604492, 0.02, 5000, 99, 0)
+    assert operating_point(tagged(point.text()), None, RECORDED, settings()) == point
+    assert operating_point(tagged("null"), None, RECORDED, settings()) is None
+    assert capsys.readouterr().err == ""
+
+
+def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(capsys):
+    point = operating_point(tagged(), None, RECORDED, settings())
+    assert (point.threshold, point.safe) == (0.5, 0)
+    said = capsys.readouterr().err
+    assert "run abc stores no alarm threshold for 2 % false alarms" in said
+    assert "its false-alarm rate is unknown; train it again" in said
+
+
+def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(capsys):
+    point = OperatingPoint(0.875, 0.02, 300, 5, None)
+    assert operating_point(tagged(point.text()), None, RECORDED, settings(0.1)) == point
+    said = capsys.readouterr().err
+    assert "no alarm threshold for 10 % false alarms" in said
+    assert "chosen on 300 safe validation gestures for 2 % false alarms" in said

@@ -18,6 +18,7 @@ SMALL = [
     "device.test_gestures=32",
     "evaluation.devices=1",
     "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
     "evaluation.gestures=32",
 ]
 

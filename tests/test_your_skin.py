@@ -88,7 +88,7 @@ def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
 @pytest.mark.slow
 def test_the_training_of_the_page_runs(home):
     store = f"tracking.uri=sqlite:///{home}/mlflow.db tracking.artifacts={home}/artifacts"
-    run(f"{COMMANDS[1].strip()} {store}", home)
+    run(f"{COMMANDS[1].strip()} evaluation.safe_gestures=64 {store}", home)
     said = run(f"{COMMANDS[2].strip()} {store} out={home}/found", home)
     assert said.startswith("within 10 % of their thresholds lie ")
     with sqlite3.connect(home / "mlflow.db") as database:

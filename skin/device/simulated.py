@@ -103,12 +103,10 @@ class Simulated(AbstractDevice):
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if self.stream and self.direction:
             raise InputError(
-                "a window of a stream shows a part of a path, not where the whole leads: give either "
-                "data.direction=true or data.stream=true"
+                "a window of a stream shows part of a path: give data.direction=true or data.stream=true"
             )
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
-        self.size = self.body.size
-        self.sensors = self.layout.sensors(self.body)
+        self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         true = true_sensors(self)
         self.model = true_model(self, true)
         contact = self.contact and self.contact(self.body, self.model)
@@ -134,6 +132,10 @@ class Simulated(AbstractDevice):
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split; fixed ones are drawn once and kept."""
         return self._split(split, epoch, complete=False).touches
+
+    def fresh_touches(self, count: int) -> Touches:
+        """Return touches that belong to no split, for choosing a threshold after the training."""
+        return self._draw(False, Stream.ALARM, count, self.data_seed).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the same touches with the applied force and the gestures' parameters.

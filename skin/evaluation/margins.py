@@ -11,7 +11,7 @@ from torch import Tensor
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation.metrics import alarm_level
+from skin.evaluation.operating_point import LABEL, OperatingPoint, Reached
 from skin.evaluation.report import Answers
 from skin.labels import TOUCH, Measures, Thresholds
 from skin.signal.measurements import above_idle
@@ -19,7 +19,7 @@ from skin.signal.measurements import above_idle
 __all__ = ["ALARM", "Faint", "Margins", "Span", "margins", "spans"]
 
 ALARM = "alarm"
-"""Name of the verdict "dangerous" where only so many false alarms are allowed."""
+"""Name of the verdict "dangerous" at the operating point; that of the label is at 0.5."""
 
 _SHARES = (0, 0.5, 0.8, 0.9, 0.95, 1, 1.05, 1.1, 1.25, 2, torch.inf)  # of the threshold
 _STRENGTHS = (0, 0.3, 0.5, 1, 2, 5, torch.inf)  # N; a touch of 0.3 N is six times the noise
@@ -79,22 +79,24 @@ class Margins:
     Attributes:
         spans: label -> its spans, from below to above the threshold; ``ALARM`` too.
         faint: from faint to strong.
-        false_alarm_rate: of ``ALARM``.
+        point: where ``ALARM`` is raised.
+        reached: its alarms.
     """
 
     spans: dict[str, list[Span]]
     faint: list[Faint]
-    false_alarm_rate: float
+    point: OperatingPoint
+    reached: Reached
 
 
-def margins(learner: Answers, device: AbstractDevice, gestures: int, false_alarm_rate: float) -> Margins:
+def margins(learner: Answers, device: AbstractDevice, gestures: int, point: OperatingPoint) -> Margins:
     """Sort a learner's verdicts on whole test touches by what the labels are made of, and by strength.
 
     Args:
         learner: trained to tell the labels of ``TOUCH``, perhaps among others.
         device: that it was trained on, or another.
         gestures: how many test touches.
-        false_alarm_rate: share of the safe touches that may raise an alarm.
+        point: where the learner raises the alarm.
 
     Raises:
         InputError: a device that does not know how hard and where it is touched.
@@ -115,11 +117,10 @@ def margins(learner: Answers, device: AbstractDevice, gestures: int, false_alarm
     measures = Measures(*(known[name] for name in Measures._fields))
     shares = _shares(measures, device.sampler.settings.thresholds)
     found = {name: spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
-    danger = TOUCH.names.index("dangerous")
-    level = alarm_level(false_alarm_rate, chances[:, danger], labels[:, danger].long())
-    found[ALARM] = spans(chances[:, danger] >= level, shares[:, danger])
+    danger = TOUCH.names.index(LABEL)
+    found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    return Margins(found, faint, false_alarm_rate)
+    return Margins(found, faint, point, point.reached(chances, labels, TOUCH))
 
 
 def spans(said: Tensor, shares: Tensor) -> list[Span]:

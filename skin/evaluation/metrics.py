@@ -9,36 +9,45 @@ from torchmetrics.functional.classification import (
     binary_calibration_error,
     binary_confusion_matrix,
     binary_recall,
-    binary_roc,
     binary_specificity,
     multiclass_accuracy,
 )
 
+from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.labels import Task
 
-__all__ = ["alarm_level", "angles", "confusion", "metrics", "recall_at"]
+__all__ = ["angles", "confusion", "metrics"]
 
 
-def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate: float) -> dict[str, float]:
-    """Return accuracy, balanced accuracy, calibration error and recalls.
+def metrics(
+    probabilities: Tensor, labels: Tensor, task: Task, point: OperatingPoint | None = None
+) -> dict[str, float]:
+    """Return accuracy, balanced accuracy, calibration error and what the alarm reaches.
 
     Args:
         probabilities: (B, L); of a direction the mean cosines.
         labels: (B, L), 0 or 1; of a direction the cosines.
         task: what the labels mean.
-        false_alarm_rate: share of false alarms at which the recall of ``dangerous`` is read.
+        point: where the alarm is raised; None: nothing is said of the alarm.
 
     Returns:
-        ``<label>/accuracy``, ``/balanced_accuracy`` and ``/ece`` for each label of a binary task,
-        ``dangerous/recall``, and ``overall/accuracy``: the mean of the labels' accuracies (report, 3.2); an
-        exclusive task has only this. Where the task has a gate, the other labels are measured on the touches
+        ``<label>/accuracy``, ``/balanced_accuracy`` and ``/ece`` for each label of a binary task, and
+        ``overall/accuracy``: the mean of the labels' accuracies (report, 3.2); an exclusive task has only
+        this. Accuracies are those of a threshold of 0.5. With an operating point there are
+        ``dangerous/alarm_recall`` and ``dangerous/false_alarm_rate`` at its threshold; NaN where no touch is
+        dangerous, or none safe. Where the task has a gate, the other labels are measured on the touches
         in which it is open, and the gate itself is no part of the overall. Where it has a direction, there
         are ``direction/degrees``, the mean size of the error, and ``direction/accuracy``, the share of errors
         up to 45 degrees, of the touches that have one (blind guesses: 90 and .25); no part of the overall.
     """
+    alarm: dict[str, float] = {}
+    if point is not None:
+        reached = point.reached(probabilities, labels, task)
+        alarm[f"{LABEL}/alarm_recall"] = reached.recall
+        alarm[f"{LABEL}/false_alarm_rate"] = reached.false_alarm_rate
     if task.kind == "exclusive":
         right = multiclass_accuracy(probabilities, labels.argmax(1), len(task), average="micro")
-        return {"overall/accuracy": float(right)}
+        return {"overall/accuracy": float(right)} | alarm
     values: dict[str, float] = {}
     pairs = _pairs(probabilities, labels, task)
     for name, (chance, label) in zip(task.binary, pairs, strict=True):
@@ -46,8 +55,6 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
         values[f"{name}/accuracy"] = float(((chance > 0.5) == (label > 0)).float().mean())
         values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = float(binary_calibration_error(chance, label, n_bins=15))
-        if name == "dangerous":
-            values[f"{name}/recall"] = recall_at(false_alarm_rate, chance, label)
     for metric in ("accuracy", "balanced_accuracy", "ece"):
         each = [values[f"{name}/{metric}"] for name in task.gated]
         values[f"overall/{metric}"] = sum(each) / len(each)
@@ -55,7 +62,7 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
         degrees = angles(probabilities, labels, task)
         values["direction/degrees"] = float(degrees.mean())
         values["direction/accuracy"] = float((degrees <= 45).float().mean())
-    return values
+    return values | alarm
 
 
 def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
@@ -67,24 +74,6 @@ def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
     (x, y), (cos, sin) = probabilities[rows, -2:].double().T, labels[rows, -2:].double().T
     angle = torch.atan2(x * sin - y * cos, x * cos + y * sin).abs() * 180 / math.pi
     return angle.where((x != 0) | (y != 0), 90)
-
-
-def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
-    """Return the largest share of true cases found by a threshold that raises at most so many false alarms.
-
-    Args:
-        false_alarm_rate: largest share of the false cases that may be called true.
-        chance: (B,), probabilities.
-        label: (B,), 0 or 1, integer.
-    """
-    false_alarms, recall, _ = binary_roc(chance, label)
-    return float(recall[false_alarms <= false_alarm_rate].max())
-
-
-def alarm_level(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
-    """Return the probability from which on alarms are raised to reach :func:`recall_at`; same arguments."""
-    false_alarms, _, levels = binary_roc(chance, label)
-    return float(levels[false_alarms <= false_alarm_rate].min())
 
 
 def confusion(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:

@@ -1,7 +1,8 @@
 """On what a trained learner is tried: its own device, unseen devices, unseen layouts."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import isnan, nan
 from statistics import fmean
 from typing import Literal, Protocol
 
@@ -15,6 +16,7 @@ from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.metrics import confusion, metrics
+from skin.evaluation.operating_point import OperatingPoint, Reached
 from skin.labels import Task
 from skin.layout.scattered import Scattered
 from skin.recording import Touches
@@ -37,18 +39,22 @@ class Report:
     """What an evaluation found.
 
     Attributes:
-        metrics: ``<column>/<label>/<metric>``, with the columns ``same`` (test gestures felt by the device of
-            the training), ``holdout`` (the training budget's last tenth), ``device_shift`` and
-            ``unseen_layout`` (means over unseen devices and layouts).
+        metrics: ``<column>/<label>/<metric>``, NaN where it is undefined, with the columns ``same`` (test
+            gestures felt by the device of the training), ``holdout`` (the training budget's last tenth),
+            ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
         cannot: column -> why the learner has no figures in it.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.
+        point: where the alarm is raised; None where the task has no label ``dangerous``.
+        reached: the alarms on the gestures of ``same``; None without ``point``.
     """
 
     metrics: dict[str, float]
     cannot: dict[str, str]
     confusion: Tensor | None
     predictions: pa.Table
+    point: OperatingPoint | None = None
+    reached: Reached | None = None
 
 
 def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
@@ -62,27 +68,42 @@ def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[
     return sets
 
 
-def evaluate(learner: Answers, device: AbstractDevice, settings: Evaluation) -> Report:
-    """Try a trained learner on a device and, where it is simulated, on others like it."""
+def evaluate(
+    learner: Answers, device: AbstractDevice, settings: Evaluation, point: OperatingPoint | None
+) -> Report:
+    """Try a trained learner on a device and, where it is simulated, on others like it.
+
+    Args:
+        learner: trained.
+        device: that it was trained on, or another.
+        settings: which other devices and layouts.
+        point: where the learner raises the alarm; None where its task has no label ``dangerous``.
+    """
     task, found, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
-    found |= _named("same", metrics(chances, _labels(same), task, settings.false_alarm_rate))
+    found |= _named("same", metrics(chances, _labels(same), task, point))
     others = columns(device, settings)
     del others["same"]
     for column, sets in others.items():
         try:
             each = [
-                metrics(learner.probabilities(touches), _labels(touches), task, settings.false_alarm_rate)
-                for touches in sets
+                metrics(learner.probabilities(touches), _labels(touches), task, point) for touches in sets
             ]
         except InputError as reason:
             cannot[column] = str(reason)
             continue
         if each:
-            found |= _named(column, {name: fmean(values[name] for values in each) for name in each[0]})
+            found |= _named(column, {name: _mean([values[name] for values in each]) for name in each[0]})
     table = confusion(chances, _labels(same), task) if task.kind == "binary" else None
-    return Report(found, cannot, table, _predictions(chances, same, task, drawn))
+    reached = None if point is None else point.reached(chances, _labels(same), task)
+    return Report(found, cannot, table, _predictions(chances, same, task, drawn), point, reached)
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean of the values that are defined; NaN if none is."""
+    defined = [value for value in values if not isnan(value)]
+    return fmean(defined) if defined else nan
 
 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:

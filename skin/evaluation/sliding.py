@@ -15,6 +15,7 @@ from skin.errors import InputError
 from skin.evaluation.alarm import Alarms, count_alarms
 from skin.evaluation.course import Course
 from skin.evaluation.metrics import metrics
+from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Answers
 from skin.labels import TOUCH_OR_NOT, Task
 from skin.signal.gate import Gate, Threshold, gates, rise
@@ -23,7 +24,6 @@ __all__ = ["Bin", "Sliding", "bins", "slide"]
 
 _CHUNK = 1024
 _EDGES = (0.2, 0.4, 0.6, 0.8)
-_RATE = 0.02  # of no consequence: metrics want one, and none of theirs is used that depends on it
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class Sliding:
         hours: its length.
         lengths: frames of a window -> overall accuracy, or why the learner takes no such window.
         streamed: whether the learner was trained on windows of streams.
+        point: where the alarm is raised.
     """
 
     bins: list[Bin]
@@ -64,10 +65,15 @@ class Sliding:
     hours: float
     lengths: dict[int, float | str]
     streamed: bool
+    point: OperatingPoint
 
     def metrics(self) -> dict[str, float]:
         """Return every figure by a name that MLflow takes."""
-        values: dict[str, float] = {"stream/hours": self.hours, "gate/threshold/least": self.threshold}
+        values: dict[str, float] = {
+            "stream/hours": self.hours,
+            "gate/threshold/least": self.threshold,
+            "alarms/threshold": self.point.threshold,
+        }
         for one in self.bins:
             values |= {f"share/{one.name}/{name}/accuracy": value for name, value in one.accuracy.items()}
         for gate, counts in self.gates.items():
@@ -82,7 +88,11 @@ class Sliding:
 
 
 def slide(
-    learner: Answers, device: AbstractDevice, course: Course, track: Callable[..., Any] = iter
+    learner: Answers,
+    device: AbstractDevice,
+    course: Course,
+    point: OperatingPoint,
+    track: Callable[..., Any] = iter,
 ) -> Sliding:
     """Try a learner on windows of test streams, as its device would feel them.
 
@@ -90,6 +100,7 @@ def slide(
         learner: trained.
         device: that it was trained on.
         course: what to try.
+        point: where the learner raises the alarm.
         track: wraps the chunks of the long stream, to show how far it is, as ``rich.progress.track``.
 
     Raises:
@@ -112,10 +123,11 @@ def slide(
         bins(chances, labels, recording.parameters["share"], device.task),
         {name: binary_confusion_matrix(answer.long(), labels[:, -1].long()) for name, answer in said.items()},
         threshold.least,
-        _listen(learner, streamed, device.task, all_gates, course, track),
+        _listen(learner, streamed, device.task, all_gates, course, point, track),
         course.hours,
         {window: _length(learner, device, window) for window in course.windows},
         device.stream,
+        point,
     )
 
 
@@ -151,19 +163,20 @@ def _listen(
     task: Task,
     all_gates: dict[str, Gate],
     course: Course,
+    point: OperatingPoint,
     track: Callable[..., Any],
 ) -> dict[str, Alarms]:
     """Return the alarms of each gate while a window slides over a long stream."""
     frames = max(round(course.hours * 3600 * device.rate), device.window)
     strip = device.strip(frames, course.gap)
     starts = torch.arange(0, frames - device.window + 1, course.stride)
-    dangerous = task.names.index("dangerous")
+    dangerous = task.names.index(LABEL)
     heard: dict[str, list[Tensor]] = {name: [] for name in all_gates}
     for part in track(starts.split(_CHUNK)):
         touches = strip.cut(part, device.window).touches
         chances = learner.probabilities(touches)
         for name, gate in all_gates.items():
-            heard[name].append((chances[:, dangerous] > 0.5) & gate(touches, chances))
+            heard[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
     gesture = strip.timeline.look(starts, device.window).gesture
     truth = strip.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
     hours = course.stride / device.rate / 3600
@@ -181,7 +194,7 @@ def _length(learner: Answers, device: Simulated, window: int) -> float | str:
         press = settings.press[0], min(settings.press[1], window)
         other = device.replace(touch=replace(settings, window=window, press=press)).touches("test")
         assert other.labels is not None
-        found = metrics(learner.probabilities(other), other.labels, device.task, _RATE)
+        found = metrics(learner.probabilities(other), other.labels, device.task)
     except InputError as reason:
         return str(reason)
     return found["overall/accuracy"]

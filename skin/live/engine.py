@@ -83,6 +83,7 @@ class Engine:
         self._patience = patience or Patience()
         self._contact = Contact(len(positions), rate, detection.threshold, detection.drift)
         self._held = min(max(1, round(detection.longest * rate)), max(1, frames - 2))
+        self._above = 0.5 if self._patience.above is None else self._patience.above
         self._segment: int | None = None
         self.tared()
 
@@ -163,7 +164,7 @@ class Engine:
             return debounce(answer, frame.t, period)
 
         chance = chances.get("dangerous", 0.0)
-        raised = settled(self._labels["dangerous"], touched and chance > self._patience.above)
+        raised = settled(self._labels["dangerous"], touched and chance > self._above)
         self.alarm = raised or (self.alarm and contact)
         self._highest = max(chance, self._highest) if self.alarm else 0.0
         # An alarm does not wait until the touch is settled.

@@ -1,6 +1,6 @@
 """From a finished run to an engine that knows what it learned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from mlflow.entities import Run
@@ -12,12 +12,13 @@ from skin.device.recording import Recorded
 from skin.device.serial import Serial
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import Answers
 from skin.live.engine import Detection, Engine
 from skin.live.verdict import Patience
 from skin.port.live import Skin
 from skin.port.opening import open_skin
-from skin.reload import restore
+from skin.reload import configuration, operating_point, restore
 from skin.session.newtons import newtons
 from skin.session.taring import Tare
 from skin.signal.contact import DRIFT
@@ -41,6 +42,7 @@ class Trained:
         window: T, frames.
         positions: (S, 3), m.
         rate: Hz.
+        point: where its alarm is raised; None where it knows no label ``dangerous``.
     """
 
     device: AbstractDevice
@@ -48,6 +50,7 @@ class Trained:
     window: int
     positions: torch.Tensor
     rate: float
+    point: OperatingPoint | None = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,8 @@ def trained(store: Store, run: Run, config: DictConfig) -> Trained:
     data = build_data(own, device)
     restore(store, run, learner, data)
     known = data.touches("train")
-    return Trained(device, learner, known.readings.shape[1], known.positions, known.rate)
+    point = operating_point(run, learner, configuration(store, run), config.evaluation)
+    return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
 
 
 def engine(of: Trained, patience: Patience, touch: float | None = None, drift: float = 600 * DRIFT) -> Engine:
@@ -123,8 +127,13 @@ def engine(of: Trained, patience: Patience, touch: float | None = None, drift: f
         drift: N in ten minutes that the baseline may follow while nothing touches.
 
     Raises:
-        InputError: neither learned nor given, and no device that has streams.
+        InputError: neither learned nor given, and no device that has streams; or no probability can raise
+            the alarm of the run.
     """
+    if patience.above is None and of.point is not None:
+        if of.point.silent:
+            raise InputError(f"{of.point.warning()}: give live.patience.above=0.5, or train another run")
+        patience = replace(patience, above=of.point.threshold)
     task = of.device.task
     learned = touch is None and task.gate is not None
     least = _tuned(of.device, learned) if touch is None else touch

@@ -52,7 +52,7 @@ class Patience:
         label: of any label but ``dangerous``, and of touch.
         alarm: of ``dangerous`` before it is said: 50 ms after the frame that shows it are too late.
         calm: before it is taken back.
-        above: probability from which on a touch is said to be dangerous.
+        above: probability above which a touch is said to be dangerous; None: as the run stores it.
 
     Raises:
         InputError: a negative time, an alarm that would come too late, or no probability.
@@ -61,10 +61,10 @@ class Patience:
     label: float = 0.15
     alarm: float = 0.02
     calm: float = 0.5
-    above: float = 0.5
+    above: float | None = None
 
     def __post_init__(self) -> None:
-        if min(self.label, self.alarm, self.calm) < 0 or not 0 < self.above < 1:
+        if min(self.label, self.alarm, self.calm) < 0 or not (self.above is None or 0 < self.above < 1):
             raise InputError(f"live.patience takes times from 0 s up and above= between 0 and 1, got {self}")
         if self.alarm > 0.03:
             raise InputError(

@@ -14,6 +14,7 @@ from torch import Tensor
 from skin.config import Evaluation
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.operating_point import gestures
 from skin.evaluation.report import columns
 from skin.labels import Task
 from skin.recording import Recording, Touches
@@ -31,9 +32,10 @@ def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
     """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
     ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
-    engineered measurements, one row per touch. Sets: ``train``, ``validation``, then
-    ``<column>_<number>`` for the sets of :func:`skin.evaluation.report.columns`. ``sets.json``, written last,
-    names the content of each set: set -> digest. A folder with other touches is emptied, answers and all.
+    engineered measurements, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
+    alarm's threshold is chosen), then ``<column>_<number>`` for the sets of
+    :func:`skin.evaluation.report.columns`. ``sets.json``, written last, names the content of each set: set ->
+    digest. A folder with other touches is emptied, answers and all.
 
     Args:
         device: whose touches.
@@ -41,12 +43,13 @@ def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
         folder: made if it is missing.
     """
     if (folder / SETS).is_file():
-        if json.loads((folder / SETS).read_text())["train"] == digest(device.touches("train")):
+        known = json.loads((folder / SETS).read_text())
+        if known["train"] == digest(device.touches("train")) and "alarm" in known:
             return
         shutil.rmtree(folder)
-    known = {}
-    for name in ("train", "validation"):
-        known[name] = _export(device.touches(name), device, folder, name)
+    learnt = {name: device.touches(name) for name in ("train", "validation")}
+    first = learnt | {"alarm": gestures(device, settings)}
+    known = {name: _export(touches, device, folder, name) for name, touches in first.items()}
     for column, sets in columns(device, settings).items():
         numbers = count()
         try:

@@ -11,6 +11,7 @@ from skin.build import build_device
 from skin.config import fingerprint, plain
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.operating_point import choose
 from skin.evaluation.report import evaluate
 from skin.peers.exchange import ABOUT, Foreign, export
 from skin.run import conclude, describe, tags
@@ -52,7 +53,8 @@ def learn(
             _follow([*command, config.row, str(where), *jobs], say)
         say("evaluating")
         peer = Foreign(where, config.row, device.task)
-        report = evaluate(peer, device, config.evaluation)
+        point = choose(peer, device, config.evaluation)
+        report = evaluate(peer, device, config.evaluation, point)
         values = {"seconds_per_epoch": peer.about["seconds"], "parameters": peer.about["parameters"]}
         conclude(store, run, report, device.task, values)
         store.client.log_dict(run.info.run_id, peer.about, ABOUT)

@@ -82,8 +82,7 @@ def try_run(
     trials = []
     for name, felt in touches.items():
         assert felt.labels is not None
-        rate = config.evaluation.false_alarm_rate
-        figures = metrics(learner.probabilities(felt), felt.labels, device.task, rate)
+        figures = metrics(learner.probabilities(felt), felt.labels, device.task)
         labels = {label: figures[f"{label}/accuracy"] for label in ("overall", *device.task.names)}
         trials.append(Trial(config.row, trained, name, str(config.seed), labels))
     return trials

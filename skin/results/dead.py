@@ -86,7 +86,7 @@ def try_run(store: Store, line: str, run: Run, config: DictConfig, settings: Dea
                 seed=_FIRST + number, dead=count, randomise=False, test_gestures=settings.gestures
             ).touches("test")
             assert touches.labels is not None
-            figures = metrics(learner.probabilities(touches), touches.labels, device.task, 0.02)
+            figures = metrics(learner.probabilities(touches), touches.labels, device.task)
             accuracy[f"{own.seed}.{number}"] = 100 * figures["overall/accuracy"]
         trials.append(Trial(line, f"{count} of {len(device.sensors)} dead", accuracy))
     return trials

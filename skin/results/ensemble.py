@@ -14,6 +14,7 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
+from skin.evaluation.operating_point import choose, gestures
 from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
 from skin.peers.exchange import digest
@@ -185,7 +186,9 @@ def _ask(
 ) -> _Asked:
     """Bring every member back and ask it about every column, of which it takes all sets or none."""
     say("drawing touches")
-    sets = {column: _drawn(drawn) for column, drawn in columns(device, members[0][0].evaluation).items()}
+    settings = members[0][0].evaluation
+    sets = {column: _drawn(drawn) for column, drawn in columns(device, settings).items()}
+    sets["alarm"] = [gestures(device, settings)]
     answers: dict[str, list[Tensor]] = {}
     left_out: dict[str, str] = {}
     for config, run in members:
@@ -219,7 +222,8 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
         groups = ("representation", "model", "fusion", "learner", "optimizer", "trainer", "epochs")
         kept = {key: value for key, value in plain(config).items() if key not in groups}
         describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))
-        report = evaluate(known, device, config.evaluation)
+        point = choose(known, device, config.evaluation)
+        report = evaluate(known, device, config.evaluation, point)
         chances = asked.chances[digest(next(columns(device, config.evaluation)["same"]))]
         differ = disagreement(chances, device.task)
         conclude(store, run, report, device.task, {f"same/{name}{_DIFFER}": x for name, x in differ.items()})

@@ -50,7 +50,7 @@ def line(found: Margins) -> str:
         f"{near['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes {_FAINT:g} N in "
         f"{faint} of {wrong['dynamic']} errors of dynamic; {sum(one.wrong for one in clear)} of "
         f"{sum(one.count for one in clear)} touches more than 10 % above the threshold of dangerous raise no "
-        f"alarm where {100 * found.false_alarm_rate:g} % may be false"
+        f"alarm; {found.point.sentence()}; {found.reached.sentence()}"
     )
 
 
@@ -75,7 +75,7 @@ def _tables(found: Margins) -> dict[str, list[list[str]]]:
 
 def _heading(name: str, found: Margins) -> str:
     if name == ALARM:
-        return f"Alarm, {100 * found.false_alarm_rate:g} % false ones allowed"
+        return f"Alarm above {found.point.threshold:.4f}"
     return f"{name.capitalize()} or {OPPOSITE[name]}"
 
 

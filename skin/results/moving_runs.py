@@ -158,9 +158,7 @@ def _accuracy(learner: AbstractLearner, device: Simulated) -> float:
     """Return the overall accuracy on a device's test touches, per cent."""
     touches = device.touches("test")
     assert touches.labels is not None
-    return (
-        100 * metrics(learner.probabilities(touches), touches.labels, device.task, 0.02)["overall/accuracy"]
-    )
+    return 100 * metrics(learner.probabilities(touches), touches.labels, device.task)["overall/accuracy"]
 
 
 def train_lines(overrides: Sequence[str], seeds: Sequence[int]) -> list[Trial]:

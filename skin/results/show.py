@@ -7,6 +7,7 @@ from rich.table import Table
 
 from skin.evaluation.report import Report
 from skin.results.table import LABELS, beside, percent
+from skin.results.verdicts import SHARES, shown
 
 __all__ = ["report", "results"]
 
@@ -24,14 +25,17 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
     console = console or Console()
     columns = list(dict.fromkeys(name.split("/")[0] for name in found.metrics))
     lines = dict.fromkeys(
-        name.split("/", 1)[1] for name in found.metrics if name.endswith(("/accuracy", "/recall", "/degrees"))
+        name.split("/", 1)[1] for name in found.metrics if name.endswith((*SHARES, "/degrees"))
     )
     table = Table("", *columns, title=title)
     for line in lines:
         values = (found.metrics.get(f"{column}/{line}") for column in columns)
         unit = 1 if line.endswith("/degrees") else 100
-        table.add_row(line, *("" if value is None else f"{unit * value:.1f}" for value in values))
+        table.add_row(line, *(shown(value, unit) for value in values))
     console.print(table)
+    if found.point is not None and found.reached is not None:
+        said = f"{found.point.sentence()}; {found.reached.sentence()}"
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
     for column, reason in found.cannot.items():
         console.print(f"{column}: {reason}", markup=False)
 
@@ -47,7 +51,7 @@ def results(lines: Sequence[dict[str, str]], title: str, console: Console | None
     table = Table(title=title, box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("row", "data"):
         table.add_column(head, no_wrap=True)
-    for head in ("overall", "big", "dyn.", "press", "dang.", "recall", "device", "layout"):
+    for head in ("overall", "big", "dyn.", "press", "dang.", "recall", "false", "device", "layout"):
         table.add_column(head, no_wrap=True, justify="right")
     for start in range(0, len(lines), len(LABELS)):
         group = {line["label"]: line for line in lines[start : start + len(LABELS)]}

@@ -19,7 +19,8 @@ def publish(found: Sliding, title: str, path: Path) -> list[Path]:
     """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
     sections = [markdown(table, heading).replace("# ", "## ", 1) for heading, table in _tables(found).items()]
     learnt = "windows of streams" if found.streamed else "whole touches"
-    text = f"# {title}\n\nTrained on {learnt}, tried on windows of streams.\n\n" + "\n".join(sections)
+    about = f"Trained on {learnt}, tried on windows of streams; {found.point.sentence()}."
+    text = f"# {title}\n\n{about}\n\n" + "\n".join(sections)
     paths = [path.with_name(path.name + ending) for ending in (".md", ".csv", ".png")]
     write(text, paths[0])
     write(_csv(found), paths[1])

@@ -17,8 +17,9 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint
 from skin.errors import InputError
 from skin.evaluation.course import Course
+from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.sliding import slide
-from skin.reload import changed, configuration, restore
+from skin.reload import TAG, changed, configuration, operating_point, restore
 from skin.results.sliding import line, publish
 from skin.tracking import Store
 
@@ -71,12 +72,13 @@ def try_run(
     Raises:
         InputError: overrides that do not fit the run, or a device that has no streams.
     """
-    own = changed(configuration(store, run), config, [one for one in overrides if not _ours(one)])
-    asked = json.dumps([vars(course), fingerprint(own)], sort_keys=True)
+    stored = configuration(store, run)
+    own = changed(stored, config, [one for one in overrides if not _ours(one)])
+    asked = json.dumps([vars(course), fingerprint(own), run.data.tags.get(TAG)], sort_keys=True)
     tags = {"evaluated": run.info.run_id, "stream": hashlib.sha256(asked.encode()).hexdigest()[:16]}
     known = store.find("FINISHED", **tags) if config.tracking.resume else []
     if not known:
-        _try(store, run, own, course, tags)
+        _try(store, run, stored, own, course, tags)
         known = store.find("FINISHED", **tags)
     with TemporaryDirectory(dir=_made(folder)) as holder:
         fetched = download_artifacts(run_id=known[0].info.run_id, dst_path=holder, tracking_uri=store.uri)
@@ -85,11 +87,15 @@ def try_run(
     return f"{run.info.run_name} ({run.info.run_id[:8]}): {known[0].data.tags['outcome']}"
 
 
-def _try(store: Store, run: Run, own: DictConfig, course: Course, tags: dict[str, str]) -> None:
+def _try(
+    store: Store, run: Run, stored: DictConfig, own: DictConfig, course: Course, tags: dict[str, str]
+) -> None:
     device, learner = build_device(own), build_learner(own)
     restore(store, run, learner, build_data(own, device))
+    point = operating_point(run, learner, stored, own.evaluation)
+    point = point or OperatingPoint.default(own.evaluation.false_alarm_rate)
     progress = partial(track, description=run.info.run_name, console=Console(stderr=True), transient=True)
-    found = slide(learner, device, course, progress)
+    found = slide(learner, device, course, point, progress)
     name = f"stream_{own.row}" + ("_streams" if found.streamed else "")
     with store.run(f"streams of {run.info.run_name}", tags, run.info.run_id) as logged:
         store.log_metrics(logged, found.metrics())

@@ -35,6 +35,7 @@ SMOKE = (
     "trainer.max_epochs=1",
     "evaluation.devices=0",
     "evaluation.layouts=0",
+    "evaluation.safe_gestures=48",
     "tracking.experiment=smoke",
 )
 """Overrides that shrink every run to a second; its figures mean nothing."""

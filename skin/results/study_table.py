@@ -13,11 +13,15 @@ from rich.table import Table
 
 from skin.results.findings import COSTS, Finding, Outcome
 from skin.results.study import Paired
-from skin.results.table import LABELS, markdown, write
+from skin.results.table import ACCURACIES, ALARM, markdown, write
 
 __all__ = ["as_csv", "measured", "page", "publish", "show", "statements", "variants"]
 
-_MEASURES = (*(f"same/{label}/accuracy" for label in LABELS[:-1]), "same/dangerous/recall", *COSTS)
+_MEASURES = (
+    *(f"same/{label}/accuracy" for label in ACCURACIES),
+    *(f"same/{metric}" for metric in ALARM.values()),
+    *COSTS,
+)
 
 
 def variants(findings: Sequence[Finding], brief: bool = False) -> list[list[str]]:
@@ -28,7 +32,7 @@ def variants(findings: Sequence[Finding], brief: bool = False) -> list[list[str]
         brief: leave out the deviations of all but the overall accuracy.
     """
     extra = list(dict.fromkeys(name for finding in findings for name in finding.extra))
-    lines = [["variant", *LABELS[:-1], "recall", "s/epoch", "parameters", *extra]]
+    lines = [["variant", *ACCURACIES, "recall", "false alarms", "s/epoch", "parameters", *extra]]
     for finding in findings:
         partly = f" ({finding.missing} failed)" if finding.missing else ""
         cells = [_cell([*finding.values(metric).values()], metric, brief) for metric in _MEASURES]

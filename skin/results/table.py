@@ -14,6 +14,8 @@ from skin.config import fingerprint
 from skin.tracking import Store
 
 __all__ = [
+    "ACCURACIES",
+    "ALARM",
     "COLUMNS",
     "LABELS",
     "Cell",
@@ -26,7 +28,10 @@ __all__ = [
     "write",
 ]
 
-LABELS = ("overall", "big", "dynamic", "press", "dangerous", "dangerous_recall")
+ACCURACIES = ("overall", "big", "dynamic", "press", "dangerous")
+ALARM = {"dangerous_recall": "dangerous/alarm_recall", "false_alarms": "dangerous/false_alarm_rate"}
+"""Label in the table -> metric; at the threshold that is stored with each run."""
+LABELS = (*ACCURACIES, *ALARM)
 COLUMNS = (
     "row",
     "simulator",
@@ -94,15 +99,16 @@ def report_values(path: Path) -> dict[tuple[str, str, str], float]:
 def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> list[dict[str, str]]:
     """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
 
-    ``ours`` is the mean over seeds of the accuracy on the test gestures, or of that recall; ``failed`` where
-    no run finished. The column ``failed`` counts the seeds that are missing.
+    ``ours`` is the mean over seeds of the accuracy on the test gestures, or of what the alarm reaches there
+    with the threshold stored with each run; ``failed`` where no run finished, empty where it is
+    undefined. The column ``failed`` counts the seeds that are missing.
     """
     lines = []
     for cell in cells:
         for label in LABELS:
             same = cell.values(_metric("same", label))
             values = {
-                "ours": _number(same) if same else "failed",
+                "ours": _number(same) if cell.runs else "failed",
                 "ours_sd": f"{stdev(same):.4f}" if len(same) > 1 else "",
                 "report": _reported(report.get((cell.row, cell.simulator, label))),
                 "device_shift": cell.shift("device_shift", label),
@@ -120,8 +126,9 @@ def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
 
     Where the report has a number, it stands behind ours.
     """
-    head = ["row", "simulator", "overall", "big", "dynamic", "press", "dangerous", "recall"]
-    table = [[*head, "device shift", "unseen layout", "s/epoch", "parameters"]]
+    head = ["row", "simulator", "overall", "big", "dynamic", "press", "dangerous", "recall", "false alarms"]
+    shifts = ["device shift", "its recall", "its false alarms", "unseen layout"]
+    table = [[*head, *shifts, "s/epoch", "parameters"]]
     for start in range(0, len(lines), len(LABELS)):
         group = {line["label"]: line for line in lines[start : start + len(LABELS)]}
         whole = group["overall"]
@@ -129,7 +136,8 @@ def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
         table.append(
             [whole["row"] + (f" ({whole['failed']} failed)" if partly else ""), whole["simulator"]]
             + [beside(group[label]) for label in LABELS]
-            + [percent(whole["device_shift"]), percent(whole["unseen_layout"])]
+            + [percent(group[label]["device_shift"]) for label in ("overall", *ALARM)]
+            + [percent(whole["unseen_layout"])]
             + [whole["seconds_per_epoch"], whole["parameters"]]
         )
     return table
@@ -159,7 +167,7 @@ def as_csv(lines: Sequence[dict[str, str]]) -> str:
 
 
 def _metric(column: str, label: str) -> str:
-    return f"{column}/dangerous/recall" if label == "dangerous_recall" else f"{column}/{label}/accuracy"
+    return f"{column}/{ALARM.get(label, f'{label}/accuracy')}"
 
 
 def _number(values: Sequence[float], digits: int = 4) -> str:
@@ -173,7 +181,7 @@ def _reported(value: float | None) -> str:
 def beside(line: dict[str, str]) -> str:
     """Return our number with its deviation and, in brackets, the report's."""
     reported = percent(line["report"])
-    return percent(line["ours"], line["ours_sd"]) + (f" ({reported})" if reported else "")
+    return (percent(line["ours"], line["ours_sd"]) or "-") + (f" ({reported})" if reported else "")
 
 
 def percent(value: str, deviation: str = "") -> str:

@@ -9,11 +9,15 @@ import pyarrow as pa
 import pyarrow.csv
 from torch import Tensor
 
+from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Report
 from skin.labels import Task
 from skin.results.figures import confusions, save
 
-__all__ = ["page", "publish", "verdicts", "whole"]
+__all__ = ["SHARES", "page", "publish", "shown", "verdicts", "whole"]
+
+SHARES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
+"""How the names of the metrics end that are shown in per cent."""
 
 
 def page(found: Report, task: Task, title: str, about: str) -> str:
@@ -30,12 +34,14 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
     lines.append("|---" * (len(columns) + 1) + "|")
     rows = dict.fromkeys(name.split("/", 1)[1] for name in found.metrics)
     for row in rows:
-        if row.endswith(("/accuracy", "/recall")):
+        if row.endswith(SHARES):
             shares = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join('' if x is None else f'{100 * x:.1f}' for x in shares)} |")
+            lines.append(f"| {row} | {' | '.join(shown(x) for x in shares)} |")
         if row.endswith("/degrees"):
             sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
             lines.append(f"| {row} | {' | '.join('' if x is None else f'{x:.1f}°' for x in sizes)} |")
+    if found.point is not None and found.reached is not None:
+        lines += ["", f"{found.point.sentence()}; {found.reached.sentence()}."]
     lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
     if found.confusion is not None:
         lines += [
@@ -57,12 +63,18 @@ def publish(path: Path, found: Report, task: Task, title: str, about: str) -> li
     return written
 
 
-def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
+def shown(value: float | None, unit: float = 100) -> str:
+    """Return a value times ``unit`` with one decimal; "-" where it is undefined, "" where there is none."""
+    return "" if value is None else "-" if math.isnan(value) else f"{unit * value:.1f}"
+
+
+def verdicts(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> tuple[str, Path]:
     """Write the probability of each label, gesture by gesture, where nobody knows the truth.
 
     Args:
         chances: (B, L); of a direction the mean cosines.
         task: the labels.
+        point: where the alarm is raised; a gesture is said to be dangerous there, as ``live`` says it.
         path: x.csv.
 
     Returns:
@@ -74,10 +86,11 @@ def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     pa.csv.write_csv(table, partial)
     partial.replace(path)
+    levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
     said = [
         f"gesture {number}: "
         + ", ".join(
-            f"{'' if chance > 0.5 else 'not '}{name} ({chance:.2f})"
+            f"{'' if chance > levels[name] else 'not '}{name} ({chance:.2f})"
             for name, chance in zip(task.binary, row, strict=False)
         )
         + (_slide(row, task) if task.direction else "")

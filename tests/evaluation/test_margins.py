@@ -6,9 +6,11 @@ import torch
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.evaluation.margins import ALARM, margins, spans
-from skin.evaluation.metrics import alarm_level, recall_at
+from skin.evaluation.operating_point import OperatingPoint
 from skin.labels import TOUCH
 from skin.recording import Touches
+
+POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
 
 
 class Sure:
@@ -42,16 +44,6 @@ def test_ranges_are_exact():
     assert one.range == pytest.approx((0, 1 - 0.025**0.1))
 
 
-def test_alarms_are_raised_from_the_level_on():
-    generator = torch.Generator().manual_seed(0)
-    label = torch.rand(500, generator=generator).round().long()
-    chance = (torch.rand(500, generator=generator) + 0.4 * label) / 1.4
-    level = alarm_level(0.05, chance, label)
-    alarm = chance >= level
-    assert alarm[label == 0].float().mean() <= 0.05
-    assert float(alarm[label == 1].float().mean()) == pytest.approx(recall_at(0.05, chance, label))
-
-
 @pytest.fixture(scope="module")
 def device(configured) -> AbstractDevice:
     from skin.build import build_device
@@ -61,7 +53,7 @@ def device(configured) -> AbstractDevice:
 
 def test_the_labels_are_what_the_measures_say(device):
     """A learner that says the labels is wrong in no span; every label changes where its measure passes 1."""
-    found = margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, 0.02)
+    found = margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, POINT)
     assert set(found.spans) == {*TOUCH.names, ALARM}
     for each in found.spans.values():
         assert sum(one.count for one in each) == 200
@@ -74,7 +66,7 @@ def test_the_labels_are_what_the_measures_say(device):
 def test_errors_are_found_where_they_are(device):
     but = torch.zeros(200, 4, dtype=torch.bool)
     but[:7, 1] = True
-    found = margins(Sure(but), device, 200, 0.02)
+    found = margins(Sure(but), device, 200, POINT)
     assert sum(one.wrong for one in found.spans["dynamic"]) == 7
     assert sum(one.wrong["dynamic"] for one in found.faint) == 7
     assert sum(one.wrong for one in found.spans["big"]) == 0
@@ -82,4 +74,13 @@ def test_errors_are_found_where_they_are(device):
 
 def test_only_simulated_touches_are_known(made_up_device):
     with pytest.raises(InputError, match="device=simulated"):
-        margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, 0.02)
+        margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, POINT)
+
+
+def test_the_alarm_is_raised_at_the_operating_point_and_the_label_at_one_half(device):
+    """Whoever says 0.9 at most raises no alarm above 0.95."""
+    shy = OperatingPoint(0.95, 0.02, 64, 1, 0)
+    found = margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, shy)
+    assert sum(one.said for one in found.spans[ALARM]) == 0
+    assert sum(one.said for one in found.spans["dangerous"]) == 100
+    assert (found.reached.recall, found.reached.false_alarm_rate, found.reached.safe) == (0, 0, 100)

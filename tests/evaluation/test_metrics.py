@@ -6,7 +6,7 @@ import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
-from skin.evaluation.metrics import angles, confusion, metrics, recall_at
+from skin.evaluation.metrics import angles, confusion, metrics
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
 
@@ -21,7 +21,7 @@ def scored():
 
 def test_accuracies_are_those_of_scikit_learn(scored):
     chances, labels = scored
-    found = metrics(chances, labels, TOUCH, 0.02)
+    found = metrics(chances, labels, TOUCH)
     for i, name in enumerate(TOUCH.names):
         said = chances[:, i] > 0.5
         assert found[f"{name}/accuracy"] == pytest.approx(accuracy_score(labels[:, i], said))
@@ -31,26 +31,15 @@ def test_accuracies_are_those_of_scikit_learn(scored):
 
 
 def test_overall_is_the_mean_of_the_labels(scored):
-    found = metrics(*scored, TOUCH, 0.02)
+    found = metrics(*scored, TOUCH)
     each = [found[f"{name}/accuracy"] for name in TOUCH.names]
     assert found["overall/accuracy"] == pytest.approx(sum(each) / 4)
-
-
-@pytest.mark.parametrize("rate", [0.0, 0.02, 0.1, 0.5])
-def test_recall_is_the_best_of_all_thresholds_that_keep_the_rate(scored, rate):
-    chance, label = scored[0][:, 3], scored[1][:, 3]
-    best = 0.0
-    for threshold in chance.tolist():
-        said = chance >= threshold
-        if said[label == 0].float().mean() <= rate + 1e-9:
-            best = max(best, float(said[label == 1].float().mean()))
-    assert recall_at(rate, chance, label.long()) == pytest.approx(best)
 
 
 def test_calibration_error_of_a_constant_is_its_distance_from_the_share():
     labels = torch.zeros(100, 4)
     labels[:30] = 1
-    found = metrics(torch.full((100, 4), 0.9), labels, TOUCH, 0.02)
+    found = metrics(torch.full((100, 4), 0.9), labels, TOUCH)
     assert found["press/ece"] == pytest.approx(0.6, abs=1e-6)
     assert found["overall/ece"] == pytest.approx(0.6, abs=1e-6)
 
@@ -65,7 +54,7 @@ def test_exclusive_labels_have_one_accuracy():
     task = Task(("poke", "stroke", "slap"), "exclusive")
     labels = torch.eye(3)[torch.tensor([0, 1, 2, 2])]
     chances = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.5, 0.3, 0.2], [0.2, 0.2, 0.6]])
-    assert metrics(chances, labels, task, 0.02) == {"overall/accuracy": 0.75}
+    assert metrics(chances, labels, task) == {"overall/accuracy": 0.75}
 
 
 def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
@@ -73,8 +62,8 @@ def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
     touched = torch.arange(400) % 3 > 0
     said = torch.where(torch.arange(400) % 4 > 0, 0.9, 0.2)
     labels = torch.cat([labels * touched[:, None], touched[:, None].float()], dim=1)
-    found = metrics(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT, 0.02)
-    alone = metrics(chances[touched], labels[touched, :4], TOUCH, 0.02)
+    found = metrics(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
+    alone = metrics(chances[touched], labels[touched, :4], TOUCH)
     gate = {name: value for name, value in found.items() if name.startswith("touch/")}
     assert {name: value for name, value in found.items() if name not in gate} == alone
     assert gate["touch/accuracy"] == pytest.approx(accuracy_score(touched, said > 0.5))
@@ -89,13 +78,13 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
     slides = torch.stack([truth.cos(), truth.sin()], dim=1)
     slides[::3] = 0
     said = 0.3 * torch.stack([(truth + error).cos(), (truth + error).sin()], dim=1)
-    found = metrics(torch.cat([chances, said], 1), torch.cat([labels, slides], 1), TOUCH_SLIDING, 0.02)
+    found = metrics(torch.cat([chances, said], 1), torch.cat([labels, slides], 1), TOUCH_SLIDING)
     # The short way round; -3 + -4 and 3 + 4 pass behind the back.
     sizes = [min(abs(one), 2 * math.pi - abs(one)) for n, one in enumerate(error.tolist()) if n % 3]
     assert found["direction/degrees"] == pytest.approx(math.degrees(sum(sizes) / len(sizes)), rel=1e-5)
     within = sum(size <= math.pi / 4 for size in sizes) / len(sizes)
     assert found["direction/accuracy"] == pytest.approx(within)
-    alone = metrics(chances, labels, TOUCH, 0.02)
+    alone = metrics(chances, labels, TOUCH)
     assert {name: found[name] for name in alone} == alone
     assert len(found) == len(alone) + 2
 

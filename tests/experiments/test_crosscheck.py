@@ -6,7 +6,12 @@ import pytest
 
 SMALL = [
     *("body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100"),
-    *("touch.small_area=[0.1,0.3]", "data.gestures=200", "device.test_gestures=100"),
+    *(
+        "touch.small_area=[0.1,0.3]",
+        "data.gestures=200",
+        "device.test_gestures=100",
+        "evaluation.safe_gestures=64",
+    ),
 ]
 
 

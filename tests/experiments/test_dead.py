@@ -8,7 +8,7 @@ from skin.results.dead import publish
 from skin.results.moving_runs import Trial
 
 SMALL = ["data.gestures=80", "trainer.max_epochs=1", "device.test_gestures=48", "evaluation.devices=0"]
-SMALL += ["evaluation.layouts=0", "layout=grid"]
+SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64", "layout=grid"]
 
 
 @pytest.mark.slow

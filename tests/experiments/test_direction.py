@@ -10,7 +10,7 @@ import pytest
 @pytest.mark.slow
 def test_it_trains_every_skin_once(run, tmp_path):
     few = ["direction.seeds=[0]", "direction.rows=[features]", "body.cells=[8,8]", "simulator.divisions=1"]
-    small = ["data.gestures=120", "device.test_gestures=64", f"out={tmp_path}"]
+    small = ["data.gestures=120", "device.test_gestures=64", "evaluation.safe_gestures=64", f"out={tmp_path}"]
     done = run(tmp_path, "direction.py", *few, *small)
     assert done.returncode == 0, done.stderr
     lines = list(csv.DictReader((tmp_path / "direction.csv").read_text().splitlines()))

@@ -3,7 +3,7 @@
 import pytest
 
 SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=32", "evaluation.devices=1",
-         "evaluation.layouts=1", "evaluation.gestures=32"]  # fmt: skip
+         "evaluation.layouts=1", "evaluation.safe_gestures=64", "evaluation.gestures=32"]  # fmt: skip
 FEW = ["embeddings.train=80", "embeddings.test=40", "embeddings.seeds=[0]", "embeddings.epochs=2",
        "embeddings.layouts=2", "embeddings.attributes=[reading]"]  # fmt: skip
 

@@ -19,6 +19,7 @@ SMALL = [
     "device.test_gestures=48",
     "evaluation.devices=1",
     "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
     "evaluation.gestures=48",
 ]
 

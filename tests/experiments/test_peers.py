@@ -26,6 +26,7 @@ SMALL = [
     "device.test_gestures=96",
     "evaluation.devices=1",
     "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
     "evaluation.gestures=48",
 ]
 
@@ -56,7 +57,7 @@ def exchanged(configured, tmp_path_factory):
     """A device with a dead sensor and the folder of its exported touches."""
     device = build_device(configured("simulator=naive", *SMALL, "device.dead=1"))
     folder = tmp_path_factory.mktemp("exchanged") / "files"
-    export(device, Evaluation(1, 1, 48, 0.02), folder)
+    export(device, Evaluation(1, 1, 48, 0.02, 64), folder)
     return device, folder
 
 

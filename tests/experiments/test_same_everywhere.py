@@ -18,7 +18,7 @@ from skin.storage import read
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 SMALL = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
-SMALL += ["evaluation.layouts=1", "evaluation.gestures=96"]
+SMALL += ["evaluation.layouts=1", "evaluation.safe_gestures=64", "evaluation.gestures=96"]
 COUNT = 8
 PATIENCE = 300  # s: machines are busy at times
 

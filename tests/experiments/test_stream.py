@@ -5,7 +5,13 @@ import sqlite3
 
 import pytest
 
-SMALL = ["data.gestures=200", "device.test_gestures=120", "evaluation.devices=1", "evaluation.layouts=1"]
+SMALL = [
+    "data.gestures=200",
+    "device.test_gestures=120",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
+]
 SHORT = ["rows=all", "simulator=naive", "stream.hours=0.02", "stream.gap=[20,60]"]
 
 

@@ -146,7 +146,7 @@ def test_a_direction_is_learnt_or_refused_by_name(made, configured, tmp_path):
     touches = device.touches("test")
     result = learner.probabilities(touches)
     assert result.shape == (80, 6)
-    found = metrics(result, touches.labels, device.task, 0.02)
+    found = metrics(result, touches.labels, device.task)
     assert found["direction/degrees"] < 30
     assert found["direction/accuracy"] > 0.8
     other = made[0]()

@@ -17,6 +17,7 @@ SMALL = [
     "device.test_gestures=96",
     "evaluation.devices=1",
     "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
     "evaluation.gestures=96",
 ]
 PATIENCE = 240  # s, on a machine that is busy with other things

@@ -24,6 +24,7 @@ SMALL = (
     "device.test_gestures=96",
     "evaluation.devices=1",
     "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
     "evaluation.gestures=48",
 )
 ROWS = ("rules", "linked_graph", "temporal_graph")

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from skin.evaluation.alarm import Alarms
+from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.sliding import Bin, Sliding
 from skin.results.sliding import line, publish
 
@@ -22,6 +23,7 @@ FOUND = Sliding(
     hours=0.6,
     lengths={20: 0.8125, 60: "made for 30"},
     streamed=False,
+    point=OperatingPoint(0.5, 0.02, 64, 1, 0),
 )
 
 

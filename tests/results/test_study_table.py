@@ -15,7 +15,12 @@ from skin.results.study_table import as_csv, measured, page, show, variants
 def run(accuracy):
     labels = ("overall", "big", "dynamic", "press", "dangerous")
     metrics = {f"same/{label}/accuracy": accuracy for label in labels}
-    metrics |= {"same/dangerous/recall": 0.25, "seconds_per_epoch": 1.5, "parameters": 105621.0}
+    metrics |= {
+        "same/dangerous/alarm_recall": 0.25,
+        "same/dangerous/false_alarm_rate": 0.02,
+        "seconds_per_epoch": 1.5,
+        "parameters": 105621.0,
+    }
     return SimpleNamespace(data=SimpleNamespace(metrics=metrics), info=SimpleNamespace(run_id="abc"))
 
 
@@ -41,6 +46,7 @@ def test_a_line_per_variant_with_mean_and_deviation():
         "press": "",
         "dangerous": "",
         "recall": "25.0 ± 0.0",
+        "false alarms": "2.0 ± 0.0",
         "s/epoch": "1.50",
         "parameters": "105621",
         "self": "0.31",

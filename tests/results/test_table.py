@@ -16,7 +16,12 @@ def run(same, shifted=None, recall=0.5):
     """Return what the table reads of an MLflow run whose four labels are equally good."""
     labels = ("overall", "big", "dynamic", "press", "dangerous")
     metrics = {f"same/{label}/accuracy": same for label in labels}
-    metrics |= {"same/dangerous/recall": recall, "seconds_per_epoch": 2.0, "parameters": 145774.0}
+    metrics |= {
+        "same/dangerous/alarm_recall": recall,
+        "same/dangerous/false_alarm_rate": 0.021,
+        "seconds_per_epoch": 2.0,
+        "parameters": 145774.0,
+    }
     if shifted is not None:
         metrics["device_shift/overall/accuracy"] = shifted
     return SimpleNamespace(data=SimpleNamespace(metrics=metrics, tags={}))
@@ -65,8 +70,35 @@ def test_a_row_that_takes_no_other_layout_says_so():
     assert (line["device_shift"], line["unseen_layout"]) == ("0.7000", "cannot")
 
 
-def test_the_recall_is_a_label_of_its_own(lines):
+def test_the_alarm_has_its_recall_and_its_false_alarms_side_by_side(lines):
     assert lines["temporal_graph", "dangerous_recall"]["ours"] == "0.5000"
+    assert lines["temporal_graph", "false_alarms"]["ours"] == "0.0210"
+    head, first, _ = grid(list(lines.values()))
+    place = head.index("recall")
+    assert head[place + 1] == "false alarms"
+    assert first[place : place + 2] == ["50.0 ± 0.0", "2.1 ± 0.0"]
+
+
+def test_other_devices_have_their_own_recall_and_false_alarms():
+    one = run(0.8, 0.7)
+    one.data.metrics |= {
+        "device_shift/dangerous/alarm_recall": 0.4,
+        "device_shift/dangerous/false_alarm_rate": 0.048,
+    }
+    head, first = grid(rows([Cell("features", "fem", (one,), 0)], {}))
+    place = head.index("device shift")
+    assert head[place : place + 3] == ["device shift", "its recall", "its false alarms"]
+    assert first[place : place + 3] == ["70.0", "40.0", "4.8"]
+
+
+def test_what_is_undefined_is_no_number():
+    """A run without dangerous test gestures has no recall; it did not fail either."""
+    one = run(0.8)
+    del one.data.metrics["same/dangerous/alarm_recall"]
+    lines = rows([Cell("features", "fem", (one,), 0)], {})
+    assert next(line["ours"] for line in lines if line["label"] == "dangerous_recall") == ""
+    head, first = grid(lines)
+    assert first[head.index("recall")] == "-"
 
 
 def test_a_person_reads_ours_with_the_reports_in_brackets(lines):

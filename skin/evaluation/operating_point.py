@@ -1,0 +1,250 @@
+"""Where the alarm "dangerous" is raised: a threshold with a known rate of false alarms."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from scipy.stats import binomtest
+from torch import Tensor
+
+from skin.config import Evaluation
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.labels import Task
+from skin.recording import Touches
+
+if TYPE_CHECKING:
+    from skin.evaluation.report import Answers
+
+__all__ = ["ENOUGH", "LABEL", "OperatingPoint", "Reached", "check", "choose", "gestures", "lowest", "read"]
+
+LABEL = "dangerous"
+ENOUGH = 2000
+"""Safe gestures; where 2 % are wanted, the true rate is then 1.4 to 2.7 % (95 %). 5000: 1.6 to 2.4 %."""
+
+_APART = 1e-6  # scores closer than this may change places on another processor
+_MOST_DRAWS = 6
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The alarms of an operating point on some gestures.
+
+    Attributes:
+        dangerous: dangerous gestures.
+        found: those that raise the alarm.
+        safe: safe gestures.
+        raised: those that raise the alarm.
+    """
+
+    dangerous: int
+    found: int
+    safe: int
+    raised: int
+
+    @property
+    def recall(self) -> float:
+        """Share of the dangerous gestures that raise the alarm; NaN if there are none."""
+        return self.found / self.dangerous if self.dangerous else math.nan
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """Share of the safe gestures that raise the alarm; NaN if there are none."""
+        return self.raised / self.safe if self.safe else math.nan
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """False-alarm rates within 95 % confidence: exact (Clopper and Pearson, 1934)."""
+        if not self.safe:
+            return math.nan, math.nan
+        low, high = binomtest(self.raised, self.safe).proportion_ci(0.95)
+        return float(low), float(high)
+
+    def sentence(self) -> str:
+        """Return the false-alarm rate with its range, and the recall, in words; "-" where undefined."""
+        low, high = self.range
+        rate = "false alarms: - (no safe gesture)"
+        if self.safe:
+            rate = (
+                f"false alarms: {self.raised} of {self.safe} safe gestures, "
+                f"{100 * self.false_alarm_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
+            )
+        recall = f"{100 * self.recall:.1f} % of {self.dangerous}" if self.dangerous else "-"
+        return f"{rate}; dangerous gestures found: {recall}"
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """An alarm is raised where the probability of ``dangerous`` is greater than the threshold.
+
+    Attributes:
+        threshold: exactly representable as float32, so that every comparison gives the same answer.
+        target: largest false-alarm rate that was wanted.
+        safe: number of safe gestures it was chosen on; 0: it was not chosen but is the default of 0.5.
+        raised: how many of them raise the alarm.
+        seed: of the fresh gestures it was chosen on; None: it was chosen on a validation split.
+    """
+
+    threshold: float
+    target: float
+    safe: int
+    raised: int
+    seed: int | None
+
+    @classmethod
+    def default(cls, target: float) -> "OperatingPoint":
+        """Return a threshold of 0.5, whose false-alarm rate nobody knows."""
+        return cls(0.5, target, 0, 0, None)
+
+    @property
+    def silent(self) -> bool:
+        """Whether no probability can raise the alarm."""
+        return self.threshold >= 1
+
+    def alarm(self, chance: Tensor) -> Tensor:
+        """Return which probabilities raise the alarm, bool, in the shape of ``chance``."""
+        return chance > self.threshold
+
+    def reached(self, chances: Tensor, labels: Tensor, task: Task) -> Reached:
+        """Return the alarms on gestures with probabilities (B, L) and labels (B, L) that mean something."""
+        chance, dangerous = _column(chances, labels, task)
+        alarm = self.alarm(chance)
+        counts = dangerous.sum(), (alarm & dangerous).sum(), (~dangerous).sum(), (alarm & ~dangerous).sum()
+        return Reached(*(int(count) for count in counts))
+
+    def sentence(self) -> str:
+        """Return the threshold and how it was chosen, in words."""
+        wanted = f"alarm above {self.threshold:.4f}"
+        if not self.safe:
+            return f"{wanted}: not chosen on any gestures, its false-alarm rate is unknown"
+        kind = "safe validation" if self.seed is None else "fresh safe"
+        return f"{wanted}, chosen on {self.safe} {kind} gestures for {100 * self.target:g} % false alarms"
+
+    def warning(self) -> str | None:
+        """Return what makes this operating point unreliable, in one sentence; None: nothing."""
+        if self.silent:
+            return (
+                f"no threshold has {100 * self.target:g} % false alarms or fewer: "
+                "the most probable answers are given to safe gestures too, no alarm will be raised"
+            )
+        if self.safe < ENOUGH:
+            return f"{self.sentence()}; {ENOUGH} are needed to rely on that rate"
+        return None
+
+    def text(self) -> str:
+        """Return it as JSON, for :func:`read`."""
+        return json.dumps(asdict(self) | {"label": LABEL})
+
+
+def read(text: str) -> OperatingPoint | None:
+    """Return what :meth:`OperatingPoint.text` wrote; None for ``null``, a task without ``dangerous``.
+
+    Raises:
+        InputError: it is no operating point.
+    """
+    try:
+        stored = json.loads(text)
+        if stored is None:
+            return None
+        point = OperatingPoint(
+            float(stored["threshold"]),
+            float(stored["target"]),
+            int(stored["safe"]),
+            int(stored["raised"]),
+            None if stored["seed"] is None else int(stored["seed"]),
+        )
+        known = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
+        if not known or not math.isfinite(point.threshold) or not 0 <= point.raised <= point.safe:
+            raise ValueError(text)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise InputError(
+            f"the stored operating point {text[:200]!r} cannot be read: train the run again, or give the "
+            "threshold to live.py as live.patience.above=0.5"
+        ) from error
+    return point
+
+
+def check(settings: Evaluation) -> None:
+    """Raise InputError where no threshold can be chosen as asked."""
+    if not 0 < settings.false_alarm_rate < 1:
+        raise InputError(
+            f"a false-alarm rate is between 0 and 1, got {settings.false_alarm_rate:g}: "
+            "use evaluation.false_alarm_rate=0.02"
+        )
+    if settings.safe_gestures < 1:
+        raise InputError(
+            "the alarm's threshold is chosen on 1 safe gesture or more, got "
+            f"{settings.safe_gestures}: use evaluation.safe_gestures={ENOUGH}"
+        )
+
+
+def gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
+    """Return the gestures on which the threshold is chosen.
+
+    A simulated device draws fresh ones, until enough of them are safe; others give their validation split.
+    """
+    check(settings)
+    if not isinstance(device, Simulated) or LABEL not in device.task.names:
+        return device.touches("validation")
+    # Half of the sampled gestures are safe; windows of streams show a touch less often.
+    count = 2 * settings.safe_gestures
+    for _ in range(_MOST_DRAWS):
+        touches = device.fresh_touches(count)
+        assert touches.labels is not None
+        _, dangerous = _column(touches.labels, touches.labels, device.task)
+        if int((~dangerous).sum()) >= settings.safe_gestures:
+            break
+        count *= 2
+    return touches
+
+
+def choose(learner: "Answers", device: AbstractDevice, settings: Evaluation) -> OperatingPoint | None:
+    """Return the operating point of a trained learner; None if its task has no label ``dangerous``.
+
+    Args:
+        learner: trained on ``device``.
+        device: gives the gestures, as :func:`gestures` says.
+        settings: the target rate and the number of safe gestures.
+    """
+    if LABEL not in device.task.names:
+        return None
+    touches, target = gestures(device, settings), settings.false_alarm_rate
+    assert touches.labels is not None  # it has learnt from them
+    chance, dangerous = _column(learner.probabilities(touches), touches.labels, device.task)
+    safe = chance[~dangerous]
+    if not len(safe):
+        return OperatingPoint.default(target)
+    threshold = lowest(safe, target)
+    seed = device.data_seed if isinstance(device, Simulated) else None
+    return OperatingPoint(threshold, target, len(safe), int((safe > threshold).sum()), seed)
+
+
+def lowest(safe: Tensor, target: float) -> float:
+    """Return the lowest threshold that keeps the false-alarm rate, a float32 number.
+
+    Of n safe gestures k = floor(target (n + 1)) - 1 or fewer raise the alarm. A new safe one then raises it
+    with a probability of (k + 1) / (n + 1) <= target or less (split conformal prediction; Vovk, Gammerman and
+    Shafer 2005). Where n < 1 / target - 1 the threshold is above all scores, and the target is not kept.
+    Scores that differ by less than 2e-6 count as equal: all of them raise the alarm or none.
+
+    Args:
+        safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.
+        target: largest rate.
+    """
+    scores = safe.detach().cpu().double().sort(descending=True).values
+    # The summand keeps a product such as 0.29 * 100 from falling below its whole number.
+    allowed = max(math.floor(target * (len(scores) + 1) + 1e-9) - 1, 0)
+    gaps = scores[:-1] - scores[1:] > 2 * _APART  # [i]: between the first i + 1 scores and the others
+    cuts = torch.nonzero(gaps[:allowed]).flatten()
+    above = int(cuts[-1]) + 1 if len(cuts) else 0
+    return float((scores[above] + _APART).float())
+
+
+def _column(chances: Tensor, labels: Tensor, task: Task) -> tuple[Tensor, Tensor]:
+    """Return probabilities (B',) and truth (B',), bool, of the gestures in which it means something."""
+    place = task.names.index(LABEL)
+    rows = task.counts(labels)[:, place]
+    return chances[rows, place], labels[rows, place] > 0.5

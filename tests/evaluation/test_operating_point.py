@@ -1,0 +1,231 @@
+"""The threshold of the alarm: how many false alarms it allows, ties, storage, and what is undefined."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import beta
+
+from skin.build import build_device
+from skin.config import Evaluation
+from skin.errors import InputError
+from skin.evaluation.metrics import metrics
+from skin.evaluation.operating_point import OperatingPoint, Reached, check, choose, gestures, lowest, read
+from skin.evaluation.report import evaluate
+from skin.labels import TOUCH, TOUCH_OR_NOT, Task
+
+SETTINGS = Evaluation(devices=0, layouts=0, gestures=32, false_alarm_rate=0.1, safe_gestures=64)
+POINT = OperatingPoint(0.25, 0.02, 2048, 40, 3)
+GESTURES = Task(("stroke", "dangerous", "slap"), "exclusive")
+
+
+class Peak:
+    """Says how likely danger is by the largest reading alone; it has learnt nothing."""
+
+    def __init__(self, task=TOUCH):
+        self.task = task
+
+    def probabilities(self, touches):
+        strongest = touches.readings.flatten(1).amax(1)
+        return (strongest / 20).clamp(0, 1)[:, None].repeat(1, len(self.task))
+
+
+@pytest.fixture(scope="module")
+def device(configured):
+    return build_device(configured("simulator=naive", "layout=grid", "device.test_gestures=64"))
+
+
+@pytest.mark.parametrize(
+    ("count", "target", "allowed"),
+    [(1999, 0.02, 39), (2000, 0.02, 39), (99, 0.02, 1), (49, 0.02, 0), (48, 0.02, 0), (99, 0.29, 28)],
+)
+def test_as_many_safe_gestures_raise_the_alarm_as_are_allowed(count, target, allowed):
+    """k = floor(target (n + 1)) - 1; 0.29 * 100 is 28.999999999999996 in floating point."""
+    generator = torch.Generator().manual_seed(0)
+    scores = torch.linspace(0.1, 0.9, count)[torch.randperm(count, generator=generator)]
+    threshold = lowest(scores, target)
+    assert int((scores > threshold).sum()) == allowed
+    assert allowed / count <= target
+
+
+def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
+    """The true rate is a beta variable of mean (k + 1) / (n + 1): exact, whatever the scores are."""
+    rng = np.random.default_rng(0)
+    # The true rate of a threshold on uniform scores is one minus the threshold.
+    rates = [1 - lowest(torch.from_numpy(rng.random(499)), 0.02) for _ in range(400)]
+    assert np.mean(rates) == pytest.approx(10 / 500, abs=4 * beta(10, 490).std() / 20)
+    assert np.std(rates) == pytest.approx(beta(10, 490).std(), rel=0.15)
+
+
+def test_equal_scores_raise_the_alarm_together_or_not_at_all():
+    """A vote of five members: 3 % of the safe gestures have all of them, 10 % four or more."""
+    votes = torch.tensor([1.0] * 30 + [0.8] * 70 + [0.0] * 900)
+    assert 0.8 < lowest(votes, 0.05) < 1
+    assert int((votes > lowest(votes, 0.05)).sum()) == 30
+    assert int((votes > lowest(votes, 0.2)).sum()) == 100
+    assert lowest(votes, 0.02) > 1
+
+
+def test_the_last_digit_of_a_score_decides_nothing():
+    """Scores of another processor differ in the last digit; the same gestures raise the alarm."""
+    scores = torch.rand(3000, generator=torch.Generator().manual_seed(0)).round(decimals=3)
+    threshold = lowest(scores, 0.05)
+    up, down = (torch.nextafter(scores, torch.tensor(end)) for end in (2.0, -1.0))
+    for other in (up, down):
+        assert torch.equal(other > threshold, scores > threshold)
+        assert int((scores > lowest(other, 0.05)).sum()) == int((scores > threshold).sum())
+
+
+def test_one_comparison_in_single_and_double_precision():
+    threshold = lowest(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
+    assert threshold == float(np.float32(threshold))
+    near = np.nextafter(np.float32(threshold), np.float32([0, 0.5, 1]), dtype=np.float32)
+    chances = torch.from_numpy(np.append(near, np.float32(threshold)))
+    said = OperatingPoint(threshold, 0.1, 500, 49, 0).alarm(chances).tolist()
+    assert said == [chance > threshold for chance in chances.tolist()]
+    assert not said[-1]
+
+
+def test_reached_rates_are_counted_and_their_range_is_exact():
+    chances = torch.tensor([[0.0] * 4] * 6)
+    chances[:, 3] = torch.tensor([0.9, 0.25, 0.3, 0.1, 0.2, 0.26])
+    labels = torch.zeros(6, 4)
+    labels[:2, 3] = 1
+    reached = POINT.reached(chances, labels, TOUCH)
+    assert reached == Reached(dangerous=2, found=1, safe=4, raised=2)
+    assert (reached.recall, reached.false_alarm_rate) == (0.5, 0.5)
+    found = metrics(chances, labels, TOUCH, POINT)
+    assert (found["dangerous/alarm_recall"], found["dangerous/false_alarm_rate"]) == (0.5, 0.5)
+    # None of ten: the upper end p has (1 - p)^10 = 0.025.
+    assert Reached(0, 0, 10, 0).range == pytest.approx((0, 1 - 0.025**0.1))
+
+
+def test_accuracy_stays_that_of_one_half():
+    chances, labels = torch.full((4, 4), 0.4), torch.zeros(4, 4)
+    found = metrics(chances, labels, TOUCH, POINT)
+    assert found["dangerous/accuracy"] == 1
+    assert found["dangerous/false_alarm_rate"] == 1
+
+
+def test_rates_of_no_gesture_are_undefined_and_printed_so():
+    safe = POINT.reached(torch.zeros(3, 4), torch.zeros(3, 4), TOUCH)
+    dangerous = POINT.reached(torch.ones(3, 4), torch.ones(3, 4), TOUCH)
+    assert math.isnan(safe.recall)
+    assert math.isnan(dangerous.false_alarm_rate)
+    assert safe.sentence().endswith("dangerous gestures found: -")
+    assert dangerous.sentence() == "false alarms: - (no safe gesture); dangerous gestures found: 100.0 % of 3"
+    assert math.isnan(dangerous.range[0])
+
+
+def test_a_shut_gate_and_an_exclusive_task_are_counted_right():
+    labels = torch.tensor([[0, 0, 0, 1.0, 1], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]])
+    assert POINT.reached(torch.ones(3, 5), labels, TOUCH_OR_NOT) == Reached(1, 1, 1, 1)
+    chances = torch.tensor([[0.1, 0.6, 0.3], [0.7, 0.3, 0.0], [0.1, 0.1, 0.8]])
+    found = metrics(chances, torch.eye(3)[[1, 0, 2]], GESTURES, POINT)
+    assert found == {
+        "overall/accuracy": 1.0,
+        "dangerous/alarm_recall": 1.0,
+        "dangerous/false_alarm_rate": 0.5,
+    }
+
+
+def test_fresh_gestures_belong_to_no_split_and_enough_are_safe(device):
+    known = {
+        row.item()
+        for split in ("train", "validation", "holdout", "test")
+        for row in device.touches(split).readings.flatten(1).sum(1)
+    }
+    fresh = gestures(device, SETTINGS)
+    assert len(fresh) == 128
+    assert int((fresh.labels[:, 3] < 0.5).sum()) == 64
+    assert not known & {row.item() for row in fresh.readings.flatten(1).sum(1)}
+    assert torch.equal(gestures(device.replace(), SETTINGS).readings, fresh.readings)
+    other = device.replace(data_seed=1)
+    assert not torch.equal(gestures(other, SETTINGS).readings, fresh.readings)
+
+
+def test_the_chosen_point_has_the_wanted_rate_on_its_gestures(device):
+    point = choose(Peak(), device, SETTINGS)
+    fresh = gestures(device, SETTINGS)
+    reached = point.reached(Peak().probabilities(fresh), fresh.labels, TOUCH)
+    assert (point.safe, point.raised, point.target, point.seed) == (64, 5, 0.1, 0)
+    assert (reached.safe, reached.raised) == (64, 5)
+    assert choose(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold < point.threshold
+
+
+def test_streams_are_drawn_until_enough_windows_show_a_safe_touch(device):
+    streamed = device.replace(stream=True)
+    fresh = gestures(streamed, SETTINGS)
+    here = fresh.labels[:, 4] > 0.5
+    assert int((here & (fresh.labels[:, 3] < 0.5)).sum()) >= 64
+    assert choose(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
+
+
+def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(made_up_device):
+    point = choose(Peak(), made_up_device, SETTINGS)
+    labels = made_up_device.touches("validation").labels
+    assert point.safe == int((labels[:, 3] < 0.5).sum())
+    assert point.seed is None
+    assert f"chosen on {point.safe} safe validation gestures" in point.warning()
+    assert "2000 are needed" in point.warning()
+
+
+def test_a_task_without_dangerous_has_no_operating_point(made_up_device):
+    made_up_device.task = Task(("big", "dynamic", "press", "hard"))
+    assert choose(Peak(), made_up_device, SETTINGS) is None
+    found = evaluate(Peak(), made_up_device, SETTINGS, None)
+    assert found.reached is None
+    assert not [name for name in found.metrics if "alarm" in name]
+
+
+def test_a_threshold_that_nothing_passes_is_told():
+    assert not POINT.silent
+    assert POINT.warning() is None
+    assert "no alarm will be raised" in replace(POINT, threshold=1.000001).warning()
+
+
+def test_what_is_stored_reads_back_to_the_last_digit():
+    point = replace(POINT, threshold=lowest(torch.linspace(0.1, 0.7, 500), 0.02))
+    assert read(point.text()) == point
+    assert read("null") is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"threshold": None},
+        {"threshold": math.nan},
+        {"threshold": math.inf},
+        {"threshold": -1},
+        {"target": 2},
+        {"safe": "many"},
+        {"raised": 9999},
+        {"label": "big"},
+        {"seed": {}},
+    ],
+)
+def test_a_damaged_one_is_refused(change):
+    with pytest.raises(InputError, match="cannot be read"):
+        read(json.dumps(json.loads(POINT.text()) | change))
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", "0.5", "[" * 5000])
+def test_what_is_no_operating_point_is_refused(text):
+    with pytest.raises(InputError, match="cannot be read"):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"false_alarm_rate": 0.0}, "false_alarm_rate=0.02"),
+        ({"false_alarm_rate": 1.0}, "false_alarm_rate=0.02"),
+        ({"safe_gestures": 0}, "safe_gestures=2000"),
+    ],
+)
+def test_what_cannot_be_chosen_is_refused(change, said):
+    with pytest.raises(InputError, match=said):
+        check(replace(SETTINGS, **change))

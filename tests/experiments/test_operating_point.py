@@ -1,0 +1,142 @@
+"""The threshold of the alarm through the commands: a training stores it, and all others use it."""
+
+import json
+import re
+import socket
+import sqlite3
+from contextlib import closing, contextmanager
+from threading import Thread
+
+import numpy as np
+import pytest
+
+SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
+SMALL = ["data.gestures=400", "device.test_gestures=96", "evaluation.devices=1", "evaluation.layouts=0"]
+SMALL += ["evaluation.gestures=48", "evaluation.safe_gestures=200"]
+
+
+@pytest.fixture(scope="module")
+def folder(run, tmp_path_factory):
+    """A folder with one finished run of rules, and what its training said."""
+    folder = tmp_path_factory.mktemp("runs")
+    done = run(folder, "train.py", "experiment=rules", *SKIN, *SMALL)
+    assert done.returncode == 0, done.stderr
+    (folder / "said").write_text(done.stdout)
+    (folder / "warned").write_text(done.stderr)
+    return folder
+
+
+def query(folder, *statement):
+    with closing(sqlite3.connect(folder / "m.db")) as database, database:
+        return database.execute(*statement).fetchall()
+
+
+def tag(folder):
+    """Return the id of the training run, which is the oldest, and the operating point that it stores."""
+    known = "select run_uuid, value from tags join runs using (run_uuid) where key='operating_point'"
+    return query(folder, f"{known} order by start_time limit 1")[0]
+
+
+def stored(folder):
+    return json.loads(tag(folder)[1])
+
+
+@contextmanager
+def changed(folder, **values):
+    """Store another operating point, or none, for a while."""
+    run, text = tag(folder)
+    write = "update tags set key=?, value=? where run_uuid=? and value=?"
+    name, new = ("operating_point", json.dumps(json.loads(text) | values)) if values else ("old", text)
+    query(folder, write, (name, new, run, text))
+    yield
+    query(folder, write, ("operating_point", text, run, new))
+
+
+def test_a_training_stores_what_it_chose_and_says_what_it_reaches(folder):
+    point = stored(folder)
+    assert (point["safe"], point["target"], point["label"], point["seed"]) == (200, 0.02, "dangerous", 0)
+    assert point["raised"] <= 3
+    said = " ".join((folder / "said").read_text().split())
+    chosen = f"alarm above {point['threshold']:.4f}, chosen on 200 fresh safe gestures for 2 % false alarms"
+    assert chosen in said
+    assert "dangerous/false_alarm_rate" in said
+    assert re.search(r"false alarms: \d+ of 48 safe gestures, \d+\.\d % \(95 %: ", said)
+    assert "2000 are needed" in (folder / "warned").read_text()
+    metrics = dict(query(folder, "select key, value from latest_metrics"))
+    assert metrics["alarm/threshold"] == point["threshold"]
+    assert {"same/dangerous/alarm_recall", "device_shift/dangerous/false_alarm_rate"} <= metrics.keys()
+
+
+def test_evaluate_raises_the_alarm_where_the_run_does(run, folder):
+    with changed(folder, threshold=1e-9):
+        done = run(folder, "evaluate.py", f"out={folder}/found")
+    assert done.returncode == 0, done.stderr
+    assert "false alarms: 48 of 48 safe gestures, 100.0 %" in done.stdout
+    assert "alarm above 0.0000, chosen on 200 fresh safe gestures" in done.stdout
+    page = (folder / "found" / "evaluation_simulated.md").read_text()
+    assert "| dangerous/false_alarm_rate | 100.0 |" in page
+    assert "false alarms: 48 of 48 safe gestures" in page
+
+
+def test_a_run_of_old_gets_its_threshold_now_and_that_is_said(run, folder):
+    """It is the one that its training would have stored."""
+    with changed(folder):
+        done = run(folder, "evaluate.py", "device.seed=3", f"out={folder}/old")
+    assert done.returncode == 0, done.stderr
+    assert "stores no alarm threshold for 2 % false alarms, it is chosen now" in done.stderr
+    assert f"alarm above {stored(folder)['threshold']:.4f}" in done.stdout
+
+
+def test_another_rate_gets_another_threshold(run, folder):
+    done = run(folder, "evaluate.py", "evaluation.false_alarm_rate=0.2", f"out={folder}/rate")
+    assert "stores no alarm threshold for 20 % false alarms" in done.stderr
+    level = float(re.search(r"alarm above (0\.\d+), chosen on 200 fresh", done.stdout)[1])
+    assert level < stored(folder)["threshold"]
+
+
+@contextmanager
+def tapped():
+    """Give the port of a skin that is left alone for five seconds and then tapped."""
+    frames = np.zeros((60, 4))
+    frames[54:57, 1] = 1.5
+    rows = "".join(f"{n},{100_000 * n},{','.join(map(str, row))}\n" for n, row in enumerate(frames.tolist()))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            held = []
+            while True:
+                try:
+                    held.append(server.accept()[0])
+                    held[-1].sendall(b"# skin proto=1 n=4 rate=10 unit=N\n" + rows.encode())
+                except OSError:
+                    return
+
+        Thread(target=serve, daemon=True).start()
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.mark.parametrize(
+    ("threshold", "given", "alarm"),
+    [(1e-5, [], True), (0.9999, [], False), (0.9999, ["live.patience.above=0.00001"], True)],
+)
+def test_live_raises_the_alarm_where_the_run_does(run, folder, threshold, given, alarm):
+    with changed(folder, threshold=threshold), tapped() as port:
+        there = ["device=serial", f"device.port={port}", "live.touch=0.3", "seconds=1.2"]
+        done = run(folder, "live.py", *there, *given)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"[1-9]\d* verdicts", done.stderr)
+    assert ("DANGEROUS" in done.stdout) == alarm
+    assert f"alarm above {'1e-05' if given else f'{threshold:.4f}'}" in done.stderr
+
+
+def test_live_refuses_an_alarm_that_cannot_be_raised(run, folder):
+    with changed(folder, threshold=1.000001):
+        done = run(folder, "live.py", "live.touch=0.3", "seconds=1")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "no alarm will be raised: give live.patience.above=0.5" in done.stderr
+
+
+def test_bad_input_is_one_sentence(run, tmp_path):
+    done = run(tmp_path, "train.py", "experiment=rules", *SKIN, "evaluation.false_alarm_rate=0")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "evaluation.false_alarm_rate=0.02" in done.stderr

@@ -157,8 +157,8 @@ def _area(big: np.ndarray, settings: GestureSettings, chance: np.ndarray) -> np.
 def _no_room(settings: GestureSettings, size: tuple[float, float]) -> InputError:
     least, most = settings.big_area
     return InputError(
-        f"none of touch.shapes={list(settings.shapes)} covers {least:g} to {most:g} of a sheet of {size[0]:g} "
-        f"x {size[1]:g} m and leaves touch.spare={settings.spare:g} m along x and y, even turned and stretched "
-        f"by up to touch.stretch={settings.stretch:g}: lower touch.spare or touch.big_area, raise "
-        "touch.stretch, or add a compact shape such as disc"
+        f"none of touch.shapes={list(settings.shapes)} covers {least:g} to {most:g} of a sheet of "
+        f"{size[0]:g} x {size[1]:g} m and leaves touch.spare={settings.spare:g} m along x and y, even turned "
+        f"and stretched by up to touch.stretch={settings.stretch:g}: lower touch.spare or touch.big_area, "
+        "raise touch.stretch, or add a compact shape such as disc"
     )

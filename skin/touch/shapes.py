@@ -1,6 +1,7 @@
 """Shapes pressed on a sheet: their outline, their contact area, and their frames on the sheet's cells."""
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import cached_property
 from typing import NamedTuple
 
@@ -59,7 +60,7 @@ class Shapes:
 
     def __init__(self, names: Sequence[str], body: AbstractBody, contact: float = 0.02) -> None:
         self.names = tuple(names)
-        self.body = body
+        self.body: AbstractBody = body
         self.contact = contact
         # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
@@ -101,7 +102,12 @@ class Shapes:
         """The same shapes on a square of such cells on which all of a long shape has room."""
         count = int(np.ceil(_LARGE * np.sqrt(np.prod(self.body.cells))))
         size = (count * self.body.cell[0], count * self.body.cell[1])
-        return Shapes(self.names, Sheet(size, (count, count), self.body.layers), self.contact)
+        # The same pictures, because a scale is in terms of them; what was measured on this sheet is not.
+        large = copy(self)
+        for known in ("_calibration", "_points"):
+            vars(large).pop(known, None)
+        large.body = Sheet(size, (count, count), self.body.layers)
+        return large
 
     @cached_property
     def _calibration(self) -> tuple[np.ndarray, np.ndarray]:

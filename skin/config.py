@@ -5,6 +5,7 @@ Only Hydra is imported here: ``--help`` and a mistyped key must not pay for torc
 
 from skin import interrupt  # isort: skip
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import wraps
@@ -202,6 +203,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         def main() -> None:
             # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
             sys.argv[1:] = [value.replace("=~/", f"={Path.home()}/", 1) for value in sys.argv[1:]]
+            warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
             try:
                 composed()
             except SystemExit as stop:

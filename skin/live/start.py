@@ -23,7 +23,7 @@ from skin.session.newtons import newtons
 from skin.signal.gate import Threshold, gates, rise
 from skin.tracking import Store
 
-__all__ = ["Source", "Trained", "engine", "source", "trained"]
+__all__ = ["Source", "Trained", "advice", "engine", "source", "trained"]
 
 _FEW = 10  # gestures, where only their shape matters
 _MANY = 4000  # windows of streams, a tenth of which tunes what touch is
@@ -140,3 +140,19 @@ def _tuned(device: AbstractDevice) -> float:
     known = device.replace(stream=True, direction=False, gestures=_MANY).touches("validation")
     assert known.labels is not None
     return Threshold.tuned(rise(known), known.labels[:, -1] > 0.5).least
+
+
+def advice(stored: DictConfig, device: AbstractDevice) -> str | None:
+    """Return what to say of a run that watches a real skin with what it learned from equation 10, or None.
+
+    Args:
+        stored: the run's configuration.
+        device: what is watched.
+    """
+    reading = OmegaConf.select(stored, "device.simulator.reading")
+    if reading != "equation10" or not isinstance(device, Serial):
+        return None
+    return (
+        "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "
+        "mechanics (docs/results.md): train one with simulator=solid for a real skin"
+    )

@@ -16,6 +16,7 @@ def main(config: DictConfig) -> None:
 
     from omegaconf import OmegaConf
 
+    from skin.balance import announce
     from skin.build import build_device
     from skin.device.recording import Recorded
     from skin.device.simulated import Simulated
@@ -26,6 +27,8 @@ def main(config: DictConfig) -> None:
     if not isinstance(device, Simulated | Recorded):
         raise InputError("only simulated touches are generated: leave out device=")
     recording = device.recording()
+    if isinstance(device, Simulated):
+        announce(device, recording)
     # Where the touches go does not change them.
     source = OmegaConf.masked_copy(config, [key for key in config if key != "out"])
     about = {"config_hash": fingerprint(source), "config": plain(source)}

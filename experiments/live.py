@@ -48,6 +48,8 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
     # What it learned from stays, whatever is watched.
     learnt = changed(stored, config, [one for one in given if not one.startswith(("device=", "device."))])
     said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
+    if advice := start.advice(stored, device):
+        said.print(advice, highlight=False)
     of = start.trained(store, run, learnt)
     engine = start.engine(of, patience, live["touch"], live["drift"])
     if of.point is not None:

@@ -10,6 +10,7 @@ from skin.config import plain
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.learner.base import AbstractLearner
+from skin.plausible import check, warn_of_surface
 
 if TYPE_CHECKING:
     from skin.datamodule import TouchData
@@ -20,7 +21,11 @@ __all__ = ["build_data", "build_device", "build_learner"]
 def build_device(config: DictConfig) -> AbstractDevice:
     """Return the source of touches, with its body, layout and, where it has one, its simulator."""
     groups = plain(config)
+    check(groups)
     body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
+    mechanics = groups["device"].get("simulator")
+    if mechanics and not mechanics["_target_"].endswith(".Naive"):
+        warn_of_surface(body, layout.sensors(body))
     # Not as arguments of instantiate: it would take the dataclass of the body for a configuration.
     return instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
 

@@ -4,10 +4,9 @@ Only Hydra is imported here: ``--help`` and a mistyped key must not pay for torc
 """
 
 from skin import interrupt  # isort: skip
-import hashlib
-import json
 import sys
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
@@ -20,8 +19,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from skin import __version__
 from skin.errors import InputError
+from skin.identity import digest
 from skin.refusal import Refused, refusal, sentence
 
 __all__ = [
@@ -166,9 +165,7 @@ def fingerprint(config: DictConfig) -> str:
     # What is not set belongs to other commands; a new command must not make every finished run look unknown.
     groups = plain(config).items()
     content = {key: value for key, value in groups if key not in _STEERING and value is not None}
-    files = {value: _digest(value) for value in _strings(content) if _file(value)}
-    text = json.dumps([content, files, __version__], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return digest(content)
 
 
 def overrides() -> list[str]:
@@ -207,6 +204,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         def main() -> None:
             # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
             sys.argv[1:] = [value.replace("=~/", f"={Path.home()}/", 1) for value in sys.argv[1:]]
+            warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
             try:
                 composed()
             except SystemExit as stop:
@@ -218,33 +216,3 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         return main
 
     return decorate
-
-
-def _strings(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict):
-        for entry in value.values():
-            yield from _strings(entry)
-    elif isinstance(value, list):
-        for entry in value:
-            yield from _strings(entry)
-
-
-def _file(name: str) -> Path | None:
-    """Return the file that a setting names, as the package finds it, if there is one."""
-    if "/" not in name and "." not in name:
-        return None
-    path = Path(name).expanduser()
-    try:
-        return next((found for found in (path, ROOT / path) if found.is_file()), None)
-    except OSError:
-        return None
-
-
-def _digest(name: str) -> str:
-    path = _file(name)
-    if path is None:
-        return ""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,6 +12,7 @@ from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
 
+from skin.balance import announce
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.console import quiet
@@ -60,6 +61,7 @@ def train(config: DictConfig) -> bool:
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
+    announce(device, shown=PARENT not in os.environ)
     name = f"{config.row} {identity['simulator']} {config.seed}"
     with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)

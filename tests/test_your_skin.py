@@ -53,7 +53,7 @@ def run(command: str, home: Path) -> str:
 
 def test_the_page_has_the_files_and_commands_of_the_walk():
     assert sorted(FILES) == ["my-skin/body/mine.yaml", "my-skin/sensors.csv"]
-    assert ["--cfg job" in command for command in COMMANDS] == [True, False, False, True, False]
+    assert ["--cfg job" in command for command in COMMANDS] == [True, False, False, False, True, False]
 
 
 def test_the_configuration_that_the_page_prints_is_the_users(home):
@@ -61,13 +61,17 @@ def test_the_configuration_that_the_page_prints_is_the_users(home):
     body = instantiate(shown.body)
     assert (body.size, body.cells, len(body.layers)) == ((0.15, 0.10), (30, 20), 3)
     assert [layer.material.young for layer in body.layers] == [560e3, 40e3, 69e3]
+    assert shown.simulator._target_ == shown.device.simulator._target_ == "skin.simulator.solid.Solid"
     assert shown.layout._target_ == "skin.layout.file.File"
+    depths = instantiate(OmegaConf.merge(shown.layout, {"path": str(home / "my-skin/sensors.csv")}))
+    # Inside a layer, where only the solid has sensors.
+    assert set(depths.sensors(body).positions[:, 2]) == {0.006}
     assert shown.layout.path == "~/my-skin/sensors.csv"
     assert shown.layout.footprint == [0.008, 0.008]
 
 
 def test_the_overrides_of_the_page_describe_the_same_sheet(home):
-    shown = OmegaConf.create(run(COMMANDS[3], home))
+    shown = OmegaConf.create(run(COMMANDS[4], home))
     body = instantiate(shown.body)
     sensors = instantiate(shown.layout).sensors(body)
     assert (body.size, body.thickness) == ((0.15, 0.10), pytest.approx(0.016))
@@ -75,7 +79,7 @@ def test_the_overrides_of_the_page_describe_the_same_sheet(home):
     assert len(sensors) == 8
 
 
-@pytest.mark.parametrize("line", COMMANDS[4].splitlines())
+@pytest.mark.parametrize("line", COMMANDS[5].splitlines())
 def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
     shown = OmegaConf.create(run(f"{line.partition('  #')[0]} --cfg job", home))
     body = instantiate(shown.body)
@@ -88,10 +92,16 @@ def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
 @pytest.mark.slow
 def test_the_training_of_the_page_runs(home):
     store = f"tracking.uri=sqlite:///{home}/mlflow.db tracking.artifacts={home}/artifacts"
+<<<<<<< HEAD
     run(f"{COMMANDS[1].strip()} evaluation.safe_gestures=64 {store}", home)
     said = run(f"{COMMANDS[2].strip()} {store} out={home}/found", home)
+=======
+    run(f"{COMMANDS[1].strip()} {store}", home)
+    run(f"{COMMANDS[2].strip()} {store}".replace("seconds=30", "seconds=4 live.web_port=0"), home)
+    said = run(f"{COMMANDS[3].strip()} {store} out={home}/found", home)
+>>>>>>> w/c
     assert said.startswith("within 10 % of their thresholds lie ")
     with sqlite3.connect(home / "mlflow.db") as database:
         states = database.execute("select name, status from runs order by start_time").fetchall()
     database.close()
-    assert states == [("custom fem 0", "FINISHED"), ("margins of custom fem 0", "FINISHED")]
+    assert states == [("custom solid 0", "FINISHED"), ("margins of custom solid 0", "FINISHED")]

@@ -40,6 +40,7 @@ class Strokes:
         profile: (B, T), at what part of full force; 0 where nothing touches.
         peak: (B,), the wanted highest cell pressure, Pa.
         wanted: (B, 4), bool, the wanted labels in the order of ``skin.labels.TOUCH``.
+        stretch: (U,), as ``Shapes.render`` takes it.
     """
 
     owner: np.ndarray
@@ -52,6 +53,12 @@ class Strokes:
     profile: Tensor
     peak: np.ndarray
     wanted: np.ndarray
+    stretch: np.ndarray | None = None
+
+    @property
+    def poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """What ``Shapes.render`` and ``Shapes.solids`` take."""
+        return self.shape, self.angle, self.scale, self.place, self.stretch
 
 
 class Pressed(NamedTuple):

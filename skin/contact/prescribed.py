@@ -30,7 +30,7 @@ class Prescribed(AbstractContact):
 
     def press(self, strokes: Strokes, ground: Ground) -> Pressed:
         """Return pictures at the force at which the gesture's highest cell has the wanted pressure."""
-        frames = ground.shapes.render(strokes.shape, strokes.angle, strokes.scale, strokes.place)
+        frames = ground.shapes.render(*strokes.poses)
         # Equation 2: the drawn peak is the largest cell of the whole movie.
         highest = (frames.flatten(1).amax(1)[strokes.index] * strokes.profile).amax(1).double().numpy()
         width, height = ground.shapes.body.cell

@@ -112,7 +112,7 @@ class Rigid(AbstractContact):
         Infinite where there is no object. On an arm the object comes down along the normal at its middle, and
         the skin falls away to its sides.
         """
-        solids = ground.shapes.solids(strokes.shape, strokes.angle, strokes.scale, strokes.place)
+        solids = ground.shapes.solids(*strokes.poses)
         lower = self.relief * (1 - solids.grey)
         inward = (self.fillet - solids.rim).clamp(min=0, max=self.fillet)
         lower += self.fillet - (self.fillet**2 - inward**2).clamp(min=0).sqrt()

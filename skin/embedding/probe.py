@@ -200,9 +200,10 @@ def _layouts(device: AbstractDevice, settings: Probing, seed: int) -> list[Touch
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
         return []  # no grid of so many sensors could be scattered
-    footprint, found = device.sensors.footprint, []
+    footprint, depth, found = device.sensors.footprint, device.sensors.positions[:, 2], []
     for number in range(settings.layouts):
-        layout = Scattered(rows, count // rows, seed=_FIRST_LAYOUT + number, footprint=footprint)
+        seed_of = _FIRST_LAYOUT + number
+        layout = Scattered(rows, count // rows, seed=seed_of, footprint=footprint, depth=depth)
         draw = _FIRST_SEED * (2 + number) + seed
         found.append(device.replace(layout=layout, data_seed=draw, gestures=settings.test))
     return [one.recording().touches for one in found]

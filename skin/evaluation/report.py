@@ -127,7 +127,7 @@ def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
 
 
 def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield test touches as as many sensors at other places, that lean as these do, feel them."""
+    """Yield test touches as as many sensors at other places, as deep and leaning as these, feel them."""
     count = len(device.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
@@ -138,6 +138,7 @@ def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
             count // rows,
             seed=_FIRST_LAYOUT + number,
             footprint=device.sensors.footprint,
+            depth=device.sensors.positions[:, 2],
             normals=device.sensors.normals,
         )
         yield device.replace(layout=layout, test_gestures=settings.gestures).touches("test")

@@ -19,17 +19,18 @@ def place(
     body: AbstractBody,
     x: np.ndarray,
     y: np.ndarray,
-    depth: np.ndarray | None,
+    depth: np.ndarray | float | None,
     footprint: Sequence[float],
     normals: np.ndarray | None = None,
 ) -> Sensors:
-    """Return sensors at x, y and depth, each (S,), m; without depth they lie at ``body.sensor_depth``.
+    """Return sensors at x and y, each (S,), m, and depth, of each or of all; None: ``body.sensor_depth``.
 
     Their normals (S, 3), unit vectors, are those of the surface if none are given.
 
     Raises:
-        InputError: a footprint that is not two positive lengths, a sensor outside the body or deeper than
-            it, or two sensors at one place in the plane, whatever their depths: images and graphs are flat.
+        InputError: a footprint that is not two positive lengths, a depth that is no number, a sensor outside
+            the body or deeper than it, or two sensors at one place in the plane, whatever their depths:
+            images and graphs are flat.
     """
     lengths = [float(extent) for extent in footprint]
     if len(lengths) != 2 or not all(math.isfinite(extent) and extent > 0 for extent in lengths):
@@ -37,7 +38,10 @@ def place(
             f"layout.footprint must be two positive lengths (x, y) in m, got {list(footprint)}: "
             "as in layout.footprint=[0.01,0.01]"
         )
-    positions = np.column_stack([x, y, np.full_like(x, body.sensor_depth) if depth is None else depth])
+    depths = np.asarray(body.sensor_depth if depth is None else depth)
+    if depths.dtype.kind not in "if":
+        raise InputError(f"layout.depth must be a length in m or null, got {depth!r}: as in 0.004")
+    positions = np.column_stack([x, y, np.broadcast_to(depths, x.shape)])
     _inside(body, positions)
     _apart(positions)
     extent = lengths[0], lengths[1]

@@ -34,20 +34,24 @@ class File(AbstractLayout):
     Args:
         path: the file; a relative path is looked for in the working directory, then in the repository.
         footprint: extent (x, y) over which a sensor feels, m.
+        depth: of all sensors, m, where the file has no ``depth_m``; None: ``body.sensor_depth``.
 
     Raises:
         InputError: no such file, nothing in it, a column missing, a cell that is no number or a normal
             without a length, with its line.
     """
 
-    def __init__(self, path: str, footprint: Sequence[float] = (0.01, 0.01)) -> None:
+    def __init__(
+        self, path: str, footprint: Sequence[float] = (0.01, 0.01), depth: float | None = None
+    ) -> None:
         self.path = _find(path)
         self.places = _read(self.path)
         self.footprint = footprint
+        self.depth = depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""
-        x, y, depth = self.places["x_m"], self.places["y_m"], self.places.get("depth_m")
+        x, y, depth = self.places["x_m"], self.places["y_m"], self.places.get("depth_m", self.depth)
         return place(body, x, y, depth, self.footprint, self._normals())
 
     def _normals(self) -> np.ndarray | None:

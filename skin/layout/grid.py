@@ -22,6 +22,7 @@ class Grid(AbstractLayout):
         footprint: extent (x, y) over which a sensor feels, m.
         tilt: angle between each sensor's normal and the surface's, rad: along +x, +y, -x and -y in turn, so
             that all neighbours feel another direction of shear. Only ``simulator=solid`` feels it.
+        depth: of all sensors, m; None: ``body.sensor_depth``.
 
     Raises:
         InputError: no row or column, or a tilt outside 0 to pi / 2.
@@ -33,12 +34,14 @@ class Grid(AbstractLayout):
         columns: int = 5,
         footprint: Sequence[float] = (0.01, 0.01),
         tilt: float = 0.0,
+        depth: float | None = None,
     ) -> None:
         self.centres = grid(rows, columns)
         self.normals = rosette(rows, columns, tilt)
         self.footprint = footprint
+        self.depth = depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
         x, y = (self.centres * np.array(body.size)).T
-        return place(body, x, y, None, self.footprint, self.normals)
+        return place(body, x, y, self.depth, self.footprint, self.normals)

@@ -25,6 +25,7 @@ class Scattered(AbstractLayout):
         footprint: extent (x, y) over which a sensor feels, m.
         tilt: angle between each sensor's normal and the surface's, rad, as in ``layout=grid``.
         normals: (S, 3), which way each sensor faces instead; None: as ``tilt`` says.
+        depth: of all sensors or of each (S,), m; None: ``body.sensor_depth``.
 
     Raises:
         InputError: no row or column, a jitter at which two sensors could meet, or a tilt outside 0 to pi / 2.
@@ -38,6 +39,7 @@ class Scattered(AbstractLayout):
         seed: int = 0,
         footprint: Sequence[float] = (0.01, 0.01),
         tilt: float = 0.0,
+        depth: float | np.ndarray | None = None,
         normals: np.ndarray | None = None,
     ) -> None:
         if not 0 <= jitter < 0.5:
@@ -51,9 +53,10 @@ class Scattered(AbstractLayout):
         self.jitter = jitter
         self.seed = seed
         self.footprint = footprint
+        self.depth = depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""
         moves = np.random.default_rng(self.seed).uniform(-self.jitter, self.jitter, self.centres.shape)
         x, y = np.round((self.centres + moves * self.pitch) * body.size, 6).T
-        return place(body, x, y, None, self.footprint, self.normals)
+        return place(body, x, y, self.depth, self.footprint, self.normals)

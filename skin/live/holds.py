@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 import torch
@@ -18,8 +19,9 @@ __all__ = ["COURSES", "Outcome", "played", "trials"]
 
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
-_CLOSE = 3.0  # s after a change in which every frame is asked about
-_SPARSE = 2.0  # s from one frame that is asked about to the next otherwise
+_CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is asked about
+_SPARSE = 5.0  # s from one frame that is asked about to the next otherwise
+_SEGMENTS = count()  # of the device's clock: every touch begins with an empty window
 _TAP = {"dynamic": 0, "press": 0, "dangerous": 1}
 _PRESS = {"dynamic": 0, "press": 1, "dangerous": 1}
 
@@ -67,13 +69,13 @@ class Outcome:
     early: bool
 
 
-def trials(device: Simulated, course: str, count: int, seed: int = 0) -> Iterator[np.ndarray]:
+def trials(device: Simulated, course: str, number: int, seed: int = 0) -> Iterator[np.ndarray]:
     """Yield the true readings (T, S), N, of dangerous touches that stand still, at the model's rate.
 
     Args:
         device: its gestures, which no training draws.
         course: a name in ``COURSES``.
-        count: how many; half of them are big.
+        number: how many; half of them are big.
         seed: of the gestures.
 
     Raises:
@@ -84,7 +86,7 @@ def trials(device: Simulated, course: str, count: int, seed: int = 0) -> Iterato
     labels = _TAP if course == "tap" else _PRESS
     names = [name for name in device.task.names if name in (*labels, "big")]
     rows = np.array(
-        [[number % 2 if name == "big" else labels[name] for name in names] for number in range(count)]
+        [[place % 2 if name == "big" else labels[name] for name in names] for place in range(number)]
     )
     profile = COURSES[course]
     for gesture in alike(device, rows, seed):
@@ -119,12 +121,12 @@ def played(engine: Engine, device: Simulated, force: np.ndarray, rate: float, se
     dead = constants.dead.numpy()
     newtons = Newtons(np.ones(len(dead)), constants.offset.double().numpy(), dead)
     touched = np.flatnonzero(true.any(axis=1))
-    begin, end = time[touched[0]], time[touched[-1]]
+    begin, end, segment = time[touched[0]], time[touched[-1]], next(_SEGMENTS)
     engine.tared()
     answers: list[tuple[float, bool, bool]] = []
     for number, (t, row) in enumerate(zip(time.tolist(), said, strict=True)):
-        frame = Frame(number, t, t, row, ~dead, seed)
-        close = any(0 <= t - change < _CLOSE for change in (0.0, begin, end - 0.5))
+        frame = Frame(number, t, t, row, ~dead, segment)
+        close = any(0 <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
         if not close and number % max(1, round(_SPARSE * rate)):
             engine.add(frame)
         elif (verdict := engine.push(frame, newtons)) is not None:
@@ -139,5 +141,5 @@ def _outcome(answers: list[tuple[float, bool, bool]], peak: float, begin: float,
         return Outcome(peak, None, True, None, early)
     kept = all(alarm for t, alarm, contact in answers if raised <= t <= end and contact)
     last = max(t for t, alarm, _ in answers if alarm)
-    cleared = None if last >= answers[-1][0] else max(0.0, last - end)
-    return Outcome(peak, raised - begin, kept, cleared, early)
+    cleared = None if last >= answers[-1][0] else max(0.0, float(last - end))
+    return Outcome(peak, float(raised - begin), kept, cleared, early)

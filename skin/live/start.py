@@ -25,7 +25,7 @@ from skin.signal.contact import DRIFT
 from skin.signal.gate import Threshold, rise
 from skin.tracking import Store
 
-__all__ = ["Source", "Trained", "engine", "source", "trained"]
+__all__ = ["Source", "Trained", "advice", "engine", "source", "trained"]
 
 _FEW = 10  # gestures, where only their shape matters
 _FAINT = 0.3  # N that end a contact where nothing else is known
@@ -159,3 +159,19 @@ def _tuned(device: AbstractDevice, learned: bool) -> float:
     known = device.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches("validation")
     assert known.labels is not None
     return Threshold.tuned(rise(known), known.labels[:, -1] > 0.5).least
+
+
+def advice(stored: DictConfig, device: AbstractDevice) -> str | None:
+    """Return what to say of a run that watches a real skin with what it learned from equation 10, or None.
+
+    Args:
+        stored: the run's configuration.
+        device: what is watched.
+    """
+    reading = OmegaConf.select(stored, "device.simulator.reading")
+    if reading != "equation10" or not isinstance(device, Serial):
+        return None
+    return (
+        "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "
+        "mechanics (docs/results.md): train one with simulator=solid for a real skin"
+    )

@@ -70,6 +70,7 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
         torch.from_numpy(scale).float(),
         gestures["peak"],
         wanted,
+        gestures["stretch"][owner],
     )
     from_first = way - way[first[owner]]
     travel = np.zeros(len(first))

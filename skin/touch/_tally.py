@@ -15,15 +15,17 @@ class Tally:
     Attributes:
         draws: how many paths were drawn.
         unconverged: frames whose pressure was not found.
+        misfits: bodies that had no room on the sheet.
     """
 
     draws: np.ndarray
     unconverged: np.ndarray
+    misfits: np.ndarray
 
     @classmethod
     def of(cls, count: int) -> "Tally":
         """Return one that begins at 0."""
-        return cls(np.zeros(count), np.zeros(count))
+        return cls(*np.zeros((3, count)))
 
     def warn(self) -> None:
         """Say how many frames were not found, if any."""

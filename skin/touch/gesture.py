@@ -6,17 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.labels import Thresholds
+from skin.touch._bodies import Fit, draw_bodies
 from skin.touch.shapes import Shapes
 
 __all__ = ["Draws", "GestureSettings", "draw_gestures", "draw_paths", "fold", "heading"]
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
-
-_TRIES = 2000
 
 
 @dataclass(frozen=True)
@@ -43,6 +41,9 @@ class GestureSettings:
     ramp: int = 3
     shear: float = 0.0
     redraws: int = 30
+    stretch: float = 4.0
+    leak: float = 0.6
+    strict: bool = False
     gap: tuple[int, int] = (10, 60)
     stride: tuple[int, int] = (15, 45)
     thresholds: Thresholds = field(default_factory=Thresholds)
@@ -83,6 +84,15 @@ class GestureSettings:
         for name, low in (("path", 0), ("spare", 0), ("ramp", 2), ("redraws", 1)):
             if getattr(self, name) < low:
                 raise InputError(f"touch.{name} must be at least {low}, got {getattr(self, name)}")
+        if not 1 <= self.stretch < np.inf:
+            raise InputError(
+                f"touch.stretch is by how much a shape may be lengthened, 1 (not at all) or more, got "
+                f"{self.stretch}"
+            )
+        if not 0.5 <= self.leak <= 1:
+            raise InputError(
+                f"touch.leak is a balanced accuracy from 0.5 to 1, got {self.leak}: as in touch.leak=0.6"
+            )
         if not 0 <= self.shear < np.inf:
             raise InputError(
                 f"touch.shear is a coefficient of friction from 0 up, got {self.shear}: as in touch.shear=0.5"
@@ -124,11 +134,13 @@ def draw_gestures(
     shapes: Shapes,
     padded: bool,
     generator: np.random.Generator,
+    fit: Fit | None = None,
+    kept: np.ndarray | None = None,
 ) -> Draws:
-    """Draw what the path does not change: shape, angle, area, duration, onset.
+    """Draw what the path does not change: shape, angle, stretch, area, duration, onset.
 
-    Shape, angle and area are redrawn, for static and dynamic alike, until the outline leaves ``spare`` along
-    both axes of the sheet: then every shape has room to slide, and only the path tells sliding from standing.
+    The outline leaves ``spare`` along both axes of the sheet, for static and dynamic alike: then every shape
+    has room to slide, and only the path tells sliding from standing.
 
     Args:
         labels: (B, 4), bool, the wanted combinations.
@@ -136,49 +148,19 @@ def draw_gestures(
         shapes: what presses, on which sheet.
         padded: the touch begins at a random frame of the window, not at its first.
         generator: where randomness comes from; it draws for all gestures in every round.
+        fit, kept: as :func:`skin.touch._bodies.draw_bodies` takes them.
 
     Returns:
-        shape, angle (rad), scale (m), low and high (B, 2) (m), duration, onset (frames).
+        What :func:`skin.touch._bodies.draw_bodies` gives, and duration and onset (frames).
     """
     dynamic, press = labels[:, 1], labels[:, 2]
-    drawn = _draw_bodies(labels[:, 0], settings, shapes, generator)
+    drawn = draw_bodies(labels[:, 0], settings, shapes, generator, fit, kept)
     least, most = np.where(press[:, None], settings.press, settings.tap).T
     least = np.where(dynamic, np.maximum(least, 2), least)
     chance = generator.random((len(labels), 2))
     duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
     free = settings.window - duration if padded else np.zeros_like(duration)
     return drawn | {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
-
-
-def _draw_bodies(
-    big: np.ndarray, settings: GestureSettings, shapes: Shapes, generator: np.random.Generator
-) -> Draws:
-    least, most = np.where(big[:, None], settings.big_area, settings.small_area).T
-    names = ("shape", "angle", "scale", "low", "high")
-    drawn: Draws = {}
-    todo = np.arange(len(big))
-    for _ in range(_TRIES):
-        chance = generator.random((len(big), 3))[todo]
-        shape = (chance[:, 0] * len(shapes.names)).astype(int)
-        angle = 2 * np.pi * chance[:, 1]
-        scale = shapes.scale(shape, least[todo] + (most - least)[todo] * chance[:, 2])
-        low, high = shapes.extent(shape, angle, scale)
-        for name, value in zip(names, (shape, angle, scale, low, high), strict=True):
-            drawn.setdefault(name, value.copy())[todo] = value
-        todo = todo[(high - low + settings.spare > shapes.body.size).any(axis=1)]
-        if not len(todo):
-            return drawn
-    raise _no_room(big[todo[0]], settings, shapes.body)
-
-
-def _no_room(big: bool, settings: GestureSettings, body: AbstractBody) -> InputError:
-    kind = "big" if big else "small"
-    area = settings.big_area if big else settings.small_area
-    return InputError(
-        f"none of touch.shapes={list(settings.shapes)} covers {area[0]:g} to {area[1]:g} of a sheet of "
-        f"{body.size[0]:g} x {body.size[1]:g} m and leaves touch.spare={settings.spare:g} m along x and y: "
-        f"add a compact shape such as disc, or lower touch.{kind}_area or touch.spare"
-    )
 
 
 def draw_paths(

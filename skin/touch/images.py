@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
 from skin.errors import InputError
 
-__all__ = ["check", "load", "pyramid"]
+__all__ = ["check", "hulls", "load", "pyramid"]
 
 _ROOT = Path(__file__).parents[2]
 _FOLDER = _ROOT / "data" / "shapes"
@@ -100,3 +101,15 @@ def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
     while levels[-1].shape[-1] > 1:
         levels.append(avg_pool2d(levels[-1], 2))
     return [level.float() for level in levels]
+
+
+def hulls(images: np.ndarray, contact: float) -> np.ndarray:
+    """Return the corners (N, K, 2) of the convex outlines of images (N, p, p), in scales."""
+    pixels = images.shape[-1]
+    found = []
+    for image in images:
+        rows, columns = np.nonzero(image > contact)
+        corners = np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
+        found.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
+    most = max(map(len, found))
+    return np.stack([np.pad(hull, ((0, most - len(hull)), (0, 0)), mode="edge") for hull in found])

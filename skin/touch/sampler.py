@@ -1,114 +1,32 @@
-"""Sampled gestures and their pressure movies, each frame rendered once."""
+"""Draws gestures of wanted labels and renders their movies, each frame once."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact, Ground, Pressed
 from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
-from skin.labels import TOUCH, measure, sliding
-from skin.simulator.base import AbstractSimulator, Response
+from skin.labels import TOUCH, measure
+from skin.touch._bodies import Fit
 from skin.touch._strokes import course
 from skin.touch._tally import Tally
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
+from skin.touch.movie import Movie, join
 from skin.touch.shapes import Shapes
 
 __all__ = ["Movie", "TouchSampler", "balanced", "join"]
 
 _ATTEMPTS = 50
 _AHEAD = 64
-_DRAWN = ("shape", "angle", "duration", "onset", "direction", "speed")
-_FOUND = ("peak", "force", "draws", "net_x", "net_y")
-
-
-@dataclass(frozen=True)
-class Movie:
-    """Pressure movies of a batch of gestures; a touch that stands still is one frame under a time profile.
-
-    Attributes:
-        frames: (U, H, W), Pa, the distinct frames at full force.
-        index: (B, T), which frame is shown.
-        scale: (B, T), its share of full force; 0 where nothing touches.
-        labels: (B, 4), 0 or 1, float32, in the order of ``skin.labels.TOUCH``.
-        parameters: (B,) each: shape (index), angle (rad), duration and onset (frames), direction (rad), speed
-            (m per frame), peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how
-            many were drawn until one had the wanted labels), net_x and net_y (m, from the first place of the
-            path to its last); area, travel, frames and pressure (``skin.labels.Measures``), which make the
-            labels; and where pressure is solved for, unconverged (frames of all its draws that were not
-            found).
-        drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
-            times the direction of motion, 0 where nothing slides; None: no friction.
-    """
-
-    frames: Tensor
-    index: Tensor
-    scale: Tensor
-    labels: Tensor
-    parameters: dict[str, Tensor]
-    drag: Tensor | None = None
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def __getitem__(self, rows: Tensor) -> "Movie":
-        """Return the movies of some gestures, with no frame that they do not show."""
-        index = self.index[rows]
-        shown = torch.zeros(len(self.frames), dtype=torch.bool)
-        shown[index.flatten()] = True
-        return Movie(
-            self.frames if shown.all() else self.frames[shown],
-            (shown.cumsum(0) - 1)[index],
-            self.scale[rows],
-            self.labels[rows],
-            {name: values[rows] for name, values in self.parameters.items()},
-            None if self.drag is None else self.drag[shown],
-        )
-
-    @property
-    def force(self) -> Tensor:
-        """Applied force, (B, T), N."""
-        return self.parameters["force"][:, None] * self.scale
-
-    @property
-    def slides(self) -> Tensor:
-        """Cosines of the directions in which touches slide, (B, 2), as ``skin.labels.sliding`` gives them."""
-        known = self.parameters
-        net = torch.stack([known["net_x"], known["net_y"]], dim=1)
-        return sliding(net, known["speed"] * (known["duration"] - 1))
-
-    def pressure(self) -> Tensor:
-        """Return the dense movie, (B, T, H, W), Pa."""
-        return self.frames[self.index] * self.scale[..., None, None]
-
-    def respond(self, simulator: AbstractSimulator, displacement: bool = True) -> Response:
-        """Return a simulator's readings (B, T, S), N, and displacement (B, T, S, 2), m.
-
-        The displacement is None if the simulator knows none, or if it is not asked for.
-        """
-        home = next(simulator.buffers(), self.frames).device
-        drag = None if self.drag is None else self.drag.to(home)
-        index, scale = self.index.to(home), self.scale.to(home)
-        return simulator.play(self.frames.to(home), index, scale, drag, displacement)
-
-
-def join(movies: Sequence[Movie]) -> Movie:
-    """Return one movie of all gestures of ``movies``, in order."""
-    starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
-    drags = [movie.drag for movie in movies if movie.drag is not None]
-    return Movie(
-        torch.cat([movie.frames for movie in movies]),
-        torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
-        torch.cat([movie.scale for movie in movies]),
-        torch.cat([movie.labels for movie in movies]),
-        {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
-        torch.cat(drags) if drags else None,
-    )
+# For how many of these attempts a fitted shape is kept; then any other may take its place.
+_LOYAL = 25
+_DRAWN = ("shape", "angle", "stretch", "misfits", "duration", "onset", "direction", "speed")
+_FOUND = ("peak", "force", "draws", "net_x", "net_y", "x", "y")
 
 
 def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
@@ -150,6 +68,11 @@ class TouchSampler:
         self.shapes = Shapes(self.settings.shapes, body, self.settings.thresholds.contact)
         self.contact = contact or Prescribed()
 
+    @cached_property
+    def fit(self) -> Fit | None:
+        """How shapes are fitted to the sheet; None where they are redrawn until they fit."""
+        return Fit.of(self.settings, self.shapes)
+
     @torch.no_grad()
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
         """Return the movies of ``count`` gestures.
@@ -166,13 +89,20 @@ class TouchSampler:
         redraws = self.settings.redraws
         pending = np.arange(count)
         tally = Tally.of(count)
+        kept = self.fit and self.fit.draw(wanted[:, 0], generator)
         found: list[np.ndarray] = []
         movies: list[Movie] = []
         while len(pending):
             if tally.draws[pending].min() >= _ATTEMPTS * redraws:
                 tally.warn()
                 raise self._never(wanted[pending[0]])
-            gestures = draw_gestures(wanted, self.settings, self.shapes, self.padded, generator)
+            if self.fit and tally.draws[pending].min() >= _LOYAL * redraws:
+                kept = self.fit.draw(wanted[:, 0], generator)
+            gestures = draw_gestures(
+                wanted, self.settings, self.shapes, self.padded, generator, self.fit, kept
+            )
+            tally.misfits[pending] += gestures["misfits"][pending]
+            gestures["misfits"] = tally.misfits
             tried, hopeless = 0, []
             while tried < redraws and len(pending):
                 # The last few gestures try several paths at once: a round costs more than what it draws.
@@ -229,7 +159,8 @@ class TouchSampler:
         if not self.contact.proportional:
             # More of an object comes down as force grows, which moves the centre of pressure though it rests.
             measures = measures._replace(travel=torch.from_numpy(taken.travel))
-        values = pressed.peak, pressed.force, gestures["draws"], *taken.net.T
+        begin = taken.strokes.place[taken.first]
+        values = pressed.peak, pressed.force, gestures["draws"], *taken.net.T, *begin.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
         known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
         known |= {name: value.float() for name, value in measures._asdict().items()}

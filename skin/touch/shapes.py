@@ -1,24 +1,26 @@
 """Shapes pressed on a sheet: their outline, their contact area, and their frames on the sheet's cells."""
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from skin.body.base import AbstractBody
-from skin.touch.images import load, pyramid
+from skin.body.sheet import Sheet
+from skin.touch.images import hulls, load, pyramid
 
 __all__ = ["Shapes", "Solids"]
 
 # Frames rendered at once: their sampling grid (32 KiB a frame on 32 x 32 cells) then stays in the cache.
 _CELLS_AT_ONCE = 128 * 1024
 _POINTS = 4
+_LARGE = 2
 _CALIBRATION_SIZES, _CALIBRATION_POSES = 24, 6
 
 
@@ -41,6 +43,7 @@ class Shapes:
     """Grey-scale images that can be pressed on a sheet at any place, angle and size.
 
     A shape's *scale* is the length, m, of half its texture's side; its place is that of its texture's centre.
+    Its *stretch* is by how much it is then made longer along x than along y, its area kept; None means 1.
 
     Args:
         names: stems in ``data/shapes`` or paths of pictures.
@@ -57,31 +60,54 @@ class Shapes:
 
     def __init__(self, names: Sequence[str], body: AbstractBody, contact: float = 0.02) -> None:
         self.names = tuple(names)
-        self.body = body
+        self.body: AbstractBody = body
         self.contact = contact
         # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
         finest = max(64, max(body.size) / self.spacing)
         self.levels = pyramid([load(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
-        self.hulls = _hulls(self.levels[0][:, 0].numpy(), contact)
+        self.hulls = hulls(self.levels[0][:, 0].numpy(), contact)
 
     def extent(
-        self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray
+        self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, stretch: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return how far the outline reaches from its place: lowest and highest (x, y), each (B, 2), m."""
         cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
         x, y = self.hulls[shape, :, 0], self.hulls[shape, :, 1]
         corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) * scale[:, None, None]
+        if stretch is not None:
+            wide = np.sqrt(stretch)
+            corners *= np.stack([wide, 1 / wide], axis=-1)[:, None]
         return corners.min(axis=1), corners.max(axis=1)
 
     def scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
-        """Return the scale (B,), m, at which shapes cover a share of the sheet, on average over places."""
+        """Return the scale (B,), m, at which shapes cover a share of the sheet, on average over places.
+
+        What reaches beyond the sheet does not count.
+        """
         scales, roots = self._calibration
         result = np.empty(len(shape))
         for number in np.unique(shape):
             mine = shape == number
             result[mine] = np.interp(np.sqrt(area[mine]), roots[number], scales[number])
         return result
+
+    def whole_scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
+        """Return the scale (B,), m, at which whole shapes cover as much as a share of the sheet."""
+        large = self._large
+        return large.scale(shape, area * (np.prod(self.body.cells) / np.prod(large.body.cells)))
+
+    @cached_property
+    def _large(self) -> "Shapes":
+        """The same shapes on a square of such cells on which all of a long shape has room."""
+        count = int(np.ceil(_LARGE * np.sqrt(np.prod(self.body.cells))))
+        size = (count * self.body.cell[0], count * self.body.cell[1])
+        # The same pictures, because a scale is in terms of them; what was measured on this sheet is not.
+        large = copy(self)
+        for known in ("_calibration", "_points"):
+            vars(large).pop(known, None)
+        large.body = Sheet(size, (count, count), self.body.layers)
+        return large
 
     @cached_property
     def _calibration(self) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +132,14 @@ class Shapes:
             roots.append(np.sqrt(np.maximum.accumulate(means)))
         return scales, np.stack(roots)
 
-    def render(self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, place: np.ndarray) -> Tensor:
+    def render(
+        self,
+        shape: np.ndarray,
+        angle: np.ndarray,
+        scale: np.ndarray,
+        place: np.ndarray,
+        stretch: np.ndarray | None = None,
+    ) -> Tensor:
         """Return frames (F, H, W), float32, each of sum 1 (report, equation 1).
 
         Every cell is the mean of 2 x 2 bilinear samples of the texture whose pixels are about as far apart as
@@ -118,24 +151,33 @@ class Shapes:
             angle: (F,), by which it is turned, from x towards y, rad.
             scale: (F,), m.
             place: (F, 2), m.
+            stretch: (F,), along x after the turn.
         """
         frames = torch.empty(len(shape), *self.body.shape)
-        for part, cells in self._rendered(self.levels, shape, angle, scale, place):
+        for part, cells in self._rendered(self.levels, shape, angle, scale, place, stretch):
             frames[part] = cells[:, 0].div_(cells.sum((2, 3)).unsqueeze(2))
         return frames
 
-    def solids(self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, place: np.ndarray) -> Solids:
+    def solids(
+        self,
+        shape: np.ndarray,
+        angle: np.ndarray,
+        scale: np.ndarray,
+        place: np.ndarray,
+        stretch: np.ndarray | None = None,
+    ) -> Solids:
         """Return what cells see of shapes as objects: poses as :meth:`render` takes them.
 
-        The object is where the picture is brighter than ``contact``.
+        The object is where the picture is brighter than ``contact``. A stretched one is stretched as a whole:
+        its ``rim`` is what it was before.
         """
         cells = torch.empty(len(shape), 3, *self.body.shape)
-        for part, values in self._rendered(self._objects, shape, angle, scale, place):
+        for part, values in self._rendered(self._objects, shape, angle, scale, place, stretch):
             cells[part] = values
         cover, grey, rim = cells.unbind(1)
         most = cover.amax((1, 2), keepdim=True)
         inside = cover >= torch.minimum(most, torch.tensor(_POINTS / 2))
-        size = torch.from_numpy(self._visible(scale)).float()[:, None, None]
+        size = torch.from_numpy(self._visible(scale, stretch)).float()[:, None, None]
         return Solids(inside, *((value / cover).where(inside, 0) for value in (grey, rim * size)))
 
     @cached_property
@@ -151,9 +193,10 @@ class Shapes:
             levels.append(avg_pool2d(levels[-1], 2))
         return levels
 
-    def _visible(self, scale: np.ndarray) -> np.ndarray:
+    def _visible(self, scale: np.ndarray, stretch: np.ndarray | None) -> np.ndarray:
         """Return scales (F,), m, at which shapes do not fall between the samples."""
-        return np.maximum(scale, max(self.body.cell) / 4)
+        narrow = 1.0 if stretch is None else np.sqrt(np.maximum(stretch, 1 / stretch))
+        return np.maximum(scale, max(self.body.cell) / 4 * narrow)
 
     def _rendered(
         self,
@@ -162,20 +205,23 @@ class Shapes:
         angle: np.ndarray,
         scale: np.ndarray,
         place: np.ndarray,
+        stretch: np.ndarray | None,
     ) -> Iterator[tuple[slice, Tensor]]:
         """Yield parts of the frames and sums (f, C, H, W) of their cells' samples of levels (N, C, p, p)."""
-        scale = self._visible(scale)
+        scale = self._visible(scale, stretch)
+        wide = np.sqrt(np.ones(len(scale)) if stretch is None else stretch)
         texel = 2 * scale / levels[0].shape[-1]
         level = np.clip(np.floor(np.log2(self.spacing / texel)), 0, len(levels) - 1).astype(int)
         turn = np.exp(-1j * angle) / scale
-        shift = turn * (place[:, 0] + 1j * place[:, 1])
+        turns = np.stack([turn / wide, turn * wide])
+        shift = turn * (place[:, 0] / wide + 1j * (place[:, 1] * wide))
         step = max(1, _CELLS_AT_ONCE // int(np.prod(self.body.shape)))
         runs = np.split(np.arange(len(level)), np.flatnonzero(np.diff(level)) + 1)
         for run in runs:
             for start in range(0, len(run), step):
                 part = slice(run[start], run[min(start + step, len(run)) - 1] + 1)
                 texture = levels[level[run[0]]][torch.from_numpy(shape[part])]
-                yield part, self._sample(texture, turn[part], shift[part])
+                yield part, self._sample(texture, turns[:, part], shift[part])
 
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
@@ -189,26 +235,14 @@ class Shapes:
         )
         return x, 1j * y[:, None]
 
-    def _sample(self, texture: Tensor, turn: np.ndarray, shift: np.ndarray) -> Tensor:
-        """Return sums (f, C, H, W) of textures (f, C, p, p) seen at ``turn * point - shift``, in scales."""
+    def _sample(self, texture: Tensor, turns: np.ndarray, shift: np.ndarray) -> Tensor:
+        """Return sums (f, C, H, W) of textures (f, C, p, p) seen at turns * (x, i y) - shift, in scales."""
         x, y = self._points
-        turns, shifts = (torch.from_numpy(values)[:, None, None] for values in (turn, shift))
+        turn_x, turn_y, shifts = (torch.from_numpy(one)[:, None, None] for one in (*turns, shift))
         # A turn of the plane is a product of complex numbers; its two real halves are what grid_sample takes.
-        across, down = (turns * x - shifts).to(torch.complex64), (turns * y).to(torch.complex64)
+        across, down = (turn_x * x - shifts).to(torch.complex64), (turn_y * y).to(torch.complex64)
         grid = torch.view_as_real(across + down)
         samples = grid_sample(texture, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
         upper, lower = samples.chunk(2, dim=2)
         left, right = (upper + lower).chunk(2, dim=3)
         return left + right
-
-
-def _hulls(images: np.ndarray, contact: float) -> np.ndarray:
-    """Return the corners (N, K, 2) of the convex outlines of images (N, p, p), in scales."""
-    pixels = images.shape[-1]
-    hulls = []
-    for image in images:
-        rows, columns = np.nonzero(image > contact)
-        corners = np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
-        hulls.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
-    most = max(map(len, hulls))
-    return np.stack([np.pad(hull, ((0, most - len(hull)), (0, 0)), mode="edge") for hull in hulls])

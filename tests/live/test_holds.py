@@ -1,4 +1,4 @@
-"""A dangerous touch is never hidden, however long it is held: every learner, with and without a learned gate."""
+"""A dangerous touch is never hidden, however long it is held: every learner, with each gate."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from skin.live import start
 from skin.live.holds import COURSES, played, trials
 from skin.live.verdict import Patience
 
-SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=800"]
+SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
 LEARNERS = {
     "rules": ["experiment=rules"],
     "features": ["experiment=features", "learner.rounds=30"],
-    "network": ["experiment=gru", "trainer.max_epochs=6", "fusion.hidden=32", "data.batch_size=16"],
+    "network": ["experiment=gru", "trainer.max_epochs=5", "fusion.hidden=32", "data.batch_size=16"],
     "ensemble": [
         "experiment=best",
         "trainer.max_epochs=3",
@@ -21,7 +21,7 @@ LEARNERS = {
         "learner.members.features.rounds=20",
     ],
 }
-RATE = 20.0  # Hz, of the device
+RATE = 10.0  # Hz, of the device
 
 
 @pytest.fixture(scope="module", params=[(name, gate) for name in LEARNERS for gate in (False, True)], ids=str)
@@ -40,7 +40,7 @@ def engine(request, configured):
 @pytest.mark.parametrize("course", COURSES)
 def test_an_alarm_stays_until_the_touch_ends(engine, course):
     subject, device = engine
-    forces = list(trials(device.replace(stream=False), course, 2 if "600" in course else 4))
+    forces = list(trials(device.replace(stream=False), course, 1 if "600" in course else 2))
     found = [played(subject, device, force, RATE, number) for number, force in enumerate(forces)]
     assert not any(one.early for one in found)
     raised = [one for one in found if one.raised is not None]
@@ -57,7 +57,7 @@ def test_a_hold_that_becomes_dangerous_late_is_found(engine):
     peak = strongest.max(axis=0)
     load = np.interp(np.arange(0, 20, 0.1), [0, 0.2, 10, 10.2, 18, 18.2], [0, 0.15, 0.15, 1, 1, 0])
     found = played(subject, device, load[:, None] * peak, RATE, 99)
-    assert found.raised is None or found.raised > 9.9
+    assert found.raised is not None
     assert found.kept
 
 

@@ -42,6 +42,8 @@ def test_the_shipped_configuration_is_the_default_difficulty():
         ({"shear": -0.1}, r"touch.shear is a coefficient of friction from 0 up, got -0.1"),
         ({"shear": float("nan")}, r"touch.shear"),
         ({"redraws": 0}, r"touch.redraws must be at least 1"),
+        ({"stretch": 0.5}, r"touch.stretch is by how much a shape may be lengthened, 1 .* or more, got 0.5"),
+        ({"leak": 0.3}, r"touch.leak is a balanced accuracy from 0.5 to 1, got 0.3"),
     ],
 )
 def test_settings_that_no_gesture_can_meet_are_refused(given, message):
@@ -75,13 +77,6 @@ def test_heading_is_where_each_step_led():
     corner = np.array([0.4, 1.0]) / np.hypot(0.4, 1.0)
     expected = [[0.6, 0.8]] * 3 + [[half, half], [half, half], corner, [-half, half]] + [[0, 0]] * 3
     np.testing.assert_allclose(heading(way, np.array([0, 3, 7, 8])), expected, atol=1e-12)
-
-
-def test_a_shape_that_never_fits_is_named():
-    settings = GestureSettings(shapes=("bar",), big_area=(0.4, 0.7))
-    labels = np.ones((1, 4), bool)
-    with pytest.raises(InputError, match=r"touch.shapes=\['bar'\] covers 0.4 to 0.7 of a sheet"):
-        draw_gestures(labels, settings, Shapes(("bar",), BODY), True, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

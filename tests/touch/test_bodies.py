@@ -1,0 +1,137 @@
+"""Bodies that fit on sheets of any form, and what their shape tells."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.metrics import balanced_accuracy_score
+from sklearn.model_selection import cross_val_predict
+
+from skin.balance import check, told_by
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.layout.grid import Grid
+from skin.touch._bodies import Fit, draw_bodies
+from skin.touch.gesture import GestureSettings
+from skin.touch.sampler import TouchSampler
+from skin.touch.shapes import Shapes
+
+LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
+DEFAULT = Sheet((0.16, 0.16), (32, 32), LAYER)
+OBLONG = {
+    "240 x 80 mm": Sheet((0.24, 0.08), (48, 16), LAYER),
+    "60 x 200 mm": Sheet((0.06, 0.20), (12, 40), LAYER),
+    "320 x 107 mm": Sheet((0.320, 0.107), (64, 21), LAYER),
+}
+
+
+@pytest.fixture(scope="module", params=OBLONG)
+def bodies(request):
+    """A sheet, which of 4000 bodies are big, and the bodies fitted to it."""
+    body, settings = OBLONG[request.param], GestureSettings()
+    generator, shapes = np.random.default_rng(0), Shapes(settings.shapes, body)
+    big, fit = generator.random(4000) < 0.5, Fit.of(settings, shapes)
+    return body, big, draw_bodies(big, settings, shapes, generator, fit, fit.draw(big, generator))
+
+
+def test_fitted_bodies_have_room(bodies):
+    body, _, drawn = bodies
+    assert (drawn["high"] - drawn["low"] + 0.010 <= np.array(body.size) + 1e-8).all()
+    assert (np.maximum(drawn["stretch"], 1 / drawn["stretch"]) <= 4).all()
+
+
+def test_a_body_is_stretched_along_the_longer_side_and_only_as_far_as_it_needs(bodies):
+    body, big, drawn = bodies
+    along = np.log(drawn["stretch"]) * np.sign(body.size[0] - body.size[1])
+    discs = drawn["shape"] == 0
+    assert (along[discs] >= 0).all()
+    narrow = int(np.argmin(body.size))
+    left = (np.array(body.size) - (drawn["high"] - drawn["low"]))[:, narrow]
+    needed = big & (along > 0)
+    np.testing.assert_allclose(left[needed], 0.010, atol=1e-8)
+
+
+def test_neither_shape_nor_angle_nor_stretch_tells_the_size(bodies):
+    _, big, drawn = bodies
+    known = np.stack([drawn[name] for name in ("shape", "angle", "stretch")], axis=1)
+    booster = HistGradientBoostingClassifier(max_iter=20, random_state=0)
+    assert balanced_accuracy_score(big, cross_val_predict(booster, known, big, cv=3)) < 0.54
+    counts = np.bincount(drawn["shape"][big], minlength=7)
+    assert counts.min() > 200
+
+
+def test_fitted_bodies_cover_what_was_asked(bodies):
+    """Counted on the cells of discs: 30 to 70 % where they are big, though the sheet is narrow."""
+    body, big, drawn = bodies
+    rows = np.flatnonzero(drawn["shape"] == 0)[:200]
+    shapes = Shapes(GestureSettings().shapes, body)
+    room = np.array(body.size) - (drawn["high"] - drawn["low"])[rows]
+    pose = *(drawn[name][rows] for name in ("shape", "angle", "scale")), room / 2 - drawn["low"][rows]
+    frames = shapes.render(*pose, drawn["stretch"][rows]).flatten(1)
+    area = (frames > 0.02 * frames.amax(1, keepdim=True)).float().mean(1).numpy()
+    assert area[big[rows]].min() > 0.27
+    assert area[big[rows]].max() < 0.72
+    assert area[~big[rows]].max() < 0.33
+
+
+def test_stretched_frames_have_the_area_of_unstretched_ones():
+    """Seen on the cells: a disc that is stretched is an ellipse of the same area, axes as asked."""
+    body = Sheet((0.24, 0.24), (240, 240), LAYER)
+    shapes = Shapes(["disc"], body)
+    zero, scale, place = np.zeros(2, int), np.full(2, 0.2), np.full((2, 2), 0.12)
+    frames = shapes.render(zero, np.zeros(2), scale, place, np.array([1.0, 3.0])).numpy()
+    inside = frames > 0.02 * frames.max((1, 2), keepdims=True)
+    round_, long = inside.sum((1, 2))
+    assert long == pytest.approx(round_, rel=0.03)
+    wide, high = inside[1].any(0).sum(), inside[1].any(1).sum()
+    assert wide / high == pytest.approx(3, rel=0.04)
+
+
+def test_a_sheet_of_nine_sensors_and_three_to_one_has_all_gestures():
+    """Of the 250 big touches of such a sheet 249 were bars, and 4038 gestures could not be drawn at all."""
+    body = OBLONG["240 x 80 mm"]
+    source = TouchSampler(body, body.footprints(Grid(3, 3).sensors(body)))
+    movie = source.sample(512, np.random.default_rng(0))
+    assert source.fit
+    shape, big = movie.parameters["shape"].numpy().astype(int), movie.labels[:, 0].numpy() > 0.5
+    assert np.bincount(shape[big], minlength=7).min() >= 15
+    told, error = told_by(shape, big)
+    assert told - 2 * error < 0.6
+
+
+@pytest.mark.parametrize("size", [(0.15, 0.10), (0.16, 0.12), (0.08, 0.08)])
+def test_the_least_leak_fits_any_sheet(size):
+    body = Sheet(size, (20, 16), LAYER)
+    sensors = body.footprints(Grid(3, 3).sensors(body))
+    assert TouchSampler(body, sensors).fit is None
+    assert TouchSampler(body, sensors, {"leak": 0.5}).fit
+
+
+def test_the_default_gestures_are_what_they_were_at_f889bde():
+    """Shapes and times are whole numbers, the same on every machine; published results stand on them."""
+    source = TouchSampler(DEFAULT, DEFAULT.footprints(Grid().sensors(DEFAULT)))
+    assert source.fit is None
+    movie = source.sample(400, np.random.default_rng(0))
+    whole = np.stack([movie.parameters[name].numpy() for name in ("shape", "duration", "onset", "draws")])
+    assert (movie.parameters["stretch"] == 1).all()
+    assert hashlib.sha256(whole.astype(np.int32).tobytes()).hexdigest()[:16] == "dc6867b64af5688c"
+
+
+def test_shapes_without_room_are_named():
+    footprints = DEFAULT.footprints(Grid().sensors(DEFAULT))
+    source = TouchSampler(DEFAULT, footprints, {"shapes": ["bar"], "spare": 0.1})
+    with pytest.raises(InputError, match=r"none of touch.shapes=\['bar'\] covers 0.3 to 0.7.*touch.stretch"):
+        source.sample(16, np.random.default_rng(0))
+
+
+def test_a_shape_that_has_room_only_as_a_small_one_is_small():
+    """It tells small from big, so the balance of such a data set warns."""
+    fit = Fit(big=np.array([True, False]), small=np.array([True, True]))
+    big = np.arange(1000) % 2 == 0
+    shape = fit.draw(big, np.random.default_rng(0))
+    assert (shape[big] == 0).all()
+    assert 200 < (shape[~big] == 1).sum() < 300
+    told, error = told_by(shape, big)
+    with pytest.warns(RuntimeWarning, match="tells big"):
+        check({"labels": {"big": {"told": told, "error": error}}}, GestureSettings())

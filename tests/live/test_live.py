@@ -2,12 +2,18 @@
 
 import re
 import signal
+import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
+from threading import Event, Thread
 from time import monotonic, sleep
 
+import numpy as np
 import pytest
+
+from skin.port.text import Header, encode_header, encode_line
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -123,3 +129,46 @@ def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
     assert done.returncode == 2
     assert needed in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_skin_that_lost_its_power_is_found_again(store, tmp_path):
+    peers, stop = [], Event()
+
+    def serve():
+        """Send for three seconds and fall silent without closing; send on in the next connection."""
+        rng = np.random.default_rng(0)
+        for frames in (300, 10**6):
+            peers.append(server.accept()[0])
+            peers[-1].sendall(encode_header(Header(n=25, rate=100.0, unit="N")))
+            for number in range(frames):
+                values = rng.normal(scale=0.02, size=25).round(4)
+                with suppress(OSError):  # live.py has ended
+                    peers[-1].sendall(encode_line(values, number, 10_000 * number))
+                if stop.wait(0.01):
+                    return
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE)
+        thread = Thread(target=serve, daemon=True)
+        thread.start()
+        port = f"device.port=socket://127.0.0.1:{server.getsockname()[1]}"
+        reader = ["device=serial", port, "device.silence=1", "device.backoff=[0.2,0.5]", "device.tare=1"]
+        live = started(tmp_path, "live.py", *reader, *store)
+        try:
+            said = tmp_path / "live.py.out"
+            until(lambda: "unplugged" in said.read_text(), live, "silence")
+            after = lambda: said.read_text().rpartition("unplugged")[2]  # noqa: E731
+            until(lambda: "no touch" in after(), live, "a verdict")
+            live.send_signal(signal.SIGINT)
+            assert live.wait(60) == 0
+        finally:
+            live.kill()
+            live.wait()
+            stop.set()
+            thread.join(60)
+            for peer in peers:
+                peer.close()
+    said = (tmp_path / "live.py.err").read_text()
+    assert "Traceback" not in said
+    assert "1 reconnected" in said

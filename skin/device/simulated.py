@@ -103,7 +103,7 @@ class Simulated(AbstractDevice):
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if self.stream and self.direction:
             raise InputError(
-                "a window of a stream shows part of a path: give data.direction=true or data.stream=true"
+                "a stream's window shows part of a path: give either data.direction=true or data.stream=true"
             )
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)

@@ -69,7 +69,7 @@ def _verdicts(
 
     store = Store.open(config.tracking)
     run = find(store, config.run)
-    trained = configuration(store, run)
+    trained = configuration(store, run, config.trust)
     learner = build_learner(trained)
     restore(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
     simulated, recorded = ((learner.probabilities(side) > 0.5).numpy() for side in both)

@@ -64,7 +64,7 @@ def _encoder(config: DictConfig) -> tuple[DictConfig, "Network"]:
     store = Store.open(config.tracking)
     run = find(store, config.run)
     given = [one for one in overrides() if not one.startswith("embeddings.")]
-    config = changed(configuration(store, run), config, given)
+    config = changed(configuration(store, run, config.trust), config, given)
     learner = build_learner(config)
     if not isinstance(learner, Network):
         raise InputError(

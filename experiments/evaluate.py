@@ -26,7 +26,7 @@ def main(config: DictConfig) -> None:
     store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
     run = find(store, config.run)
     given = overrides()
-    config = changed(configuration(store, run), config, given)
+    config = changed(configuration(store, run, config.trust), config, given)
     device, learner = build_device(config), build_learner(config)
     shapes = device.blank() if isinstance(device, Serial) else device
     restore(store, run, learner, build_data(config, shapes))

@@ -43,7 +43,7 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
     torch.set_num_threads(config.tracking.threads or 1)
     store, said = Store.open(config.tracking), Console(stderr=True)
     run = find(store, config.run)
-    stored, given = configuration(store, run), overrides()
+    stored, given = configuration(store, run, config.trust), overrides()
     device = build_device(changed(stored, config, given))
     # What it learned from stays, whatever is watched.
     learnt = changed(stored, config, [one for one in given if not one.startswith(("device=", "device."))])

@@ -29,7 +29,7 @@ def main(config: DictConfig) -> None:
     store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
     run = find(store, config.run)
     given = [one for one in overrides() if one.lstrip("+~").split("=")[0] not in _OWN]
-    own = changed(configuration(store, run), config, given)
+    own = changed(configuration(store, run, config.trust), config, given)
     device, learner = build_device(own), build_learner(own)
     restore(store, run, learner, build_data(own, device))
     found = margins(learner, device, config.gestures, own.evaluation.false_alarm_rate)

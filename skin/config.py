@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
 
 # They steer a run and change none of its results.
-_STEERING = ("tracking",)
+_STEERING = ("tracking", "trust")
 
 
 @dataclass
@@ -104,6 +104,7 @@ class Config:
     contact: dict[str, Any] | None = None  # runs of old have none
     # What a command other than training adds.
     run: str | None = None
+    trust: bool = False
     n: int | None = None
     out: str | None = field(default=None)
     view: str | None = None

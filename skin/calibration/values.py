@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from skin.errors import InputError
+from skin.foreign import settings
 
 __all__ = ["BROKEN", "QUANTITIES", "Calibration", "read", "write"]
 
@@ -151,8 +149,8 @@ def read(path: str | Path) -> Calibration:
     if found is None:
         raise InputError(f"no calibration {path}: experiments/calibrate.py session=FILE out={path} makes one")
     try:
-        stored: Any = OmegaConf.to_container(OmegaConf.load(found))
-    except (OSError, YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        stored: Any = settings(found)
+    except (OSError, ValueError) as error:
         raise InputError(f"cannot read the calibration {found}: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         raise InputError(f"{found} is no calibration: it needs format: {FORMAT}, count: and sensors:")

@@ -11,6 +11,7 @@ import numpy as np
 
 from skin.device._cost import CHANNELS, SOURCE, Captures, read
 from skin.errors import InputError
+from skin.foreign import arrays
 from skin.simulator._store import folder
 
 __all__ = ["captures"]
@@ -55,12 +56,14 @@ def captures(path: Path, window: int) -> Captures:
 def _load(path: Path, window: int) -> Captures | None:
     """Return the captures in a cache file, or None if there is none or anything about it is wrong."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            found = Captures(**{field.name: file[field.name] for field in fields(Captures)})
+        stored = arrays(path)
+        found = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
     except Exception:  # Whatever a broken archive raises, the answer is the same: read the file anew.
         return None
-    sound = found.counts.shape[1:] == (window, CHANNELS)
-    return found if sound and all(len(values) == len(found) for values in vars(found).values()) else None
+    sound = found.counts.shape[1:] == (window, CHANNELS) and found.counts.dtype == np.float32
+    others = [values for name, values in vars(found).items() if name != "counts"]
+    sound = sound and all(one.shape == (len(found),) and one.dtype.kind == "i" for one in others)
+    return found if sound else None
 
 
 def _save(path: Path, found: Captures) -> None:

@@ -50,7 +50,7 @@ def newest(store: Store, config: DictConfig, rows: str | Sequence[str]) -> dict[
         if row is None or (rows != "all" and row not in rows):
             continue
         seen.add(row)
-        own = configuration(store, run)
+        own = configuration(store, run, config.trust)
         if "dead" in own.device:
             found.setdefault(_line(row, own), {}).setdefault(str(own.seed), run)
     names = [] if rows == "all" else [rows] if isinstance(rows, str) else rows
@@ -73,7 +73,7 @@ def try_run(store: Store, line: str, run: Run, config: DictConfig, settings: Dea
 
     The training's own number of dead sensors, or a device per gesture, does not count.
     """
-    own = changed(configuration(store, run), config, [])
+    own = changed(configuration(store, run, config.trust), config, [])
     device, learner = build_device(own), build_learner(own)
     if not isinstance(device, Simulated):
         raise InputError(f"run {run.info.run_id} was not trained on a simulated skin: leave its row out")

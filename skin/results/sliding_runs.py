@@ -71,7 +71,9 @@ def try_run(
     Raises:
         InputError: overrides that do not fit the run, or a device that has no streams.
     """
-    own = changed(configuration(store, run), config, [one for one in overrides if not _ours(one)])
+    own = changed(
+        configuration(store, run, config.trust), config, [one for one in overrides if not _ours(one)]
+    )
     asked = json.dumps([vars(course), fingerprint(own)], sort_keys=True)
     tags = {"evaluated": run.info.run_id, "stream": hashlib.sha256(asked.encode()).hexdigest()[:16]}
     known = store.find("FINISHED", **tags) if config.tracking.resume else []

@@ -76,9 +76,22 @@ class Elastic:
             axis: along which the cells are loaded.
             path: of the file, x.npy; it is written if it is not there.
         """
-        if not path.exists():
+        known = self._influence(path)
+        if known is None:
             self._write_influence(axis, path)
-        return np.load(path, mmap_mode="r")
+            known = self._influence(path)
+        assert known is not None
+        return known
+
+    def _influence(self, path: Path) -> np.ndarray | None:
+        """Return what a file holds, or None if there is none or it is no such array."""
+        columns, rows, _ = self.mesh.counts
+        shape = (len(self.mesh.held), columns * rows)
+        try:
+            found = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, EOFError, ValueError):
+            return None
+        return found if found.shape == shape and found.dtype == np.float32 else None
 
     def _write_influence(self, axis: int, path: Path) -> None:
         loads = self.mesh.loads(axis)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 import warnings
@@ -11,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import platformdirs
+
+from skin.foreign import arrays
 
 __all__ = ["folder", "hashed", "kept", "place"]
 
@@ -49,13 +52,13 @@ def kept(
     stored = _load(path, key, shapes)
     if stored is not None:
         return stored
-    arrays = dict(build())
+    built = dict(build())
     try:
         with place(path) as name, open(name, "wb") as file:
-            np.savez(file, allow_pickle=False, **({"key": np.array(key)} | arrays))
+            np.savez(file, allow_pickle=False, **({"key": np.array(key)} | built))
     except OSError as error:
         warnings.warn(f"the operator cannot be kept in {path.parent}: {error}", RuntimeWarning, stacklevel=3)
-    return arrays
+    return built
 
 
 class place:  # noqa: N801 - reads as the verb it is
@@ -80,14 +83,15 @@ class place:  # noqa: N801 - reads as the verb it is
 def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:
     """Return the arrays of a file, or None if there is no file or anything about it is wrong."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if str(file["key"]) != key:
-                return None
-            arrays = {name: file[name] for name in shapes}
+        expected = sum(8 * math.prod(shape) for shape in shapes.values())
+        stored = arrays(path, most=expected + 4 * len(key))
+        if str(stored["key"]) != key:
+            return None
+        found = {name: stored[name] for name in shapes}
     except Exception:  # Whatever a broken archive raises, the answer is the same: build it anew.
         return None
     sound = all(
         array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
-        for name, array in arrays.items()
+        for name, array in found.items()
     )
-    return arrays if sound else None
+    return found if sound else None

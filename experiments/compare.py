@@ -27,8 +27,8 @@ def main(config: DictConfig) -> None:
     from skin.build import build_device
     from skin.console import quiet
     from skin.device.simulated import Simulated
+    from skin.files import write
     from skin.results import compare, gestures, gestures_page
-    from skin.results.verdicts import whole
 
     quiet()
     settings = plain(config)["compare"]
@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
         both = compare.touches(presses, device.sensors.positions, device.rate, device.window)
         text = compare.page(presses, _verdicts(config, device, both), about)
         picture = compare.figure(presses, settings["shown"], folder / "compare.png")
-    print(text, whole(text, folder / "compare.md"), picture, sep="\n")
+    print(text, write(text, folder / "compare.md"), picture, sep="\n")
 
 
 def _verdicts(

@@ -31,9 +31,10 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.embedding.probe import probe
+    from skin.files import write
     from skin.results.figures import save
     from skin.results.space import lines, spaces, statements
-    from skin.results.table import markdown, write
+    from skin.results.table import markdown
 
     folder = Path(config.out).expanduser() if config.out else ROOT / "results"
     if config.run is not None:

@@ -5,12 +5,14 @@ import sys
 from pathlib import Path
 
 import train
+from chosen import refusing
 
 from skin.config import ROOT
 
 BUDGETS = {"full": "table", "smoke": "smoke"}
 
 
+@refusing
 def main() -> None:
     """Run the sweep, let its rows vote, then write table and figures to ``results/``; 1 if a run failed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -30,9 +32,10 @@ def report(overrides: list[str], folder: Path) -> int:
     from entries import Entries
 
     from skin.build import build_device
+    from skin.files import write
     from skin.results.gallery import draw_runs, draw_skin
     from skin.results.show import results
-    from skin.results.table import as_csv, collect, grid, markdown, report_values, rows, write
+    from skin.results.table import as_csv, collect, grid, markdown, report_values, rows
     from skin.tracking import Store
 
     entries = Entries(overrides)

@@ -15,7 +15,6 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -193,7 +192,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             started.append(True)
             try:
                 return task(checked(config))
-            except (HydraException, OmegaConfBaseException, InputError, TypeError) as error:
+            except Exception as error:
                 refused = refusal(error)
                 if refused is None:
                     raise

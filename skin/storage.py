@@ -8,12 +8,8 @@ under ``skin``, beside ``x.csv`` in ``x.csv.json``.
 """
 
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -23,7 +19,9 @@ import pyarrow.parquet
 import torch
 from torch import Tensor
 
+from skin import files
 from skin.errors import InputError
+from skin.files import whole
 from skin.labels import Task
 from skin.recording import Recording, Touches
 
@@ -46,18 +44,15 @@ def write(recording: Recording, path: str | Path) -> Path:
     path = Path(path)
     _check_suffix(path)
     table, about = _table(recording), _describe(recording)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _whole(path) as partial:
-            if path.suffix == ".parquet":
-                table = table.replace_schema_metadata({"skin": json.dumps(about)})
-                pa.parquet.write_table(table, partial, compression="zstd")
-                return path
-            pa.csv.write_csv(table, partial)
-        with _whole(_sidecar(path)) as partial:
-            partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
+    if path.suffix == ".parquet":
+        with whole(path) as partial:
+            table = table.replace_schema_metadata({"skin": json.dumps(about)})
+            pa.parquet.write_table(table, partial, compression="zstd")
+        return path
+    # The table takes its place last: without it the sidecar means nothing.
+    with whole(path) as partial:
+        pa.csv.write_csv(table, partial)
+        files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
     return path
 
 
@@ -87,19 +82,6 @@ def _check_suffix(path: Path) -> None:
 
 def _sidecar(path: Path) -> Path:
     return path.with_name(path.name + ".json")
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside ``path`` that takes its place if all goes well."""
-    with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        partial = Path(file.name)
-    try:
-        yield partial
-        partial.chmod(0o644)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _numbered(name: str, count: int) -> list[str]:

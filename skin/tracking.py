@@ -11,18 +11,23 @@ import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from alembic.util import CommandError
 from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Run, ViewType
+from mlflow.exceptions import MlflowException
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
+from sqlalchemy.exc import SQLAlchemyError
 
 from skin.config import ROOT, Tracking
+from skin.errors import InputError
+from skin.files import whole
 
 __all__ = ["Store", "commit", "ends_on_signal"]
 
@@ -43,17 +48,28 @@ class Store:
 
     @classmethod
     def open(cls, settings: Tracking) -> "Store":
-        """Return the experiment, made with its database where they are missing."""
+        """Return the experiment, made with its database where they are missing.
+
+        Raises:
+            InputError: the database is none, belongs to another version of MLflow, or cannot be written.
+        """
         uri = settings.uri or f"sqlite:///{ROOT / 'mlflow.db'}"
         artifacts = Path(settings.artifacts).expanduser() if settings.artifacts else ROOT / "mlartifacts"
-        with _alone(uri):
-            client = MlflowClient(tracking_uri=uri)
-            found = client.get_experiment_by_name(settings.experiment)
-            if found is None:
-                location = (artifacts / settings.experiment).resolve().as_uri()
-                identity = client.create_experiment(settings.experiment, artifact_location=location)
-            else:
-                identity = found.experiment_id
+        try:
+            with _alone(uri, artifacts):
+                client = MlflowClient(tracking_uri=uri)
+                found = client.get_experiment_by_name(settings.experiment)
+                if found is None:
+                    location = (artifacts / settings.experiment).resolve().as_uri()
+                    identity = client.create_experiment(settings.experiment, artifact_location=location)
+                else:
+                    identity = found.experiment_id
+        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+            reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
+            raise InputError(
+                f"cannot use the runs in {uri}: {reason}: give another place, as in "
+                "tracking.uri=sqlite:////FOLDER/runs.db"
+            ) from error
         return cls(client, uri, identity)
 
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
@@ -127,8 +143,16 @@ def commit() -> str:
         return "unknown"
 
 
+def _make(path: Path, artifacts: Path) -> None:
+    """Make a database under another name first: one that is cut short halfway could not be opened again."""
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
+
+    with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
+        SqlAlchemyStore(f"sqlite:///{partial}", str(artifacts)).engine.dispose()
+
+
 @contextmanager
-def _alone(uri: str) -> Iterator[Any]:
+def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
     """Keep other processes out while a SQLite database is made: two that make it at once both fail."""
     if not uri.startswith("sqlite:///"):
         yield
@@ -136,8 +160,9 @@ def _alone(uri: str) -> Iterator[Any]:
     path = Path(uri.removeprefix("sqlite:///"))
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(f"{path}.lock"):
-        connection = sqlite3.connect(path)
-        # Readers and writers at the same time; the mode stays with the file.
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.close()
+        if not path.exists() or not path.stat().st_size:
+            _make(path, artifacts)
+        with closing(sqlite3.connect(path)) as connection:
+            # Readers and writers at the same time; the mode stays with the file.
+            connection.execute("PRAGMA journal_mode=WAL")
         yield

@@ -11,6 +11,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from skin.errors import InputError
+from skin.files import whole, write
 
 __all__ = ["load", "numbers", "save"]
 
@@ -56,17 +57,12 @@ def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path)
     path, table = Path(path).expanduser(), pa.table(dict(columns))
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"a session is a .csv or .parquet file, got {path.name}: as in session=bench.csv")
-    partial = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as partial:
         if path.suffix == ".parquet":
             pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
         else:
             pa.csv.write_csv(table, partial)
-            path.with_name(path.name + ".json").write_text(json.dumps(dict(about)) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
+            write(json.dumps(dict(about)) + "\n", path.with_name(path.name + ".json"))
     return path
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from skin import files
 from skin.errors import InputError
 from skin.foreign import settings
 
@@ -185,14 +186,7 @@ def write(calibration: Calibration, path: str | Path) -> Path:
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]
     lines.append(f"about: {json.dumps(dict(calibration.about))}")
     path = Path(path).expanduser()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".part")
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
-    return path
+    return files.write("\n".join(lines) + "\n", path)
 
 
 def _known(given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:

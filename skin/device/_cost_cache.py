@@ -1,8 +1,6 @@
 """Captures of CoST.csv, read once and kept on disk."""
 
 import hashlib
-import os
-import tempfile
 import warnings
 from dataclasses import fields
 from pathlib import Path
@@ -11,6 +9,7 @@ import numpy as np
 
 from skin.device._cost import CHANNELS, SOURCE, Captures, read
 from skin.errors import InputError
+from skin.files import whole
 from skin.foreign import arrays
 from skin.simulator._store import folder
 
@@ -48,7 +47,7 @@ def captures(path: Path, window: int) -> Captures:
     found = read(path, window)
     try:
         _save(stored, found)
-    except OSError as error:
+    except InputError as error:
         warnings.warn(f"captures cannot be kept in {stored.parent}: {error}", RuntimeWarning, stacklevel=2)
     return found
 
@@ -68,12 +67,5 @@ def _load(path: Path, window: int) -> Captures | None:
 
 def _save(path: Path, found: Captures) -> None:
     """Write a cache file whole or not at all: others may read or write it at the same time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **vars(found))
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with whole(path) as partial:
+        np.savez(partial, **vars(found))

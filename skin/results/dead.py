@@ -16,11 +16,12 @@ from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.metrics import metrics
+from skin.files import write
 from skin.reload import changed, configuration, restore
 from skin.results.asked import DeadSettings
 from skin.results.moving_runs import Trial
 from skin.results.moving_table import comparison
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 from skin.tracking import Store
 
 __all__ = ["newest", "publish", "try_run"]

@@ -23,7 +23,6 @@ __all__ = [
     "markdown",
     "report_values",
     "rows",
-    "write",
 ]
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous", "dangerous_recall")
@@ -139,14 +138,6 @@ def markdown(table: Sequence[Sequence[str]], title: str) -> str:
     """Return a table, its head first, as Markdown."""
     lines = ["| " + " | ".join(line) + " |" for line in table]
     return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
-
-
-def write(text: str, path: Path) -> None:
-    """Write a file under a temporary name and rename it, so that a reader never sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text)
-    unfinished.replace(path)
 
 
 def as_csv(lines: Sequence[dict[str, str]]) -> str:

@@ -10,10 +10,11 @@ import pyarrow.csv
 from torch import Tensor
 
 from skin.evaluation.report import Report
+from skin.files import whole, write
 from skin.labels import Task
 from skin.results.figures import confusions, save
 
-__all__ = ["page", "publish", "verdicts", "whole"]
+__all__ = ["page", "publish", "verdicts"]
 
 
 def page(found: Report, task: Task, title: str, about: str) -> str:
@@ -50,7 +51,7 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
 
 def publish(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [whole(page(found, task, title, about), path)]
+    written = [write(page(found, task, title, about), path)]
     if found.confusion is not None:
         named = dict(zip(task.binary, found.confusion.numpy(), strict=True))
         written.append(save(confusions(named, ("no", "yes")), path.with_suffix(".png")))
@@ -70,10 +71,8 @@ def verdicts(chances: Tensor, task: Task, path: Path) -> tuple[str, Path]:
     """
     columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
     table = pa.table({"gesture": np.arange(len(chances)), **columns})
-    partial = path.with_name(path.name + ".part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pa.csv.write_csv(table, partial)
-    partial.replace(path)
+    with whole(path) as partial:
+        pa.csv.write_csv(table, partial)
     said = [
         f"gesture {number}: "
         + ", ".join(
@@ -91,11 +90,3 @@ def _slide(row: Sequence[float], task: Task) -> str:
     if row[task.names.index("dynamic")] <= 0.5:
         return ""
     return f", sliding towards {math.degrees(math.atan2(row[-1], row[-2])):.0f}°"
-
-
-def whole(text: str, path: Path) -> Path:
-    """Write a text under a temporary name and rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(text, encoding="utf-8")
-    return partial.replace(path)

@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +12,11 @@ from typing import Any
 import numpy as np
 import platformdirs
 
+from skin.errors import InputError
+from skin.files import whole
 from skin.foreign import arrays
 
-__all__ = ["folder", "hashed", "kept", "place"]
+__all__ = ["folder", "hashed", "kept"]
 
 
 def folder(given: str | Path | None) -> Path:
@@ -54,30 +55,11 @@ def kept(
         return stored
     built = dict(build())
     try:
-        with place(path) as name, open(name, "wb") as file:
-            np.savez(file, allow_pickle=False, **({"key": np.array(key)} | built))
-    except OSError as error:
+        with whole(path) as partial:
+            np.savez(partial, allow_pickle=False, **({"key": np.array(key)} | built))
+    except InputError as error:
         warnings.warn(f"the operator cannot be kept in {path.parent}: {error}", RuntimeWarning, stacklevel=3)
     return built
-
-
-class place:  # noqa: N801 - reads as the verb it is
-    """Give a temporary name that becomes ``path`` when all went well: others may read or write it too."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> str:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        handle, self._name = tempfile.mkstemp(dir=self._path.parent, prefix=self._path.stem, suffix=".tmp")
-        os.close(handle)
-        return self._name
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            os.replace(self._name, self._path)
-        else:
-            Path(self._name).unlink(missing_ok=True)
 
 
 def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from skin.body._memory import require_memory
 from skin.errors import InputError
 from skin.files import whole, write
 
@@ -33,7 +34,10 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
         raise InputError(f"no {what} {path}")
     try:
         if path.suffix == ".parquet":
-            table = pa.parquet.read_table(path)
+            with pa.parquet.ParquetFile(path) as file:
+                size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
+                require_memory(size, f"the {what} {path}", "give fewer rows")
+                table = file.read()
             about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
         else:
             lines = path.read_text(encoding="utf-8-sig").splitlines(keepends=True)
@@ -41,8 +45,12 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
             table = pa.csv.read_csv(pa.py_buffer(text.encode()))
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise InputError(f"cannot read the {what} {path}: {error}") from error
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, RecursionError) as error:
+        raise InputError(f"cannot read the {what} {path}: {' '.join(str(error).split())}") from error
+    if not isinstance(about, dict):
+        raise InputError(f"the {what} {path} says {about!r} of itself, needed is an object, as in {{}}")
     if not len(table):
         raise InputError(f"the {what} {path} has no rows below its header")
     return table.rename_columns([name.strip() for name in table.column_names]), about

@@ -40,8 +40,17 @@ class Session:
     def __post_init__(self) -> None:
         if self.unit not in _UNITS:
             raise InputError(f"the session's unit must be {' or '.join(_UNITS)}, got {self.unit}")
-        if len(self.time) < 2 or (np.diff(self.time) <= 0).any():
-            raise InputError("a session needs at least two frames, and time that grows from frame to frame")
+        if len(self.time) < 2:
+            raise InputError(f"a session needs at least two frames, got {len(self.time)}")
+        # A time that is no number does not grow either.
+        if len(late := np.flatnonzero(~(np.diff(self.time) > 0))):
+            number = int(late[0])
+            raise InputError(
+                "time must grow from frame to frame, but row "
+                f"{number + 2} has {self.time[number + 1]:g} s after {self.time[number]:g} s"
+            )
+        if self.bits is not None and not (isinstance(self.bits, int) and 1 <= self.bits <= 64):
+            raise InputError(f"the session's bits must be a whole number from 1 to 64, got {self.bits}")
 
 
 def read(path: str | Path, indenter: str, radius: float, unit: str | None = None) -> Session:
@@ -72,7 +81,10 @@ def read(path: str | Path, indenter: str, radius: float, unit: str | None = None
     if inside and in_microseconds:
         table = table.append_column("time", [time])
     rows = gauges.of_table(table, str(path), indenter, radius) if inside else None
-    return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+    try:
+        return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def write(session: Session, path: str | Path) -> Path:

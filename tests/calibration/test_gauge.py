@@ -99,7 +99,9 @@ def test_a_log_of_a_microcontroller_is_a_session(tmp_path):
         ("time,a\n", "no rows"),
         ("time\n1\n2\n", "no column of a sensor"),
         ("a,b\n1,2\n3,4\n", "no column time"),
-        ("time,a\n1,2\n1,3\n", "time that grows"),
+        ("time,a\n1,2\n1,3\n", r"log\.csv: time must grow .* row 2 has 1 s after 1 s"),
+        ("t_us,a\n5,2\n5,3\n5,3\n", r"log\.csv: time must grow .* row 2 has 5e-06 s after 5e-06 s"),
+        ("time,a\n1,2\n", "two frames, got 1"),
         ("time,a\n1,2\n1,2,3\n", "cannot read"),
     ],
 )
@@ -107,4 +109,13 @@ def test_bad_sessions_are_refused(tmp_path, text, reason):
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=reason):
+        session.read(path, "disc", 0.01)
+
+
+@pytest.mark.parametrize("about", ["[]", "3", "{", "[" * 5000, '{"unit": ["N"]}', '{"bits": "many"}'])
+def test_what_a_session_says_of_itself_is_checked(tmp_path, about):
+    path = tmp_path / "log.csv"
+    path.write_text("time,a\n1,2\n2,3\n")
+    (tmp_path / "log.csv.json").write_text(about)
+    with pytest.raises(InputError, match=r"log\.csv"):
         session.read(path, "disc", 0.01)

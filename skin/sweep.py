@@ -113,8 +113,7 @@ class Sweep(Callback):
 
         self._store = store = Store.open(settings)
         name = config.hydra.runtime.choices.get("sweep") or "sweep"
-        parent = store.client.create_run(store.experiment, run_name=name, tags={"sweep": name})
-        self._parent = parent.info.run_id
+        self._parent = store.create(name, {"sweep": name}).info.run_id
         os.environ[PARENT] = self._parent
         return store
 

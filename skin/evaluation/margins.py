@@ -116,6 +116,8 @@ def margins(learner: Answers, device: AbstractDevice, gestures: int, false_alarm
     shares = _shares(measures, device.sampler.settings.thresholds)
     found = {name: spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index("dangerous")
+    if len(labels[:, danger].unique()) < 2:
+        raise InputError("all test touches are safe or all are dangerous: give more, as in gestures=20000")
     level = alarm_level(false_alarm_rate, chances[:, danger], labels[:, danger].long())
     found[ALARM] = spans(chances[:, danger] >= level, shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))

@@ -35,6 +35,7 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
         in which it is open, and the gate itself is no part of the overall. Where it has a direction, there
         are ``direction/degrees``, the mean size of the error, and ``direction/accuracy``, the share of errors
         up to 45 degrees, of the touches that have one (blind guesses: 90 and .25); no part of the overall.
+        NaN where the touches do not define a value: a recall needs touches with the label and without.
     """
     if task.kind == "exclusive":
         right = multiclass_accuracy(probabilities, labels.argmax(1), len(task), average="micro")
@@ -42,9 +43,11 @@ def metrics(probabilities: Tensor, labels: Tensor, task: Task, false_alarm_rate:
     values: dict[str, float] = {}
     pairs = _pairs(probabilities, labels, task)
     for name, (chance, label) in zip(task.binary, pairs, strict=True):
-        recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
         values[f"{name}/accuracy"] = float(((chance > 0.5) == (label > 0)).float().mean())
-        values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
+        values[f"{name}/balanced_accuracy"] = math.nan
+        if _both(label):
+            recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
+            values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = float(binary_calibration_error(chance, label, n_bins=15))
         if name == "dangerous":
             values[f"{name}/recall"] = recall_at(false_alarm_rate, chance, label)
@@ -76,9 +79,19 @@ def recall_at(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:
         false_alarm_rate: largest share of the false cases that may be called true.
         chance: (B,), probabilities.
         label: (B,), 0 or 1, integer.
+
+    Returns:
+        NaN where all labels are alike.
     """
+    if not _both(label):
+        return math.nan
     false_alarms, recall, _ = binary_roc(chance, label)
     return float(recall[false_alarms <= false_alarm_rate].max())
+
+
+def _both(label: Tensor) -> bool:
+    """Return whether a label (B,) is there in some touches and not in others."""
+    return bool(label.any()) and not bool(label.all())
 
 
 def alarm_level(false_alarm_rate: float, chance: Tensor, label: Tensor) -> float:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isnan
 from statistics import fmean
 from typing import Literal, Protocol
 
@@ -23,6 +24,8 @@ __all__ = ["Answers", "Report", "columns", "evaluate"]
 
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
+_SHOWN = ("/accuracy", "/recall", "/degrees")
+_UNDEFINED = "not defined, because the test has only gestures with this label or only gestures without it"
 
 
 class Answers(Protocol):
@@ -37,10 +40,10 @@ class Report:
     """What an evaluation found.
 
     Attributes:
-        metrics: ``<column>/<label>/<metric>``, with the columns ``same`` (test gestures felt by the device of
-            the training), ``holdout`` (the training budget's last tenth), ``device_shift`` and
-            ``unseen_layout`` (means over unseen devices and layouts).
-        cannot: column -> why the learner has no figures in it.
+        metrics: ``<column>/<label>/<metric>``, NaN where the touches do not define it. Columns: ``same`` (test
+            gestures felt by the device of the training), ``holdout`` (the training budget's last tenth),
+            ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
+        cannot: column, or metric that is not defined -> why there is no figure.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.
     """
@@ -81,6 +84,7 @@ def evaluate(learner: Answers, device: AbstractDevice, settings: Evaluation) -> 
             continue
         if each:
             found |= _named(column, {name: fmean(values[name] for values in each) for name in each[0]})
+    cannot |= {name: _UNDEFINED for name, value in found.items() if isnan(value) and name.endswith(_SHOWN)}
     table = confusion(chances, _labels(same), task) if task.kind == "binary" else None
     return Report(found, cannot, table, _predictions(chances, same, task, drawn))
 

@@ -13,6 +13,7 @@ from skin.evaluation.report import Report
 from skin.files import whole, write
 from skin.labels import Task
 from skin.results.figures import confusions, save
+from skin.results.show import number
 
 __all__ = ["page", "publish", "verdicts"]
 
@@ -33,10 +34,10 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
     for row in rows:
         if row.endswith(("/accuracy", "/recall")):
             shares = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join('' if x is None else f'{100 * x:.1f}' for x in shares)} |")
+            lines.append(f"| {row} | {' | '.join(map(number, shares))} |")
         if row.endswith("/degrees"):
             sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join('' if x is None else f'{x:.1f}°' for x in sizes)} |")
+            lines.append(f"| {row} | {' | '.join(number(x, 1) + '°' * (x is not None) for x in sizes)} |")
     lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
     if found.confusion is not None:
         lines += [

@@ -4,11 +4,11 @@ Gestures as experiments/record.py marks them, or the presses of a bench (presses
 and .png into out=; run=latest compares its verdicts too. calibrate.py calibrate.demo=true makes a session.
 """
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skin.config import ROOT, DictConfig, command, plain
+from skin.config import DictConfig, command, plain
 from skin.errors import InputError
+from skin.files import results
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +35,7 @@ def main(config: DictConfig) -> None:
     device = build_device(config)
     if not isinstance(device, Simulated):
         raise InputError("the other side is the session: leave out device=")
-    folder = ROOT / Path(config.out).expanduser()
+    folder = results(config.out)
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )

@@ -1,11 +1,11 @@
 """Compare pretrained graph embeddings with plain readings: python experiments/embeddings.py run=latest"""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skin.config import ROOT, DictConfig, command, overrides, plain
+from skin.config import DictConfig, command, overrides, plain
 from skin.embedding.asked import Probing
 from skin.errors import InputError
+from skin.files import results
 
 if TYPE_CHECKING:
     from skin.learner.network import Network
@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     from skin.results.space import lines, spaces, statements
     from skin.results.table import markdown
 
-    folder = Path(config.out).expanduser() if config.out else ROOT / "results"
+    folder = results(config.out)
     if config.run is not None:
         config, learner = _encoder(config)
     device = build_device(config)

@@ -10,6 +10,8 @@ from chosen import refusing
 from skin.config import ROOT
 
 BUDGETS = {"full": "table", "smoke": "smoke"}
+_TITLE = "Accuracy on the test gestures in per cent (the report's in brackets)"
+TITLES = {"full": _TITLE, "smoke": f"SMOKE, little data and one epoch, these numbers mean nothing: {_TITLE}"}
 
 
 @refusing
@@ -23,12 +25,12 @@ def main() -> None:
     overrides = [f"sweep={BUDGETS[arguments.budget]}", "seed=" + ",".join(map(str, range(arguments.seeds)))]
     overrides += [f"simulator={arguments.simulators}"] if arguments.simulators else []
     code = _sweep(["-m", *overrides])
-    missing = report(overrides, ROOT / "results" / ("" if arguments.budget == "full" else arguments.budget))
+    missing = report(overrides, arguments.budget)
     sys.exit(code or (1 if missing else 0))
 
 
-def report(overrides: list[str], folder: Path) -> int:
-    """Write and print what finished runs say; return how many are missing."""
+def report(overrides: list[str], budget: str) -> int:
+    """Write and print what finished runs say, with their budget; return how many are missing."""
     from entries import Entries
 
     from skin.build import build_device
@@ -45,9 +47,10 @@ def report(overrides: list[str], folder: Path) -> int:
     cells += [cell for cell in collect(store, entries.named(entries.others)) if cell.runs]
     simulators = list(dict.fromkeys(config.data.name for config in entries.rows))
     cells.sort(key=lambda cell: simulators.index(cell.simulator))
-    lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"))
+    folder = ROOT / "results" / ("" if budget == "full" else budget)
+    lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"), budget)
     write(as_csv(lines), folder / "table.csv")
-    title = "Accuracy on the test gestures in per cent (the report's in brackets)"
+    title = TITLES[budget]
     write(markdown(grid(lines), title), folder / "table.md")
     skin = {config.data.name: config for config in reversed(entries.rows)}
     name = "fem" if "fem" in skin else simulators[-1]

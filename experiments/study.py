@@ -53,7 +53,9 @@ def run(study: Study, variants: Sequence[Variant], overrides: list[str], folder:
     findings = collect(store, variants, study.self_share)
     outcomes = conclusions(study.statements, findings)
     settings = [word for word in overrides[1:] if not word.startswith("tracking.")]
-    title = ", ".join([f"{study.name}: {study.about}", *settings])
+    smoke = set(SMOKE) <= set(overrides)
+    title = "SMOKE, little data and one epoch, these numbers mean nothing: " * smoke
+    title += ", ".join([f"{study.name}: {study.about}", *settings])
     publish(folder / f"study_{study.name}", title, findings, outcomes)
     return sum(finding.missing for finding in findings)
 

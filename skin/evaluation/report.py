@@ -40,9 +40,9 @@ class Report:
     """What an evaluation found.
 
     Attributes:
-        metrics: ``<column>/<label>/<metric>``, NaN where the touches do not define it. Columns: ``same`` (test
-            gestures felt by the device of the training), ``holdout`` (the training budget's last tenth),
-            ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
+        metrics: ``<column>/<label>/<metric>``, NaN where the touches do not define it. Columns: ``same``
+            (test gestures felt by the device of the training), ``holdout`` (the training budget's last
+            tenth), ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
         cannot: column, or metric that is not defined -> why there is no figure.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.

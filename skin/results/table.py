@@ -38,6 +38,7 @@ COLUMNS = (
     "seconds_per_epoch",
     "parameters",
     "failed",
+    "budget",
 )
 
 
@@ -90,11 +91,13 @@ def report_values(path: Path) -> dict[tuple[str, str, str], float]:
         }
 
 
-def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> list[dict[str, str]]:
+def rows(
+    cells: Sequence[Cell], report: dict[tuple[str, str, str], float], budget: str = "full"
+) -> list[dict[str, str]]:
     """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
 
     ``ours`` is the mean over seeds of the accuracy on the test gestures, or of that recall; ``failed`` where
-    no run finished. The column ``failed`` counts the seeds that are missing.
+    no run finished. The column ``failed`` counts the seeds that are missing, ``budget`` is theirs.
     """
     lines = []
     for cell in cells:
@@ -109,6 +112,7 @@ def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> li
                 "seconds_per_epoch": _number(cell.values("seconds_per_epoch"), 2),
                 "parameters": _number(cell.values("parameters"), 0),
                 "failed": str(cell.missing),
+                "budget": budget,
             }
             lines.append({"row": cell.row, "simulator": cell.simulator, "label": label, **values})
     return lines

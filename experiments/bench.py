@@ -27,7 +27,7 @@ def main() -> None:
     from benchmarks import training
     from benchmarks.wire import decode_core_share
 
-    from skin.results.table import write
+    from skin.files import write
 
     repeats, say = arguments.repeats, Console(stderr=True).print
     figures = {

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from functools import wraps
 
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from skin.config import CONF, checked
-from skin.errors import InputError
+from skin.refusal import refusal
 
 __all__ = ["configuration", "jobs", "names", "parser", "refusing"]
 
@@ -54,8 +52,11 @@ def refusing(main: Callable[[], None]) -> Callable[[], None]:
     def refuse() -> None:
         try:
             main()
-        except (InputError, HydraException, OmegaConfBaseException) as error:
-            print(str(error).strip().replace("\n", "; "), file=sys.stderr)
+        except Exception as error:
+            refused = refusal(error)
+            if refused is None:
+                raise
+            print(refused, file=sys.stderr)
             sys.exit(2)
 
     return refuse

@@ -4,11 +4,11 @@ Gestures as experiments/record.py marks them, or the presses of a bench (presses
 and .png into out=; run=latest compares its verdicts too. calibrate.py calibrate.demo=true makes a session.
 """
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skin.config import ROOT, DictConfig, command, plain
+from skin.config import DictConfig, command, plain
 from skin.errors import InputError
+from skin.files import results
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,15 +27,15 @@ def main(config: DictConfig) -> None:
     from skin.build import build_device
     from skin.console import quiet
     from skin.device.simulated import Simulated
+    from skin.files import write
     from skin.results import compare, gestures, gestures_page
-    from skin.results.verdicts import whole
 
     quiet()
     settings = plain(config)["compare"]
     device = build_device(config)
     if not isinstance(device, Simulated):
         raise InputError("the other side is the session: leave out device=")
-    folder = ROOT / Path(config.out).expanduser()
+    folder = results(config.out)
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )
@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
         both = compare.touches(presses, device.sensors.positions, device.rate, device.window)
         text = compare.page(presses, _verdicts(config, device, both), about)
         picture = compare.figure(presses, settings["shown"], folder / "compare.png")
-    print(text, whole(text, folder / "compare.md"), picture, sep="\n")
+    print(text, write(text, folder / "compare.md"), picture, sep="\n")
 
 
 def _verdicts(
@@ -69,7 +69,7 @@ def _verdicts(
 
     store = Store.open(config.tracking)
     run = find(store, config.run)
-    trained = configuration(store, run)
+    trained = configuration(store, run, config.trust)
     learner = build_learner(trained)
     restore(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
     simulated, recorded = ((learner.probabilities(side) > 0.5).numpy() for side in both)

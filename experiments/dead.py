@@ -6,9 +6,8 @@ python experiments/train.py -m experiment=temporal_graph row=dead representation
     device.dead=[0,5] device.randomise=true seed=0,1,2
 """
 
-from pathlib import Path
-
-from skin.config import ROOT, DictConfig, command, plain
+from skin.config import DictConfig, command, plain
+from skin.files import results
 from skin.results.asked import DeadSettings
 
 
@@ -30,7 +29,7 @@ def main(config: DictConfig) -> None:
     runs = [(line, run) for line, seeds in found.items() for run in seeds.values()]
     shown = track(runs, "trying finished runs", console=Console(stderr=True), disable=not runs)
     trials = [trial for line, run in shown for trial in try_run(store, line, run, config, settings)]
-    folder = Path(config.out).expanduser() if config.out else ROOT / "results"
+    folder = results(config.out)
     publish(folder, trials)
 
 

@@ -4,9 +4,8 @@ Trains each row on three skins of simulator=solid: upright sensors without frict
 with it. Overrides of the training follow: trainer.max_epochs=30 direction.rows=[gru] layout.path=mine.csv
 """
 
-from pathlib import Path
-
-from skin.config import ROOT, DictConfig, command, overrides, plain
+from skin.config import DictConfig, command, overrides, plain
+from skin.files import results
 from skin.results.asked import DirectionSettings
 
 
@@ -20,7 +19,7 @@ def main(config: DictConfig) -> None:
 
     quiet()
     lines = train_lines(overrides(), settings)
-    publish(Path(config.out).expanduser() if config.out else ROOT / "results", comparison(lines))
+    publish(results(config.out), comparison(lines))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Compare pretrained graph embeddings with plain readings: python experiments/embeddings.py run=latest"""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skin.config import ROOT, DictConfig, command, overrides, plain
+from skin.config import DictConfig, command, overrides, plain
 from skin.embedding.asked import Probing
 from skin.errors import InputError
+from skin.files import results
 
 if TYPE_CHECKING:
     from skin.learner.network import Network
@@ -31,11 +31,12 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.embedding.probe import probe
+    from skin.files import write
     from skin.results.figures import save
     from skin.results.space import lines, spaces, statements
-    from skin.results.table import markdown, write
+    from skin.results.table import markdown
 
-    folder = Path(config.out).expanduser() if config.out else ROOT / "results"
+    folder = results(config.out)
     if config.run is not None:
         config, learner = _encoder(config)
     device = build_device(config)
@@ -64,7 +65,7 @@ def _encoder(config: DictConfig) -> tuple[DictConfig, "Network"]:
     store = Store.open(config.tracking)
     run = find(store, config.run)
     given = [one for one in overrides() if not one.startswith("embeddings.")]
-    config = changed(configuration(store, run), config, given)
+    config = changed(configuration(store, run, config.trust), config, given)
     learner = build_learner(config)
     if not isinstance(learner, Network):
         raise InputError(

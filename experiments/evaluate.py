@@ -1,12 +1,11 @@
 """Try a trained run on other touches: python experiments/evaluate.py run=latest device.seed=7
 
 On a skin, gesture by gesture: run=latest device=serial device.port=/dev/ttyACM0; see conf/device/serial.yaml.
-Writes evaluation_<device>.md and .png into out=, and an MLflow run of its own.
+Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its own with that id.
 """
 
-from pathlib import Path
-
-from skin.config import ROOT, DictConfig, command, overrides
+from skin.config import DictConfig, command, overrides
+from skin.files import results
 
 
 @command("evaluate")
@@ -23,10 +22,10 @@ def main(config: DictConfig) -> None:
     from skin.tracking import Store
 
     quiet()
-    store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
+    store, folder = Store.open(config.tracking), results(config.out)
     run = find(store, config.run)
     given = overrides()
-    stored = configuration(store, run)
+    stored = configuration(store, run, config.trust)
     config = changed(stored, config, given)
     device, learner = build_device(config), build_learner(config)
     shapes = device.blank() if isinstance(device, Serial) else device
@@ -34,10 +33,11 @@ def main(config: DictConfig) -> None:
     point = operating_point(run, learner, stored, config.evaluation)
     if isinstance(device, Serial):
         device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
-    name = f"evaluation_{config.device['_target_'].split('.')[-2]}"
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
+        # Every evaluation keeps its files.
+        name = f"evaluation_{config.device['_target_'].split('.')[-2]}_{evaluation.info.run_id[:8]}"
         if isinstance(device, Serial) and device.touches("test").labels is None:
             chances = learner.probabilities(device.touches("test"))
             said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")

@@ -33,7 +33,11 @@ def main(config: DictConfig) -> None:
     source = OmegaConf.masked_copy(config, [key for key in config if key != "out"])
     about = {"config_hash": fingerprint(source), "config": plain(source)}
     path = write(replace(recording, metadata=recording.metadata | about), config.out)
-    print(f"{path}: {line(recording.metadata['summary'])}")
+    # What a file says of itself may be anything.
+    said = (
+        line(recording.metadata["summary"]) if isinstance(device, Simulated) else f"{len(recording)} gestures"
+    )
+    print(f"{path}: {said}")
 
 
 if __name__ == "__main__":

@@ -43,14 +43,14 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
     torch.set_num_threads(config.tracking.threads or 1)
     store, said = Store.open(config.tracking), Console(stderr=True)
     run = find(store, config.run)
-    stored, given = configuration(store, run), overrides()
+    stored, given = configuration(store, run, config.trust), overrides()
     device = build_device(changed(stored, config, given))
     # What it learned from stays, whatever is watched.
     learnt = changed(stored, config, [one for one in given if not one.startswith(("device=", "device."))])
     said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
     if advice := start.advice(stored, device):
         said.print(advice, highlight=False)
-    of = start.trained(store, run, learnt)
+    of = start.trained(store, run, learnt, stored)
     engine = start.engine(of, patience, live["touch"], live["drift"])
     if of.point is not None:
         given = patience.above is not None

@@ -1,13 +1,13 @@
 """How far from a threshold a verdict can be trusted: python experiments/margins.py run=latest
 
 Sorts the verdicts of a finished run by area, travel, duration and pressure over their thresholds, and by the
-highest reading. Writes margins_<row>.md, .csv and .png into out=, and an MLflow run of its own.
+highest reading. Writes margins_<row>_<id>.md, .csv and .png into out=, and the MLflow
+run that has this id.
 """
 
-from pathlib import Path
-
-from skin.config import ROOT, DictConfig, command, overrides
+from skin.config import DictConfig, command, overrides
 from skin.errors import InputError
+from skin.files import results
 
 _OWN = ("gestures", "out", "run")
 
@@ -26,10 +26,10 @@ def main(config: DictConfig) -> None:
     from skin.tracking import Store
 
     quiet()
-    store, folder = Store.open(config.tracking), ROOT / Path(config.out).expanduser()
+    store, folder = Store.open(config.tracking), results(config.out)
     run = find(store, config.run)
     given = [one for one in overrides() if one.lstrip("+~").split("=")[0] not in _OWN]
-    stored = configuration(store, run)
+    stored = configuration(store, run, config.trust)
     own = changed(stored, config, given)
     device, learner = build_device(own), build_learner(own)
     restore(store, run, learner, build_data(own, device))
@@ -38,7 +38,7 @@ def main(config: DictConfig) -> None:
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"margins of {run.info.run_name}", tags, run.info.run_id) as logged:
         title = f"{run.info.run_name}, run {run.info.run_id[:8]}, {config.gestures} touches"
-        written = publish(found, title, folder / f"margins_{own.row}")
+        written = publish(found, title, folder / f"margins_{own.row}_{logged.info.run_id[:8]}")
         for path in written:
             store.client.log_artifact(logged.info.run_id, str(path))
     print(line(found), *written, sep="\n")

@@ -5,14 +5,14 @@ moving.train=true also trains sequence_graph on the layout, on true and on estim
 
 from collections.abc import Iterator
 from copy import deepcopy
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import ROOT, command, plain
+from skin.config import command, plain
 from skin.errors import InputError
+from skin.files import results
 from skin.results.asked import MovingSettings
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def main(config: DictConfig) -> None:
     overrides = HydraConfig.get().overrides.task
     trained = train_lines(overrides, settings.seeds) if settings.train else []
     lines = comparison([*_tried(config, settings), *trained])
-    folder = Path(config.out).expanduser() if config.out else ROOT / "results"
+    folder = results(config.out)
     publish(folder, moves, config.n, lines)
 
 

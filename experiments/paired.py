@@ -9,14 +9,14 @@ import sys
 from collections.abc import Sequence
 from statistics import fmean
 
+from chosen import refusing
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 
 from skin.config import CONF, checked, fingerprint
-from skin.errors import InputError
 from skin.results.study import FEWEST, paired
 
 
+@refusing
 def main() -> None:
     """Print both means, their difference and its standard error; exit code 2 without paired seeds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -24,11 +24,7 @@ def main() -> None:
     parser.add_argument("other")
     parser.add_argument("overrides", nargs="*", help="settings of both, as of train.py")
     arguments = parser.parse_intermixed_args()
-    try:
-        one, other = (_overall(name, arguments.overrides) for name in (arguments.one, arguments.other))
-    except (HydraException, InputError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)
+    one, other = (_overall(name, arguments.overrides) for name in (arguments.one, arguments.other))
     found = paired(one, other)
     if found is None or found.seeds < 2:
         seeds = found.seeds if found else 0

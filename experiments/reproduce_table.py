@@ -5,12 +5,16 @@ import sys
 from pathlib import Path
 
 import train
+from chosen import refusing
 
 from skin.config import ROOT
 
 BUDGETS = {"full": "table", "smoke": "smoke"}
+_TITLE = "Accuracy on the test gestures in per cent (the report's in brackets)"
+TITLES = {"full": _TITLE, "smoke": f"SMOKE, little data and one epoch, these numbers mean nothing: {_TITLE}"}
 
 
+@refusing
 def main() -> None:
     """Run the sweep, let its rows vote, then write table and figures to ``results/``; 1 if a run failed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -21,18 +25,19 @@ def main() -> None:
     overrides = [f"sweep={BUDGETS[arguments.budget]}", "seed=" + ",".join(map(str, range(arguments.seeds)))]
     overrides += [f"simulator={arguments.simulators}"] if arguments.simulators else []
     code = _sweep(["-m", *overrides])
-    missing = report(overrides, ROOT / "results" / ("" if arguments.budget == "full" else arguments.budget))
+    missing = report(overrides, arguments.budget)
     sys.exit(code or (1 if missing else 0))
 
 
-def report(overrides: list[str], folder: Path) -> int:
-    """Write and print what finished runs say; return how many are missing."""
+def report(overrides: list[str], budget: str) -> int:
+    """Write and print what finished runs say, with their budget; return how many are missing."""
     from entries import Entries
 
     from skin.build import build_device
+    from skin.files import write
     from skin.results.gallery import draw_runs, draw_skin
     from skin.results.show import results
-    from skin.results.table import as_csv, collect, grid, markdown, report_values, rows, write
+    from skin.results.table import as_csv, collect, grid, markdown, report_values, rows
     from skin.tracking import Store
 
     entries = Entries(overrides)
@@ -42,9 +47,10 @@ def report(overrides: list[str], folder: Path) -> int:
     cells += [cell for cell in collect(store, entries.named(entries.others)) if cell.runs]
     simulators = list(dict.fromkeys(config.data.name for config in entries.rows))
     cells.sort(key=lambda cell: simulators.index(cell.simulator))
-    lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"))
+    folder = ROOT / "results" / ("" if budget == "full" else budget)
+    lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"), budget)
     write(as_csv(lines), folder / "table.csv")
-    title = "Accuracy on the test gestures in per cent (the report's in brackets)"
+    title = TITLES[budget]
     write(markdown(grid(lines), title), folder / "table.md")
     skin = {config.data.name: config for config in reversed(entries.rows)}
     name = "fem" if "fem" in skin else simulators[-1]

@@ -4,10 +4,9 @@ rows=all takes the newest finished runs of every row on simulator=, on whole tou
 (train.py data.stream=true) each. What was tried before is brought back from MLflow.
 """
 
-from pathlib import Path
-
-from skin.config import ROOT, DictConfig, command, overrides, plain
+from skin.config import DictConfig, command, overrides, plain
 from skin.evaluation.course import Course
+from skin.files import results
 
 
 @command("stream")
@@ -25,7 +24,7 @@ def main(config: DictConfig) -> None:
     runs = newest(store, config.data.name, config.rows) if config.rows else [find(store, config.run)]
     given = overrides()
     for run in runs:
-        print(try_run(store, run, config, course, given, ROOT / Path(config.out).expanduser()), flush=True)
+        print(try_run(store, run, config, course, given, results(config.out)), flush=True)
 
 
 if __name__ == "__main__":

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import train
-from hydra.errors import HydraException
+from chosen import refusing
 
 from skin.config import ROOT
-from skin.errors import InputError
 from skin.results.study import SMOKE, Study, Variant, choose, read
 
 
+@refusing
 def main() -> None:
     """Run studies one after another; exit code 1 if a run failed, 2 for bad input."""
     arguments, studies = _arguments(), read()
@@ -27,12 +27,8 @@ def main() -> None:
     if arguments.config_dir:
         overrides.append(f"hydra.searchpath=[{arguments.config_dir.expanduser().resolve()}]")
     overrides += [word for word in arguments.what if "=" in word]
-    try:
-        chosen = choose(studies, [word for word in arguments.what if "=" not in word])
-        planned = [(study, study.variants(overrides)) for study in chosen]
-    except (HydraException, InputError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)
+    chosen = choose(studies, [word for word in arguments.what if "=" not in word])
+    planned = [(study, study.variants(overrides)) for study in chosen]
     folder = arguments.out or ROOT / "results" / ("smoke" if arguments.smoke else "")
     missing = [run(study, variants, overrides, folder) for study, variants in planned]
     sys.exit(1 if any(missing) else 0)
@@ -57,7 +53,9 @@ def run(study: Study, variants: Sequence[Variant], overrides: list[str], folder:
     findings = collect(store, variants, study.self_share)
     outcomes = conclusions(study.statements, findings)
     settings = [word for word in overrides[1:] if not word.startswith("tracking.")]
-    title = ", ".join([f"{study.name}: {study.about}", *settings])
+    smoke = set(SMOKE) <= set(overrides)
+    title = "SMOKE, little data and one epoch, these numbers mean nothing: " * smoke
+    title += ", ".join([f"{study.name}: {study.about}", *settings])
     publish(folder / f"study_{study.name}", title, findings, outcomes)
     return sum(finding.missing for finding in findings)
 

@@ -14,7 +14,6 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -40,7 +39,7 @@ ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
 
 # They steer a run and change none of its results.
-_STEERING = ("tracking",)
+_STEERING = ("tracking", "trust")
 
 
 @dataclass
@@ -104,6 +103,7 @@ class Config:
     contact: dict[str, Any] | None = None  # runs of old have none
     # What a command other than training adds.
     run: str | None = None
+    trust: bool = False
     n: int | None = None
     out: str | None = field(default=None)
     view: str | None = None
@@ -190,7 +190,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             started.append(True)
             try:
                 return task(checked(config))
-            except (HydraException, OmegaConfBaseException, InputError, TypeError) as error:
+            except Exception as error:
                 refused = refusal(error)
                 if refused is None:
                     raise

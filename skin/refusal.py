@@ -1,10 +1,31 @@
 """What a person is told where a command or one job of a multirun cannot go on."""
 
-from hydra.errors import CompactHydraException, InstantiationException
+import errno
+import os
+import sqlite3
+from collections.abc import Iterator
+
+from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from omegaconf.errors import OmegaConfBaseException
 
 from skin.errors import InputError
 
 __all__ = ["Refused", "refusal", "sentence"]
+
+
+# What a disk or its owner refuses; everything else that the system says is an error of ours.
+_DISK = frozenset(
+    (
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EIO,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.ENOTDIR,
+    )
+)
 
 
 class Refused(InputError, CompactHydraException):  # noqa: N818
@@ -15,6 +36,20 @@ def refusal(error: Exception) -> InputError | None:
     """Return the sentence for a person, or None where the error is ours and deserves its traceback."""
     if isinstance(error, InputError):
         return error
+    for one in _chain(error):
+        if isinstance(one, sqlite3.OperationalError) or type(one) is sqlite3.DatabaseError:
+            return InputError(
+                f"the database of runs refuses: {one}: make room, or give another one, as in "
+                "tracking.uri=sqlite:////FOLDER/runs.db; what has finished is kept"
+            )
+        if isinstance(one, OSError) and one.errno in _DISK:
+            where = one.filename2 or one.filename or "a file"
+            return InputError(
+                f"cannot use {where}: {os.strerror(one.errno)}: make room or give another folder, and run "
+                "the same command again; what has finished is kept"
+            )
+    if not isinstance(error, HydraException | OmegaConfBaseException | TypeError):
+        return None
     cause = error.__cause__ if isinstance(error, InstantiationException) else None
     if isinstance(cause, InputError):
         return cause
@@ -24,6 +59,14 @@ def refusal(error: Exception) -> InputError | None:
     if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
         return None
     return InputError(sentence(reason))
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error and what it came from: libraries wrap what the system says."""
+    found: BaseException | None = error
+    while found is not None:
+        yield found
+        found = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
 
 
 def sentence(error: BaseException) -> str:

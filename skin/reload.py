@@ -1,5 +1,6 @@
 """A finished run, brought back: its configuration with changes, and what it learned."""
 
+import pickle
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
+from mlflow.exceptions import MlflowException
 from omegaconf import DictConfig, OmegaConf
 
 from skin.build import build_device
@@ -16,14 +18,28 @@ from skin.config import Evaluation, checked
 from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose, read
+from skin.foreign import settings
 from skin.learner.base import AbstractLearner
 from skin.tracking import Store
+from skin.trust import vet
 
 __all__ = ["TAG", "changed", "configuration", "find", "operating_point", "restore"]
 
 TAG = "operating_point"
 """Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
 
+# What a learner raises on a file that is damaged, or that another learner wrote.
+_UNFIT = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    pickle.PickleError,
+)
 # What a run learned fits these as they were; the rest may be tried with others.
 _FIXED = (
     "representation",
@@ -54,13 +70,28 @@ def find(store: Store, name: str) -> Run:
     return found[0]
 
 
-def configuration(store: Store, run: Run) -> DictConfig:
-    """Return the configuration that a run was made from, every value in it final."""
+def configuration(store: Store, run: Run, trust: bool = False) -> DictConfig:
+    """Return the configuration that a run was made from, every value in it final.
+
+    Args:
+        store: where the run is.
+        run: whoever made it.
+        trust: build whatever it names, which may run any code. Otherwise :func:`skin.trust.vet` decides.
+
+    Raises:
+        InputError: it cannot be read, or names what a stored run may not build.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        path = download_artifacts(
-            run_id=run.info.run_id, artifact_path="config.yaml", dst_path=folder, tracking_uri=store.uri
-        )
-        return OmegaConf.load(path)  # type: ignore[return-value]
+        path = _fetched(store, run, "config.yaml", folder)
+        try:
+            stored = settings(path)
+        except (ValueError, OSError) as error:
+            raise InputError(f"run {run.info.run_id} has no readable config.yaml: {error}") from error
+    if not isinstance(stored, dict):
+        raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
+    if not trust:
+        vet(stored, f"config.yaml of run {run.info.run_id}")
+    return OmegaConf.create(stored)
 
 
 def changed(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -79,7 +110,7 @@ def changed(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) 
     _follow(whole, composed)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
-        if key == "run" or key.startswith("hydra"):
+        if key in ("run", "trust") or key.startswith("hydra"):
             continue
         group = key.split(".")[0]
         if group in _FIXED:
@@ -102,16 +133,19 @@ def restore(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -
         InputError: what it learned does not fit the touches, as another window does not fit early fusion.
     """
     name = run.data.tags["learned"]
-    with tempfile.TemporaryDirectory() as folder:
-        path = download_artifacts(
-            run_id=run.info.run_id, artifact_path=name, dst_path=folder, tracking_uri=store.uri
+    if Path(name).name != name:
+        raise InputError(
+            f"run {run.info.run_id} names {name!r} as what it learned, which is no file of its own"
         )
+    with tempfile.TemporaryDirectory() as folder:
+        path = _fetched(store, run, name, folder)
         try:
-            learner.load(data, Path(path))
-        except (RuntimeError, KeyError) as error:
-            reason = str(error).strip().splitlines()[-1].strip()
+            learner.load(data, path)
+        except InputError:
+            raise
+        except _UNFIT as error:
             raise InputError(
-                f"what run {run.info.run_id} learned does not fit these touches: {reason}"
+                f"{name} of run {run.info.run_id} is damaged or does not fit these touches: {_reason(error)}"
             ) from error
 
 
@@ -148,6 +182,25 @@ def operating_point(
     if said:
         print(said, file=sys.stderr, flush=True)
     return point
+
+
+def _reason(error: Exception) -> str:
+    """Return what an error says, in short; torch's words on a pickle advise to run the code in it."""
+    if isinstance(error, pickle.PickleError):
+        return "it holds something else than numbers"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
+
+
+def _fetched(store: Store, run: Run, name: str, folder: str) -> Path:
+    """Copy a file or folder of a run into ``folder``."""
+    identity = run.info.run_id
+    try:
+        return Path(
+            download_artifacts(run_id=identity, artifact_path=name, dst_path=folder, tracking_uri=store.uri)
+        )
+    except (MlflowException, OSError) as error:
+        raise InputError(f"run {identity} has no {name} in {run.info.artifact_uri}: {error}") from error
 
 
 def _follow(whole: DictConfig, composed: DictConfig) -> None:

@@ -8,13 +8,10 @@ layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``ski
 ``x.csv.json``.
 """
 
+import hashlib
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -24,7 +21,10 @@ import pyarrow.parquet
 import torch
 from torch import Tensor
 
+from skin import files
+from skin.description import check, check_rows
 from skin.errors import InputError
+from skin.files import whole
 from skin.labels import Task
 from skin.recording import Recording, Touches
 
@@ -47,18 +47,16 @@ def write(recording: Recording, path: str | Path) -> Path:
     path = Path(path)
     _check_suffix(path)
     table, about = _table(recording), _describe(recording)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _whole(path) as partial:
-            if path.suffix == ".parquet":
-                table = table.replace_schema_metadata({"skin": json.dumps(about)})
-                pa.parquet.write_table(table, partial, compression="zstd")
-                return path
-            pa.csv.write_csv(table, partial)
-        with _whole(_sidecar(path)) as partial:
-            partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
+    if path.suffix == ".parquet":
+        with whole(path) as partial:
+            text = json.dumps(about)
+            table = table.replace_schema_metadata({"skin": text, "skin_sha256": _sha256(text.encode())})
+            pa.parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
+        return path
+    # The table takes its place last: without it the sidecar means nothing.
+    with whole(path) as partial:
+        pa.csv.write_csv(table, partial)
+        files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
     return path
 
 
@@ -74,11 +72,15 @@ def read(path: str | Path) -> Recording:
         raise InputError(f"no recording {path}: experiments/generate.py n=1000 out={path} makes one")
     try:
         about = _read_about(path)
-        if about.get("format") != FORMAT:
+        if isinstance(about, dict) and about.get("format") != FORMAT:
             raise InputError(f"{path} has format {about.get('format')}, this version reads format {FORMAT}")
+        check(about, str(path))
         return _recording(_read_table(path, about), about, path)
-    except (OSError, pa.ArrowException, json.JSONDecodeError, KeyError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is damaged or no recording of this project: {error}") from error
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, KeyError, OverflowError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
 
 
 def _check_suffix(path: Path) -> None:
@@ -88,19 +90,6 @@ def _check_suffix(path: Path) -> None:
 
 def _sidecar(path: Path) -> Path:
     return path.with_name(path.name + ".json")
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside ``path`` that takes its place if all goes well."""
-    with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        partial = Path(file.name)
-    try:
-        yield partial
-        partial.chmod(0o644)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _numbered(name: str, count: int) -> list[str]:
@@ -173,6 +162,10 @@ def _table(recording: Recording) -> pa.Table:
     )
 
 
+def _sha256(text: bytes) -> str:
+    return hashlib.sha256(text).hexdigest()
+
+
 def _read_about(path: Path) -> dict[str, Any]:
     if path.suffix == ".csv":
         sidecar = _sidecar(path)
@@ -182,6 +175,9 @@ def _read_about(path: Path) -> dict[str, Any]:
     stored = pa.parquet.read_schema(path).metadata or {}
     if b"skin" not in stored:
         raise InputError(f"{path} is no recording: its schema has no units, layout and rate under 'skin'")
+    # Files of old have no sum.
+    if stored.get(b"skin_sha256", _sha256(stored[b"skin"]).encode()) != _sha256(stored[b"skin"]).encode():
+        raise InputError(f"{path} is damaged: its units, layout and rate are not those that were written")
     return json.loads(stored[b"skin"])
 
 
@@ -189,8 +185,12 @@ def _read_table(path: Path, about: dict[str, Any]) -> pa.Table:
     columns = _columns(about)
     if path.suffix == ".csv":
         convert = pa.csv.ConvertOptions(column_types=columns, include_columns=list(columns))
-        return pa.csv.read_csv(path, convert_options=convert)
-    return pa.parquet.read_table(path, columns=list(columns)).cast(pa.schema(columns.items()))
+        table = pa.csv.read_csv(path, convert_options=convert)
+        check_rows(about, len(table), len(columns), str(path))
+        return table
+    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+        check_rows(about, file.metadata.num_rows, len(columns), str(path))
+        return file.read(columns=list(columns)).cast(pa.schema(columns.items()))
 
 
 def _recording(table: pa.Table, about: dict[str, Any], path: Path) -> Recording:
@@ -199,8 +199,6 @@ def _recording(table: pa.Table, about: dict[str, Any], path: Path) -> Recording:
     batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
     rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
     whole = np.stack([np.repeat(np.arange(batch), time), np.tile(np.arange(time), batch)], axis=1)
-    if rows.shape != whole.shape:
-        raise InputError(f"{path} has {len(rows)} rows, not {batch} touches of {time} frames: is it cut off?")
     if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
         raise InputError(
             f"{path}, row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "

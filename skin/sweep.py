@@ -7,7 +7,9 @@ import os
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -16,7 +18,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from skin.config import CONF, ROOT, Tracking, checked
-from skin.errors import InputError
+from skin.refusal import refusal
 
 if TYPE_CHECKING:
     from skin.tracking import Store
@@ -87,25 +89,33 @@ class Sweep(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the parent run and tell the jobs about it."""
         try:
-            settings = _tracking(config)
-        except InputError as refusal:
+            store = self._open(config)
+        except Exception as error:
+            refused = refusal(error)
+            if refused is None:
+                raise
             # What no job could accept is refused once, before any of them; Hydra lets only exits pass here.
-            print(refusal, file=sys.stderr)
+            print(refused, file=sys.stderr)
             sys.exit(2)
-
-        from skin.run import PARENT
-        from skin.tracking import Store
-
         _share_cores(config.hydra.launcher)
-        self._store = store = Store.open(settings)
-        name = config.hydra.runtime.choices.get("sweep") or "sweep"
-        parent = store.client.create_run(store.experiment, run_name=name, tags={"sweep": name})
-        self._parent = parent.info.run_id
-        os.environ[PARENT] = self._parent
         atexit.register(self._close)
         # Swept or not, Hydra lists only what belongs to jobs here.
         self._jobs = jobs(list(config.hydra.overrides.task), config.hydra.sweeper.params or {})
         self._progress = Progress([_seconds(store, job) for job in self._jobs])
+
+    def _open(self, config: DictConfig) -> "Store":
+        """Make the folder that Hydra writes to, and the parent run."""
+        settings = _tracking(config)
+        Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
+
+        from skin.run import PARENT
+        from skin.tracking import Store
+
+        self._store = store = Store.open(settings)
+        name = config.hydra.runtime.choices.get("sweep") or "sweep"
+        self._parent = store.create(name, {"sweep": name}).info.run_id
+        os.environ[PARENT] = self._parent
+        return store
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
@@ -137,7 +147,9 @@ class Sweep(Callback):
         if store is None:
             return
         whole = self._failed == 0 and sum(self._progress._expected) == 0
-        store.client.set_terminated(self._parent, "FINISHED" if whole else "FAILED")
+        # A database that refuses was told of before, and nobody hears an exit; the next start closes the run.
+        with suppress(Exception):
+            store.client.set_terminated(self._parent, "FINISHED" if whole else "FAILED")
 
     def _label(self, config: DictConfig) -> str:
         number = int(config.hydra.job.num)

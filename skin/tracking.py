@@ -6,25 +6,36 @@ import os
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
+import json
+import platform
 import signal
 import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import psutil
+from alembic.util import CommandError
 from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Run, ViewType
+from mlflow.exceptions import MlflowException
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
+from sqlalchemy.exc import SQLAlchemyError
 
 from skin.config import ROOT, Tracking
+from skin.errors import InputError
+from skin.files import whole
 
 __all__ = ["Store", "commit", "ends_on_signal"]
+
+_PROCESS = "process"
+_SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
 
 
 @dataclass(frozen=True)
@@ -43,18 +54,31 @@ class Store:
 
     @classmethod
     def open(cls, settings: Tracking) -> "Store":
-        """Return the experiment, made with its database where they are missing."""
+        """Return the experiment, made with its database where they are missing.
+
+        Raises:
+            InputError: the database is none, belongs to another version of MLflow, or cannot be written.
+        """
         uri = settings.uri or f"sqlite:///{ROOT / 'mlflow.db'}"
         artifacts = Path(settings.artifacts).expanduser() if settings.artifacts else ROOT / "mlartifacts"
-        with _alone(uri):
-            client = MlflowClient(tracking_uri=uri)
-            found = client.get_experiment_by_name(settings.experiment)
-            if found is None:
-                location = (artifacts / settings.experiment).resolve().as_uri()
-                identity = client.create_experiment(settings.experiment, artifact_location=location)
-            else:
-                identity = found.experiment_id
-        return cls(client, uri, identity)
+        try:
+            with _alone(uri, artifacts):
+                client = MlflowClient(tracking_uri=uri)
+                found = client.get_experiment_by_name(settings.experiment)
+                if found is None:
+                    location = (artifacts / settings.experiment).resolve().as_uri()
+                    identity = client.create_experiment(settings.experiment, artifact_location=location)
+                else:
+                    identity = found.experiment_id
+        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+            reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
+            raise InputError(
+                f"cannot use the runs in {uri}: {reason}: give another place, as in "
+                "tracking.uri=sqlite:////FOLDER/runs.db"
+            ) from error
+        store = cls(client, uri, identity)
+        store._close_abandoned()
+        return store
 
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
         """Return the runs that have the tags, newest first; ``status`` as MLflow calls it (``FINISHED``)."""
@@ -70,11 +94,25 @@ class Store:
             )
         )
 
+    def create(self, name: str, tags: dict[str, str]) -> Run:
+        """Return a new run with a tag that tells which process works on it; who calls this ends it."""
+        tags = tags | {_PROCESS: _me()}
+        return self.client.create_run(self.experiment, run_name=name, tags=tags)
+
+    def _close_abandoned(self) -> None:
+        """Call runs KILLED whose process is gone: nobody else ever will.
+
+        Only a process of this machine can be known to be gone. Runs without the tag are left as they are.
+        """
+        for run in self.find("RUNNING"):
+            if _gone(run.data.tags.get(_PROCESS, "")):
+                self.client.set_terminated(run.info.run_id, "KILLED")
+
     @contextmanager
     def run(self, name: str, tags: dict[str, str], parent: str | None = None) -> Iterator[Run]:
         """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal."""
         tags = tags | {"commit": commit()} | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
-        run = self.client.create_run(self.experiment, run_name=name, tags=tags)
+        run = self.create(name, tags)
         status = "KILLED"
         try:
             with ends_on_signal():
@@ -88,10 +126,37 @@ class Store:
             self.client.set_terminated(run.info.run_id, status)
 
     def log_metrics(self, run: Run, values: dict[str, float]) -> None:
-        """Log final metrics, in one transaction."""
+        """Log final metrics, in one transaction; what is not defined (NaN) is left out."""
         now = int(1000 * time.time())
-        metrics = [Metric(name, value, now, 0) for name, value in values.items()]
+        metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
         self.client.log_batch(run.info.run_id, metrics, synchronous=True)
+
+
+def _where() -> str:
+    """Return what tells apart machines, and containers of one machine that number processes by themselves."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        space = ""
+    return f"{platform.node()} {space}"
+
+
+def _me() -> str:
+    """Return the tag of this process: its start tells it from a later one with the same number."""
+    return json.dumps([_where(), os.getpid(), psutil.Process().create_time()])
+
+
+def _gone(process: str) -> bool:
+    """Return whether the process that a tag names ran on this machine and does so no more."""
+    try:
+        where, number, started = json.loads(process)
+        if where != _where():
+            return False
+        return abs(psutil.Process(number).create_time() - started) > _SET_CLOCK
+    except psutil.NoSuchProcess:
+        return True
+    except (ValueError, TypeError, psutil.Error):
+        return False
 
 
 @contextmanager
@@ -127,8 +192,16 @@ def commit() -> str:
         return "unknown"
 
 
+def _make(path: Path, artifacts: Path) -> None:
+    """Make a database under another name first: one that is cut short halfway could not be opened again."""
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
+
+    with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
+        SqlAlchemyStore(f"sqlite:///{partial}", str(artifacts)).engine.dispose()
+
+
 @contextmanager
-def _alone(uri: str) -> Iterator[Any]:
+def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
     """Keep other processes out while a SQLite database is made: two that make it at once both fail."""
     if not uri.startswith("sqlite:///"):
         yield
@@ -136,8 +209,9 @@ def _alone(uri: str) -> Iterator[Any]:
     path = Path(uri.removeprefix("sqlite:///"))
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(f"{path}.lock"):
-        connection = sqlite3.connect(path)
-        # Readers and writers at the same time; the mode stays with the file.
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.close()
+        if not path.exists() or not path.stat().st_size:
+            _make(path, artifacts)
+        with closing(sqlite3.connect(path)) as connection:
+            # Readers and writers at the same time; the mode stays with the file.
+            connection.execute("PRAGMA journal_mode=WAL")
         yield

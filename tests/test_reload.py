@@ -1,15 +1,20 @@
 """A run comes back as it was, but for what the command line names."""
 
+import io
+import json
+import zipfile
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from skin.build import build_data, build_device, build_learner
 from skin.config import CONF, Evaluation, Tracking, checked, plain
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.reload import TAG, changed, find, operating_point
+from skin.reload import TAG, changed, find, operating_point, restore
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -138,3 +143,98 @@ def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(caps
     said = capsys.readouterr().err
     assert "no alarm threshold for 10 % false alarms" in said
     assert "chosen on 300 safe validation gestures for 2 % false alarms" in said
+
+
+SKIN = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "data.gestures=20"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What learners save: the name of the file -> its content."""
+    found = {}
+    for name, learner in (
+        ("features.npz", ["learner=features", "learner.rounds=2"]),
+        ("rules.json", ["learner=rules"]),
+    ):
+        config = checked(composed(*SKIN, *learner))
+        made = build_learner(config)
+        made.fit(build_data(config, build_device(config)))
+        path = made.save(tmp_path_factory.mktemp("learned"))
+        assert path.name == name
+        found[name] = path.read_bytes()
+    return found | {"weights.pt": b"PK\3\4" + bytes(100)}
+
+
+def claimed(shape):
+    """Return an .npz file whose arrays claim a shape that they do not have."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in ("train", "train_labels", "validation", "validation_labels"):
+            archive.writestr(f"{name}.npy", header.getvalue() + bytes(64))
+    return buffer.getvalue()
+
+
+def foreign(**arrays):
+    """Return an .npz file of arrays."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def tables(rows, columns, labels):
+    """Return an .npz file as learner=features saves it, of random numbers."""
+    random = np.random.default_rng(0)
+    parts = {}
+    for split in ("train", "validation"):
+        parts[split] = random.normal(size=(rows, columns)).astype(np.float32)
+        parts[f"{split}_labels"] = random.integers(0, 2, (rows, labels)).astype(np.float32)
+    return foreign(**parts)
+
+
+DAMAGED = {
+    "cut": ("features.npz", lambda content: content[:-100]),
+    "almost empty": ("features.npz", lambda content: content[:3]),
+    "a byte": ("features.npz", lambda content: content[:200] + b"\0\1\2\3" + content[204:]),
+    "text": ("features.npz", lambda content: b"no archive"),
+    "larger than memory": ("features.npz", lambda content: claimed((250_000_000, 240))),
+    "an endless shape": ("features.npz", lambda content: claimed((10**400,))),
+    "other arrays": ("features.npz", lambda content: foreign(a=np.ones(3))),
+    "texts": ("features.npz", lambda content: foreign(**dict.fromkeys(
+        ("train", "train_labels", "validation", "validation_labels"), np.array([["x"] * 4] * 9)))),
+    "other measurements": ("features.npz", lambda content: tables(20, 5, 4)),
+    "other labels": ("features.npz", lambda content: tables(20, 5, 2)),
+    "a list": ("rules.json", lambda content: b"[]"),
+    "other rules": ("rules.json", lambda content: b"{}"),
+    "cut rules": ("rules.json", lambda content: content[:40]),
+    "rules of other types": ("rules.json", lambda content: json.dumps(
+        {name: {"measurement": 3, "threshold": 0, "slope": 1} for name in json.loads(content)}).encode()),
+    "unknown measurements": ("rules.json", lambda content: json.dumps(
+        {name: rule | {"measurement": "luck"} for name, rule in json.loads(content).items()}).encode()),
+    "weights": ("weights.pt", lambda content: content),
+    "no weights": ("weights.pt", lambda content: b""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store, whole, tmp_path):
+    name, damage = DAMAGED[case]
+    kind = {"features.npz": "features", "rules.json": "rules", "weights.pt": "network"}[name]
+    config = checked(composed(*SKIN, f"learner={kind}"))
+    path = tmp_path / name
+    path.write_bytes(damage(whole[name]))
+    with store.run("damaged", {"learned": name}) as run:
+        store.client.log_artifact(run.info.run_id, str(path))
+    data, learner = build_data(config, build_device(config)), build_learner(config)
+    with pytest.raises(InputError, match=rf"{name} of run .* is damaged or does not fit") as refused:
+        restore(store, store.client.get_run(run.info.run_id), learner, data)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_run_without_its_files_is_refused(store):
+    with store.run("bare", {"learned": "rules.json"}) as run:
+        pass
+    config = checked(composed(*SKIN, "learner=rules"))
+    with pytest.raises(InputError, match=r"has no rules\.json in "):
+        restore(store, store.client.get_run(run.info.run_id), build_learner(config), None)

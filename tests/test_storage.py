@@ -1,7 +1,11 @@
 """Recordings in files: equal to the last bit, or refused by name."""
 
 import json
+import random
+import resource
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.csv
@@ -166,3 +170,102 @@ def test_recordings_from_before_directions_are_read(tmp_path):
     del about["task"]["direction"]
     beside.write_text(json.dumps(about))
     assert same(read(path), kept)
+
+
+@contextmanager
+def memory(more: int = 1 << 30):
+    """Let this process allocate no more than ``more`` bytes on top of what it has."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + more, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="address space is read from /proc")
+JUNK = [None, True, -1, 0, 0.5, 3, 2**31, 2**62, 1e308, float("nan"), "", "x", [], [[]], [1], {}, {"x": [1]}]
+
+
+def altered(about: dict, chance: random.Random) -> dict:
+    """Return a description with one value, at whatever depth, replaced by junk or removed."""
+    about = json.loads(json.dumps(about))
+    inside, key = about, chance.choice(sorted(about.keys() - {"metadata"}))
+    while isinstance(inside[key], dict | list) and inside[key] and chance.random() < 0.5:
+        inside = inside[key]
+        key = chance.randrange(len(inside)) if isinstance(inside, list) else chance.choice(sorted(inside))
+    if chance.random() < 0.2:
+        del inside[key]
+    else:
+        inside[key] = chance.choice(JUNK)
+    return about
+
+
+def read_or_refused(path: Path) -> Recording | None:
+    """Return what a file holds, or None where it is refused in one sentence; all else is an error."""
+    try:
+        found = read(path)
+    except InputError as error:
+        said = str(error)
+    else:
+        said = ""
+    if said:
+        assert path.name in said
+        assert "\n" not in said
+        return None
+    assert found.touches.readings.shape == found.touches.valid.shape
+    return found
+
+
+@linux
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_an_altered_description_is_refused_or_read(tmp_path, suffix):
+    path, chance = write(recording(), tmp_path / f"x.{suffix}"), random.Random(0)
+    sidecar, refused = tmp_path / "x.csv.json", 0
+    table = pyarrow.parquet.read_table(path) if suffix == "parquet" else None
+    about = json.loads(table.schema.metadata[b"skin"] if table else sidecar.read_text())
+    with memory():
+        for _ in range(200):
+            text = json.dumps(altered(about, chance))
+            if table:
+                pyarrow.parquet.write_table(table.replace_schema_metadata({"skin": text}), path)
+            else:
+                sidecar.write_text(text)
+            refused += read_or_refused(path) is None
+    assert refused > 150
+
+
+@linux
+def test_altered_bytes_are_refused_or_mean_nothing(tmp_path):
+    kept = recording()
+    path, chance = write(kept, tmp_path / "x.parquet"), random.Random(0)
+    whole, refused = path.read_bytes(), 0
+    footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+    with memory():
+        for number in range(200):
+            content = bytearray(whole)
+            for _ in range(chance.choice([1, 2, 8])):
+                content[chance.randrange(footer if number % 2 else 4, len(whole))] = chance.randrange(256)
+            path.write_bytes(content)
+            found = read_or_refused(path)
+            refused += found is None
+            assert found is None or same(found, kept)
+    assert refused > 100
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "null", '"x"', "[" * 5000, '{"format": 1}', "{", "\x00"])
+def test_a_sidecar_of_another_type_is_refused(tmp_path, content):
+    path = write(recording(), tmp_path / "x.csv")
+    (tmp_path / "x.csv.json").write_text(content)
+    assert read_or_refused(path) is None
+
+
+@pytest.mark.parametrize("name", ["gestures", "frames"])
+def test_a_gesture_without_frames_is_refused(tmp_path, name):
+    path = write(recording(), tmp_path / "x.csv")
+    about = json.loads((tmp_path / "x.csv.json").read_text())
+    (tmp_path / "x.csv.json").write_text(json.dumps(about | {name: 0}))
+    path.write_text(path.read_text().splitlines()[0] + "\n")
+    with pytest.raises(InputError, match=f"{name} must be a whole number of at least 1, got 0"):
+        read(path)

@@ -1,5 +1,6 @@
 """A run's status can be trusted, whatever ends it."""
 
+import json
 import os
 import signal
 import sqlite3
@@ -9,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from skin import tracking
 from skin.config import ROOT, Tracking
 from skin.tracking import Store, commit
 
@@ -80,6 +82,31 @@ def test_a_signal_leaves_no_finished_run(settings, store, number, expected):
         process.wait(60)
     assert store.find(fingerprint="f")[0].info.status == expected
     assert not store.find("FINISHED", fingerprint="f")
+    # Whatever starts next tells what nobody could tell at the end.
+    assert Store.open(settings).find(fingerprint="f")[0].info.status == "KILLED"
+
+
+def test_a_run_whose_process_is_gone_is_called_killed(settings, store):
+    here, number, started = json.loads(tracking._me())
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    tags = {
+        "gone": json.dumps([here, ended.pid, started]),
+        "number given anew": json.dumps([here, number, started - 3600]),
+        "another machine": json.dumps(["elsewhere", ended.pid, started]),
+        "no process": "x",
+    }
+    runs = {
+        name: store.client.create_run(store.experiment, run_name=name, tags={"process": process})
+        for name, process in tags.items()
+    }
+    with store.run("mine", {}) as runs["mine"]:
+        Store.open(settings)
+        found = {name: status(store, run) for name, run in runs.items()}
+    killed = {name for name, said in found.items() if said == "KILLED"}
+    assert killed == {"gone", "number given anew"}
+    assert set(found.values()) == {"KILLED", "RUNNING"}
+    assert status(store, runs["mine"]) == "FINISHED"
 
 
 def test_a_child_knows_its_parent(store):

@@ -20,9 +20,9 @@ from benchmarks.setting import configuration
 from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
 from skin.learner.network import Network
-from skin.live.engine import Engine
+from skin.live.engine import Detection, Engine
 from skin.port.frame import Frame
-from skin.signal.gate import Threshold, gates
+from skin.session.newtons import Newtons
 
 __all__ = ["measure"]
 
@@ -66,8 +66,7 @@ def _untrained(row: str) -> tuple[Simulated, Engine]:
     data = build_data(config, device)
     learner.build(data)
     positions = data.touches("train").positions
-    gate = gates(Threshold(_TOUCH), device.task)["threshold"]
-    return device, Engine(learner, device.task, positions, device.window, device.rate, gate)
+    return device, Engine(learner, device.task, positions, device.window, device.rate, Detection(_TOUCH))
 
 
 def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
@@ -80,7 +79,8 @@ def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
     config = configuration(*([f"tracking.uri={uri}"] if uri else []))
     store = Store.open(config.tracking)
     found = find(store, run)
-    of = start.trained(store, found, changed(stored(store, found), config, []))
+    known = stored(store, found)
+    of = start.trained(store, found, changed(known, config, []), known)
     assert isinstance(of.device, Simulated)
     return of.device, start.engine(of, Patience(), _TOUCH)
 
@@ -100,8 +100,10 @@ def _stream(device: Simulated, engine: Engine, count: int) -> list[Frame]:
 
 def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
     """Return how long a verdict takes, by the clock on the wall and by the core's, s."""
+    sensors = engine.window.sensors
+    known = Newtons(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
     wall, core = time.perf_counter(), time.thread_time()
-    assert engine.push(frame) is not None
+    assert engine.push(frame, known) is not None
     return time.perf_counter() - wall, time.thread_time() - core
 
 

@@ -11,7 +11,9 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from skin.body._memory import require_memory
 from skin.errors import InputError
+from skin.files import whole, write
 
 __all__ = ["load", "numbers", "save"]
 
@@ -37,14 +39,21 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
         raise InputError(f"no {what} {path}")
     try:
         if path.suffix == ".parquet":
-            table = pa.parquet.read_table(path)
+            with pa.parquet.ParquetFile(path) as file:
+                size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
+                require_memory(size, f"the {what} {path}", "give fewer rows")
+                table = file.read()
             about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
         else:
             table = pa.csv.read_csv(pa.py_buffer(_rows(path)))
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise InputError(f"cannot read the {what} {path}: {error}") from error
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, RecursionError) as error:
+        raise InputError(f"cannot read the {what} {path}: {' '.join(str(error).split())}") from error
+    if not isinstance(about, dict):
+        raise InputError(f"the {what} {path} says {about!r} of itself, needed is an object, as in {{}}")
     if not len(table):
         raise InputError(f"the {what} {path} has no rows below its header")
     return table.rename_columns([name.strip() for name in table.column_names]), about
@@ -75,17 +84,12 @@ def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path)
     path, table = Path(path).expanduser(), pa.table(dict(columns))
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"a session is a .csv or .parquet file, got {path.name}: as in session=bench.csv")
-    partial = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as partial:
         if path.suffix == ".parquet":
             pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
         else:
             pa.csv.write_csv(table, partial)
-            path.with_name(path.name + ".json").write_text(json.dumps(dict(about)) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
+            write(json.dumps(dict(about)) + "\n", path.with_name(path.name + ".json"))
     return path
 
 

@@ -53,6 +53,8 @@ class Session:
                 f"the session's time must grow from frame to frame: after frame {back[0]} it goes from "
                 f"{before:.9g} to {after:.9g} s"
             )
+        if self.bits is not None and not (isinstance(self.bits, int) and 1 <= self.bits <= 64):
+            raise InputError(f"the session's bits must be a whole number from 1 to 64, got {self.bits}")
 
 
 def read(path: str | Path, indenter: str, radius: float, unit: str | None = None) -> Session:
@@ -83,7 +85,10 @@ def read(path: str | Path, indenter: str, radius: float, unit: str | None = None
     if inside and in_microseconds:
         table = table.append_column("time", [time])
     rows = gauges.of_table(table, str(path), indenter, radius) if inside else None
-    return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+    try:
+        return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def write(session: Session, path: str | Path) -> Path:

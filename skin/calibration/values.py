@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
+from skin import files
 from skin.errors import InputError
+from skin.foreign import settings
 
 __all__ = ["BROKEN", "QUANTITIES", "Calibration", "read", "write"]
 
@@ -151,8 +150,8 @@ def read(path: str | Path) -> Calibration:
     if found is None:
         raise InputError(f"no calibration {path}: experiments/calibrate.py session=FILE out={path} makes one")
     try:
-        stored: Any = OmegaConf.to_container(OmegaConf.load(found))
-    except (OSError, YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        stored: Any = settings(found)
+    except (OSError, ValueError) as error:
         raise InputError(f"cannot read the calibration {found}: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         raise InputError(f"{found} is no calibration: it needs format: {FORMAT}, count: and sensors:")
@@ -187,14 +186,7 @@ def write(calibration: Calibration, path: str | Path) -> Path:
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]
     lines.append(f"about: {json.dumps(dict(calibration.about))}")
     path = Path(path).expanduser()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".part")
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
-    return path
+    return files.write("\n".join(lines) + "\n", path)
 
 
 def _known(given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:

@@ -1,8 +1,6 @@
 """Captures of CoST.csv, read once and kept on disk."""
 
 import hashlib
-import os
-import tempfile
 import warnings
 from dataclasses import fields
 from pathlib import Path
@@ -11,6 +9,8 @@ import numpy as np
 
 from skin.device._cost import CHANNELS, SOURCE, Captures, read
 from skin.errors import InputError
+from skin.files import whole
+from skin.foreign import arrays
 from skin.simulator._store import folder
 
 __all__ = ["captures"]
@@ -47,7 +47,7 @@ def captures(path: Path, window: int) -> Captures:
     found = read(path, window)
     try:
         _save(stored, found)
-    except OSError as error:
+    except InputError as error:
         warnings.warn(f"captures cannot be kept in {stored.parent}: {error}", RuntimeWarning, stacklevel=2)
     return found
 
@@ -55,22 +55,17 @@ def captures(path: Path, window: int) -> Captures:
 def _load(path: Path, window: int) -> Captures | None:
     """Return the captures in a cache file, or None if there is none or anything about it is wrong."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            found = Captures(**{field.name: file[field.name] for field in fields(Captures)})
+        stored = arrays(path)
+        found = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
     except Exception:  # Whatever a broken archive raises, the answer is the same: read the file anew.
         return None
-    sound = found.counts.shape[1:] == (window, CHANNELS)
-    return found if sound and all(len(values) == len(found) for values in vars(found).values()) else None
+    sound = found.counts.shape[1:] == (window, CHANNELS) and found.counts.dtype == np.float32
+    others = [values for name, values in vars(found).items() if name != "counts"]
+    sound = sound and all(one.shape == (len(found),) and one.dtype.kind == "i" for one in others)
+    return found if sound else None
 
 
 def _save(path: Path, found: Captures) -> None:
     """Write a cache file whole or not at all: others may read or write it at the same time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **vars(found))
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with whole(path) as partial:
+        np.savez(partial, **vars(found))

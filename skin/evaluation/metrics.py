@@ -39,6 +39,7 @@ def metrics(
         in which it is open, and the gate itself is no part of the overall. Where it has a direction, there
         are ``direction/degrees``, the mean size of the error, and ``direction/accuracy``, the share of errors
         up to 45 degrees, of the touches that have one (blind guesses: 90 and .25); no part of the overall.
+        NaN where the touches do not define a value: a recall needs touches with the label and without.
     """
     alarm: dict[str, float] = {}
     if point is not None:
@@ -51,9 +52,11 @@ def metrics(
     values: dict[str, float] = {}
     pairs = _pairs(probabilities, labels, task)
     for name, (chance, label) in zip(task.binary, pairs, strict=True):
-        recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
         values[f"{name}/accuracy"] = float(((chance > 0.5) == (label > 0)).float().mean())
-        values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
+        values[f"{name}/balanced_accuracy"] = math.nan
+        if _both(label):
+            recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
+            values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = float(binary_calibration_error(chance, label, n_bins=15))
     for metric in ("accuracy", "balanced_accuracy", "ece"):
         each = [values[f"{name}/{metric}"] for name in task.gated]
@@ -74,6 +77,11 @@ def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
     (x, y), (cos, sin) = probabilities[rows, -2:].double().T, labels[rows, -2:].double().T
     angle = torch.atan2(x * sin - y * cos, x * cos + y * sin).abs() * 180 / math.pi
     return angle.where((x != 0) | (y != 0), 90)
+
+
+def _both(label: Tensor) -> bool:
+    """Return whether a label (B,) is there in some touches and not in others."""
+    return bool(label.any()) and not bool(label.all())
 
 
 def confusion(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:

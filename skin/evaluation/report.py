@@ -25,6 +25,11 @@ __all__ = ["Answers", "Report", "columns", "evaluate"]
 
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
+SHARES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
+"""How the names of the metrics end that are shown in per cent."""
+
+_SHOWN = (*SHARES, "/degrees")
+_UNDEFINED = "not defined, because the test has only gestures with this label or only gestures without it"
 
 
 class Answers(Protocol):
@@ -39,10 +44,10 @@ class Report:
     """What an evaluation found.
 
     Attributes:
-        metrics: ``<column>/<label>/<metric>``, NaN where it is undefined, with the columns ``same`` (test
-            gestures felt by the device of the training), ``holdout`` (the training budget's last tenth),
-            ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
-        cannot: column -> why the learner has no figures in it.
+        metrics: ``<column>/<label>/<metric>``, NaN where the touches do not define it. Columns: ``same``
+            (test gestures felt by the device of the training), ``holdout`` (the training budget's last
+            tenth), ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
+        cannot: column, or metric that is not defined -> why there is no figure.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.
         point: where the alarm is raised; None where the task has no label ``dangerous``.
@@ -95,6 +100,7 @@ def evaluate(
             continue
         if each:
             found |= _named(column, {name: _mean([values[name] for values in each]) for name in each[0]})
+    cannot |= {name: _UNDEFINED for name, value in found.items() if isnan(value) and name.endswith(_SHOWN)}
     table = confusion(chances, _labels(same), task) if task.kind == "binary" else None
     reached = None if point is None else point.reached(chances, _labels(same), task)
     return Report(found, cannot, table, _predictions(chances, same, task, drawn), point, reached)

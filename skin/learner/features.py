@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from skin.errors import InputError
+from skin.foreign import arrays
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
@@ -85,11 +86,20 @@ class Features(AbstractLearner):
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Grow the trees again from what ``save`` wrote; takes some seconds."""
-        with np.load(path, allow_pickle=False) as table:
-            if table["train_labels"].shape[1] != len(data.task):
-                known = table["train_labels"].shape[1]
-                raise RuntimeError(f"it has learnt {known} labels, not {', '.join(data.task.names)}")
-            self._grow(dict(table), data.task)
+        table = arrays(path)
+        columns = _matrix(data.touches("train")[:1], data.task).shape[1]
+        for split in ("train", "validation"):
+            values, labels = table[split], table[f"{split}_labels"]
+            if labels.ndim != 2 or labels.shape[1] != len(data.task):
+                known = labels.shape[-1] if labels.ndim else 0
+                raise ValueError(f"it has learnt {known} labels, not {', '.join(data.task.names)}")
+            if values.shape != (len(labels), columns) or not {values.dtype.kind, labels.dtype.kind} <= set(
+                "f"
+            ):
+                raise ValueError(
+                    f"{split} is {values.dtype} {values.shape}, not {len(labels)} x {columns} numbers"
+                )
+        self._grow(table, data.task)
 
     def _grow(self, table: dict[str, np.ndarray], task: Task) -> None:
         began = time.perf_counter()

@@ -113,7 +113,13 @@ class Rules(AbstractLearner):
     def load(self, data: "TouchData", path: Path) -> None:
         """Take the rules that ``save`` wrote."""
         stored = json.loads(Path(path).read_text())
-        self._set({name: Rule(**stored[name]) for name in data.task.names})
+        rules = {name: Rule(**stored[name]) for name in data.task.names}
+        known = measurements(data.touches("train")[:1].to("cpu"))
+        for name, rule in rules.items():
+            numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
+            if rule.measurement not in known or not numbers:
+                raise ValueError(f"the rule of {name} is {asdict(rule)}")
+        self._set(rules)
 
     def _set(self, rules: dict[str, Rule]) -> None:
         self._rules = rules

@@ -1,6 +1,6 @@
 """Taps, held presses and slow ramps before an engine, in the time of the device: when is the alarm raised?"""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -15,7 +15,9 @@ from skin.port.frame import Frame
 from skin.session.newtons import Newtons
 from skin.streams import Stream, generator
 
-__all__ = ["COURSES", "Outcome", "played", "trials"]
+__all__ = ["COURSES", "FIELDS", "Outcome", "played", "summary", "trials"]
+
+FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "cleared_s")
 
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
@@ -143,3 +145,19 @@ def _outcome(answers: list[tuple[float, bool, bool]], peak: float, begin: float,
     last = max(t for t, alarm, _ in answers if alarm)
     cleared = None if last >= answers[-1][0] else max(0.0, float(last - end))
     return Outcome(peak, float(raised - begin), kept, cleared, early)
+
+
+def summary(course: str, found: Sequence[Outcome]) -> list[str]:
+    """Return a line with the columns of ``FIELDS``.
+
+    These are: the course; how many touches there were, how many raised the alarm, kept it to their end, and
+    found it raised before; median and 95th percentile of the time to the alarm, and median of the time from
+    the end of the touch to the end of the alarm, s.
+    """
+    raised = [one.raised for one in found if one.raised is not None]
+    cleared = [one.cleared for one in found if one.cleared is not None]
+    counts = len(found), len(raised), sum(one.kept for one in found), sum(one.early for one in found)
+    times = [float(np.percentile(raised, share)) for share in (50, 95)] if raised else []
+    times += [float(np.median(cleared))] if cleared else []
+    words = [f"{value:.2f}" for value in times]
+    return [course, *map(str, counts), *words, *[""] * (len(FIELDS) - 5 - len(words))]

@@ -18,7 +18,7 @@ from skin.live.engine import Detection, Engine
 from skin.live.verdict import Patience
 from skin.port.live import Skin
 from skin.port.opening import open_skin
-from skin.reload import configuration, operating_point, restore
+from skin.reload import operating_point, restore
 from skin.session.newtons import newtons
 from skin.session.taring import Tare
 from skin.signal.contact import DRIFT
@@ -92,13 +92,14 @@ def _plain(sensors: int) -> Tare:
     return Tare(lambda baseline, header: newtons(sensors, None, 1.0, None, None), 0.0, 1.0)
 
 
-def trained(store: Store, run: Run, config: DictConfig) -> Trained:
+def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
     """Return a run with what it learned.
 
     Args:
         store: where it is.
         run: a finished training.
         config: its configuration, changed as :func:`skin.reload.changed` does.
+        stored: its configuration as it was.
 
     Raises:
         InputError: what it learned does not fit the configuration.
@@ -112,7 +113,7 @@ def trained(store: Store, run: Run, config: DictConfig) -> Trained:
     data = build_data(own, device)
     restore(store, run, learner, data)
     known = data.touches("train")
-    point = operating_point(run, learner, configuration(store, run), config.evaluation)
+    point = operating_point(run, learner, stored, config.evaluation)
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
 
 

@@ -16,9 +16,10 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.operating_point import gestures
 from skin.evaluation.report import columns
+from skin.files import whole
+from skin.files import write as write_text
 from skin.labels import Task
 from skin.recording import Recording, Touches
-from skin.results.table import write as write_text
 from skin.signal.measurements import measurements
 from skin.storage import write
 
@@ -103,8 +104,8 @@ def _export(touches: Touches, device: Simulated, folder: Path, name: str) -> str
     write(recording, folder / "touches" / f"{name}.parquet")
     table = {key: values.to(torch.float32).numpy() for key, values in measurements(touches).items()}
     path = folder / "measurements" / f"{name}.parquet"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pa.parquet.write_table(pa.table(table), path, compression="zstd")
+    with whole(path) as partial:
+        pa.parquet.write_table(pa.table(table), partial, compression="zstd")
     return digest(touches)
 
 

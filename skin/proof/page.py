@@ -9,8 +9,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from skin.files import whole, write
 from skin.proof.finding import Finding, Law, Outcome, Picture
-from skin.results.table import write
 
 __all__ = ["as_json", "draw", "page", "publish"]
 
@@ -134,7 +134,5 @@ def draw(picture: Picture, path: Path) -> None:
     axes.set(xlabel=picture.x, ylabel=picture.y, title=picture.title)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".part")
-    figure.savefig(unfinished, dpi=100, format="png")
-    unfinished.replace(path)
+    with whole(path) as partial:
+        figure.savefig(partial, dpi=100)

@@ -13,6 +13,7 @@ from matplotlib.patheffects import withStroke
 from PIL.Image import Dither, Image, fromarray, new
 
 from skin.errors import InputError
+from skin.files import whole
 from skin.representation._pixels import centres
 from skin.representation.interp import weights
 from skin.results.figures import save
@@ -46,16 +47,10 @@ def write(scene: Scene, view: str, path: Path) -> Path:
     """
     step = thinning(len(scene.readings), scene.rate)
     pictures = _pictures(scene, view, range(0, len(scene.readings), step))
-    unfinished = path.with_suffix(".part.gif")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        more, pause = pictures[1:], round(1e3 * step / scene.rate)
-        pictures[0].save(unfinished, save_all=True, append_images=more, duration=pause, loop=0)
-        return unfinished.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
+    more, pause = pictures[1:], round(1e3 * step / scene.rate)
+    with whole(path) as partial:
+        pictures[0].save(partial, save_all=True, append_images=more, duration=pause, loop=0)
+    return path
 
 
 def still(scene: Scene, view: str, path: Path) -> Path:

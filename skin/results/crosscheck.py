@@ -15,9 +15,10 @@ from rich.table import Table
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint
 from skin.evaluation.metrics import metrics
+from skin.files import write
 from skin.recording import Touches
 from skin.reload import restore
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 from skin.tracking import Store
 
 __all__ = ["MECHANICS", "Trial", "found", "publish", "tests", "try_run"]

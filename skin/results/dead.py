@@ -16,11 +16,12 @@ from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.metrics import metrics
+from skin.files import write
 from skin.reload import changed, configuration, restore
 from skin.results.asked import DeadSettings
 from skin.results.moving_runs import Trial
 from skin.results.moving_table import comparison
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 from skin.tracking import Store
 
 __all__ = ["newest", "publish", "try_run"]
@@ -50,7 +51,7 @@ def newest(store: Store, config: DictConfig, rows: str | Sequence[str]) -> dict[
         if row is None or (rows != "all" and row not in rows):
             continue
         seen.add(row)
-        own = configuration(store, run)
+        own = configuration(store, run, config.trust)
         if "dead" in own.device:
             found.setdefault(_line(row, own), {}).setdefault(str(own.seed), run)
     names = [] if rows == "all" else [rows] if isinstance(rows, str) else rows
@@ -73,7 +74,7 @@ def try_run(store: Store, line: str, run: Run, config: DictConfig, settings: Dea
 
     The training's own number of dead sensors, or a device per gesture, does not count.
     """
-    own = changed(configuration(store, run), config, [])
+    own = changed(configuration(store, run, config.trust), config, [])
     device, learner = build_device(own), build_learner(own)
     if not isinstance(device, Simulated):
         raise InputError(f"run {run.info.run_id} was not trained on a simulated skin: leave its row out")

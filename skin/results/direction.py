@@ -14,10 +14,11 @@ from rich.progress import track
 from rich.table import Table
 
 from skin.config import checked, fingerprint
+from skin.files import write
 from skin.results.asked import DirectionSettings
 from skin.results.moving_runs import children_of
 from skin.results.study import paired, verdict
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 from skin.run import train
 from skin.tracking import Store
 

@@ -8,6 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from skin.files import whole
+
 __all__ = [
     "COLOURS",
     "confusions",
@@ -28,11 +30,10 @@ _MARKS = ("o", "s", "^", "D")
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG under a temporary name and rename it, so that a reader never sees half of one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".part.png")
-    figure.savefig(unfinished, dpi=120)
-    return unfinished.replace(path)
+    """Write a figure as PNG, whole, and return its path."""
+    with whole(path) as partial:
+        figure.savefig(partial, dpi=120)
+    return path
 
 
 def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float, float]) -> Figure:

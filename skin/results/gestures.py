@@ -88,9 +88,10 @@ def marked(path: str) -> bool:
     """Return whether a session marks gestures, as those of experiments/record.py do."""
     beside = Path(path).expanduser().with_name(Path(path).name + ".json")
     try:
-        return "window" in json.loads(beside.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        about = json.loads(beside.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return False
+    return isinstance(about, dict) and "window" in about
 
 
 def read(device: Simulated, path: str, seed: int) -> Gestures:

@@ -9,9 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from skin.evaluation.margins import ALARM, Faint, Margins, Span
+from skin.files import write
 from skin.labels import OPPOSITE, TOUCH
 from skin.results.figures import COLOURS, save
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 
 __all__ = ["line", "publish"]
 

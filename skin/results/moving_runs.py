@@ -138,7 +138,7 @@ def try_run(store: Store, run: Run, config: DictConfig, settings: MovingSettings
 
 
 def _try(store: Store, run: Run, config: DictConfig, settings: MovingSettings) -> dict[str, float]:
-    own = changed(configuration(store, run), config, [])
+    own = changed(configuration(store, run, config.trust), config, [])
     device, learner = build_device(own), build_learner(own)
     if not isinstance(device, Simulated):
         raise InputError(f"run {run.info.run_id} was not trained on a simulated skin: leave its row out")

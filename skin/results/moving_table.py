@@ -8,10 +8,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from skin.files import write
 from skin.results.moving import Change
 from skin.results.moving_runs import Trial
 from skin.results.study import Paired, paired, verdict
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 
 __all__ = ["comparison", "publish"]
 

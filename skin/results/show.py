@@ -1,15 +1,15 @@
 """Evaluations for a person at the terminal."""
 
 from collections.abc import Sequence
+from math import isnan
 
 from rich.console import Console
 from rich.table import Table
 
-from skin.evaluation.report import Report
+from skin.evaluation.report import SHARES, Report
 from skin.results.table import LABELS, beside, percent
-from skin.results.verdicts import SHARES, shown
 
-__all__ = ["report", "results"]
+__all__ = ["number", "report", "results"]
 
 _WIDEST = 200
 
@@ -31,13 +31,18 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
     for line in lines:
         values = (found.metrics.get(f"{column}/{line}") for column in columns)
         unit = 1 if line.endswith("/degrees") else 100
-        table.add_row(line, *(shown(value, unit) for value in values))
+        table.add_row(line, *(number(value, unit) for value in values))
     console.print(table)
     if found.point is not None and found.reached is not None:
         said = f"{found.point.sentence()}; {found.reached.sentence()}"
         console.print(said, markup=False, highlight=False, soft_wrap=True)
     for column, reason in found.cannot.items():
         console.print(f"{column}: {reason}", markup=False)
+
+
+def number(value: float | None, unit: float = 100) -> str:
+    """Return a figure with one digit; "-" where it is not defined, and nothing where there is none."""
+    return "" if value is None else "-" if isnan(value) else f"{unit * value:.1f}"
 
 
 def results(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:

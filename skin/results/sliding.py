@@ -9,8 +9,9 @@ from torch import Tensor
 
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.sliding import Sliding
+from skin.files import write
 from skin.results.figures import COLOURS, save
-from skin.results.table import markdown, write
+from skin.results.table import markdown
 
 __all__ = ["line", "publish"]
 

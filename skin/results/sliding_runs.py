@@ -72,7 +72,7 @@ def try_run(
     Raises:
         InputError: overrides that do not fit the run, or a device that has no streams.
     """
-    stored = configuration(store, run)
+    stored = configuration(store, run, config.trust)
     own = changed(stored, config, [one for one in overrides if not _ours(one)])
     asked = json.dumps([vars(course), fingerprint(own), run.data.tags.get(TAG)], sort_keys=True)
     tags = {"evaluated": run.info.run_id, "stream": hashlib.sha256(asked.encode()).hexdigest()[:16]}

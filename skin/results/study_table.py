@@ -11,9 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from skin.files import write
 from skin.results.findings import COSTS, Finding, Outcome
 from skin.results.study import Paired
-from skin.results.table import ACCURACIES, ALARM, markdown, write
+from skin.results.table import ACCURACIES, ALARM, markdown
 
 __all__ = ["as_csv", "measured", "page", "publish", "show", "statements", "variants"]
 

@@ -25,7 +25,6 @@ __all__ = [
     "markdown",
     "report_values",
     "rows",
-    "write",
 ]
 
 ACCURACIES = ("overall", "big", "dynamic", "press", "dangerous")
@@ -44,6 +43,7 @@ COLUMNS = (
     "seconds_per_epoch",
     "parameters",
     "failed",
+    "budget",
 )
 
 
@@ -96,12 +96,15 @@ def report_values(path: Path) -> dict[tuple[str, str, str], float]:
         }
 
 
-def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> list[dict[str, str]]:
+def rows(
+    cells: Sequence[Cell], report: dict[tuple[str, str, str], float], budget: str = "full"
+) -> list[dict[str, str]]:
     """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
 
     ``ours`` is the mean over seeds of the accuracy on the test gestures, or of what the alarm reaches there
     with the threshold stored with each run; ``failed`` where no run finished, empty where it is
-    undefined. The column ``failed`` counts the seeds that are missing.
+    undefined. The column ``failed`` counts the seeds that are missing, ``budget`` is
+    theirs.
     """
     lines = []
     for cell in cells:
@@ -116,6 +119,7 @@ def rows(cells: Sequence[Cell], report: dict[tuple[str, str, str], float]) -> li
                 "seconds_per_epoch": _number(cell.values("seconds_per_epoch"), 2),
                 "parameters": _number(cell.values("parameters"), 0),
                 "failed": str(cell.missing),
+                "budget": budget,
             }
             lines.append({"row": cell.row, "simulator": cell.simulator, "label": label, **values})
     return lines
@@ -147,14 +151,6 @@ def markdown(table: Sequence[Sequence[str]], title: str) -> str:
     """Return a table, its head first, as Markdown."""
     lines = ["| " + " | ".join(line) + " |" for line in table]
     return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
-
-
-def write(text: str, path: Path) -> None:
-    """Write a file under a temporary name and rename it, so that a reader never sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text)
-    unfinished.replace(path)
 
 
 def as_csv(lines: Sequence[dict[str, str]]) -> str:

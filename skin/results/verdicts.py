@@ -10,14 +10,13 @@ import pyarrow.csv
 from torch import Tensor
 
 from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.report import Report
+from skin.evaluation.report import SHARES, Report
+from skin.files import whole, write
 from skin.labels import Task
 from skin.results.figures import confusions, save
+from skin.results.show import number
 
-__all__ = ["SHARES", "page", "publish", "shown", "verdicts", "whole"]
-
-SHARES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
-"""How the names of the metrics end that are shown in per cent."""
+__all__ = ["page", "publish", "verdicts"]
 
 
 def page(found: Report, task: Task, title: str, about: str) -> str:
@@ -36,10 +35,10 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
     for row in rows:
         if row.endswith(SHARES):
             shares = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join(shown(x) for x in shares)} |")
+            lines.append(f"| {row} | {' | '.join(map(number, shares))} |")
         if row.endswith("/degrees"):
             sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join('' if x is None else f'{x:.1f}°' for x in sizes)} |")
+            lines.append(f"| {row} | {' | '.join(number(x, 1) + '°' * (x is not None) for x in sizes)} |")
     if found.point is not None and found.reached is not None:
         lines += ["", f"{found.point.sentence()}; {found.reached.sentence()}."]
     lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
@@ -56,16 +55,11 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
 
 def publish(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [whole(page(found, task, title, about), path)]
+    written = [write(page(found, task, title, about), path)]
     if found.confusion is not None:
         named = dict(zip(task.binary, found.confusion.numpy(), strict=True))
         written.append(save(confusions(named, ("no", "yes")), path.with_suffix(".png")))
     return written
-
-
-def shown(value: float | None, unit: float = 100) -> str:
-    """Return a value times ``unit`` with one decimal; "-" where it is undefined, "" where there is none."""
-    return "" if value is None else "-" if math.isnan(value) else f"{unit * value:.1f}"
 
 
 def verdicts(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> tuple[str, Path]:
@@ -82,10 +76,8 @@ def verdicts(chances: Tensor, task: Task, point: OperatingPoint | None, path: Pa
     """
     columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
     table = pa.table({"gesture": np.arange(len(chances)), **columns})
-    partial = path.with_name(path.name + ".part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pa.csv.write_csv(table, partial)
-    partial.replace(path)
+    with whole(path) as partial:
+        pa.csv.write_csv(table, partial)
     levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
     said = [
         f"gesture {number}: "
@@ -104,11 +96,3 @@ def _slide(row: Sequence[float], task: Task) -> str:
     if row[task.names.index("dynamic")] <= 0.5:
         return ""
     return f", sliding towards {math.degrees(math.atan2(row[-1], row[-2])):.0f}°"
-
-
-def whole(text: str, path: Path) -> Path:
-    """Write a text under a temporary name and rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(text, encoding="utf-8")
-    return partial.replace(path)

@@ -1,5 +1,6 @@
 """A solid body, factorised once: rows over its surface cells, and how all of it moves under each of them."""
 
+import os
 import sys
 from functools import cached_property
 from pathlib import Path
@@ -11,9 +12,9 @@ from rich.progress import track
 from scipy.sparse.linalg import SuperLU
 
 from skin.body._memory import require_memory
+from skin.files import whole
 from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
-from skin.simulator._store import place
 
 __all__ = ["Elastic"]
 
@@ -76,20 +77,41 @@ class Elastic:
             axis: along which the cells are loaded.
             path: of the file, x.npy; it is written if it is not there.
         """
-        if not path.exists():
+        known = self._influence(path)
+        if known is None:
             self._write_influence(axis, path)
-        return np.load(path, mmap_mode="r")
+            known = self._influence(path)
+        assert known is not None
+        return known
+
+    def _influence(self, path: Path) -> np.ndarray | None:
+        """Return what a file holds, or None if there is none or it is no such array."""
+        columns, rows, _ = self.mesh.counts
+        shape = (len(self.mesh.held), columns * rows)
+        try:
+            found = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, EOFError, ValueError):
+            return None
+        return found if found.shape == shape and found.dtype == np.float32 else None
 
     def _write_influence(self, axis: int, path: Path) -> None:
         loads = self.mesh.loads(axis)
         parts = range(0, loads.shape[1], _AT_ONCE)
-        with place(path) as name:
-            whole = np.lib.format.open_memmap(name, mode="w+", dtype=np.float32, shape=loads.shape)
+        with whole(path, "SKIN_CACHE=FOLDER") as partial:
+            found = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float32, shape=loads.shape)
+            _reserve(partial)
             console = Console(stderr=True)
             shown = sys.stderr.isatty()
             for first in track(parts, "solving for each surface cell", console=console, disable=not shown):
-                whole[:, first : first + _AT_ONCE] = self.solve(loads[:, first : first + _AT_ONCE].toarray())
-            whole.flush()
+                found[:, first : first + _AT_ONCE] = self.solve(loads[:, first : first + _AT_ONCE].toarray())
+            found.flush()
+
+
+def _reserve(path: Path) -> None:
+    """Claim the disk space of a file that is mapped: to write to a map of a full disk kills the process."""
+    if hasattr(os, "posix_fallocate"):
+        with open(path, "rb+") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
 
 
 def _bytes(columns: int, rows: int, deep: int) -> float:

@@ -2,8 +2,8 @@
 
 import hashlib
 import json
+import math
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 import platformdirs
 
-__all__ = ["folder", "hashed", "kept", "place"]
+from skin.errors import InputError
+from skin.files import whole
+from skin.foreign import arrays
+
+__all__ = ["folder", "hashed", "kept"]
 
 
 def folder(given: str | Path | None) -> Path:
@@ -49,45 +53,27 @@ def kept(
     stored = _load(path, key, shapes)
     if stored is not None:
         return stored
-    arrays = dict(build())
+    built = dict(build())
     try:
-        with place(path) as name, open(name, "wb") as file:
-            np.savez(file, allow_pickle=False, **({"key": np.array(key)} | arrays))
-    except OSError as error:
+        with whole(path) as partial:
+            np.savez(partial, allow_pickle=False, **({"key": np.array(key)} | built))
+    except InputError as error:
         warnings.warn(f"the operator cannot be kept in {path.parent}: {error}", RuntimeWarning, stacklevel=3)
-    return arrays
-
-
-class place:  # noqa: N801 - reads as the verb it is
-    """Give a temporary name that becomes ``path`` when all went well: others may read or write it too."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> str:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        handle, self._name = tempfile.mkstemp(dir=self._path.parent, prefix=self._path.stem, suffix=".tmp")
-        os.close(handle)
-        return self._name
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            os.replace(self._name, self._path)
-        else:
-            Path(self._name).unlink(missing_ok=True)
+    return built
 
 
 def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray] | None:
     """Return the arrays of a file, or None if there is no file or anything about it is wrong."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if str(file["key"]) != key:
-                return None
-            arrays = {name: file[name] for name in shapes}
+        expected = sum(8 * math.prod(shape) for shape in shapes.values())
+        stored = arrays(path, most=expected + 4 * len(key))
+        if str(stored["key"]) != key:
+            return None
+        found = {name: stored[name] for name in shapes}
     except Exception:  # Whatever a broken archive raises, the answer is the same: build it anew.
         return None
     sound = all(
         array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
-        for name, array in arrays.items()
+        for name, array in found.items()
     )
-    return arrays if sound else None
+    return found if sound else None

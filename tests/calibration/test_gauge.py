@@ -128,3 +128,12 @@ def test_bad_sessions_are_refused(tmp_path, text, reason):
     path.write_text(text)
     with pytest.raises(InputError, match=reason):
         session.read(path, "disc", 0.01)
+
+
+@pytest.mark.parametrize("about", ["[]", "3", "{", "[" * 5000, '{"unit": ["N"]}', '{"bits": "many"}'])
+def test_what_a_session_says_of_itself_is_checked(tmp_path, about):
+    path = tmp_path / "log.csv"
+    path.write_text("time,a\n1,2\n2,3\n")
+    (tmp_path / "log.csv.json").write_text(about)
+    with pytest.raises(InputError, match=r"log\.csv"):
+        session.read(path, "disc", 0.01)

@@ -93,3 +93,15 @@ def test_saying_no_direction_is_as_wrong_as_a_blind_guess():
     labels = torch.tensor([[1.0, 0.0]]).repeat(1, 3)[:, :6]
     said = torch.zeros(1, 6)
     assert angles(said, labels, TOUCH_SLIDING).tolist() == [90.0]
+
+
+@pytest.mark.parametrize("dangerous", [0.0, 1.0])
+def test_no_recall_is_made_up_where_no_gesture_is_safe_or_none_is_dangerous(scored, dangerous):
+    chances, labels = scored
+    labels = labels.clone()
+    labels[:, 3] = dangerous
+    found = metrics(chances, labels, TOUCH, 0.02)
+    assert math.isnan(found["dangerous/recall"])
+    assert math.isnan(found["dangerous/balanced_accuracy"])
+    assert 0 < found["dangerous/accuracy"] < 1
+    assert 0 < found["overall/accuracy"] < 1

@@ -1,9 +1,11 @@
 """Every column is what it says: the same device, unseen devices, unseen layouts, the budget's last tenth."""
 
+import io
 from dataclasses import replace
 
 import pytest
 import torch
+from rich.console import Console
 
 from skin.build import build_device
 from skin.config import Evaluation
@@ -11,6 +13,8 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import columns, evaluate
 from skin.labels import TOUCH
+from skin.results.show import report as show
+from skin.results.verdicts import page
 
 SETTINGS = Evaluation(devices=2, layouts=2, gestures=32, false_alarm_rate=0.02)
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
@@ -129,3 +133,22 @@ def test_a_layout_of_a_prime_number_of_sensors_makes_no_grid(configured, tmp_pat
         configured("simulator=naive", f"layout.path={path}", "data.gestures=80", "device.test_gestures=48")
     )
     assert "unseen_layout" in evaluate(Knows(), device, SETTINGS, POINT).cannot
+
+
+def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device, tmp_path):
+    class AllDangerous(type(made_up_device)):
+        def touches(self, split, epoch=0):
+            touches = super().touches(split, epoch)
+            touches.labels[:, 3] = 1
+            return touches
+
+    found = evaluate(Knows(), AllDangerous(), SETTINGS, POINT)
+    assert "same/dangerous/false_alarm_rate" in found.cannot
+    assert "dangerous/accuracy" not in "".join(found.cannot)
+    seen = io.StringIO()
+    show(found, "title", Console(file=seen, width=100))
+    line = next(line for line in seen.getvalue().splitlines() if "dangerous/false_alarm_rate" in line)
+    assert "100.0" not in line
+    assert line.count(" - ") == 2
+    assert "same/dangerous/false_alarm_rate: not defined" in seen.getvalue()
+    assert "| dangerous/false_alarm_rate | - | - |" in page(found, TOUCH, "title", "about")

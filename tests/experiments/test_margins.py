@@ -14,22 +14,27 @@ WAYS = ("threshold", "reading")
 def test_a_finished_run_is_sorted_by_margins(run, tmp_path):
     done = run(tmp_path, "train.py", "experiment=rules", *SMALL)
     assert done.returncode == 0, done.stderr
-    done = run(tmp_path, "margins.py", "run=latest", "gestures=400", f"out={tmp_path}/found")
+    done = run(tmp_path, "margins.py", "run=latest", "gestures=400", "out=found")
     assert done.returncode == 0, done.stderr
     said = done.stdout.splitlines()
     assert said[0].startswith("within 10 % of their thresholds lie ")
-    with (tmp_path / "found" / "margins_rules.csv").open(newline="") as file:
+    with next((tmp_path / "found").glob("margins_rules_*.csv")).open(newline="") as file:
         lines = list(csv.DictReader(file))
     ways = {way: [one for one in lines if (one["label"], one["by"]) == ("big", way)] for way in WAYS}
     assert [sum(int(one["touches"]) for one in each) for each in ways.values()] == [400, 400]
     wrong, also = (sum(int(one["wrong"]) for one in each) for each in ways.values())
     assert wrong == also > 0
     assert f"of {wrong} errors of big" in said[0]
-    text = (tmp_path / "found" / "margins_rules.md").read_text()
+    text = next((tmp_path / "found").glob("margins_rules_*.md")).read_text()
     assert "## Alarm above 0." in text
     assert "chosen on 64 fresh safe gestures for 2 % false alarms; false alarms: " in said[0]
-    with Image.open(tmp_path / "found" / "margins_rules.png") as picture:
+    with Image.open(next((tmp_path / "found").glob("margins_rules_*.png"))) as picture:
         assert picture.size[0] > 800
+    few = ["device.test_gestures=32", "evaluation.devices=0", "evaluation.layouts=0", "out=found"]
+    for _ in range(2):
+        done = run(tmp_path, "evaluate.py", *few)
+        assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "found").glob("evaluation_simulated_*.md"))) == 2
     done = run(tmp_path, "margins.py", "run=latest", "gestures=0")
     assert done.returncode == 2
     assert "margins need touches, got gestures=0" in done.stderr

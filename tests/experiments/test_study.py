@@ -93,6 +93,8 @@ def test_what_is_missing_is_trained_and_what_failed_is_told(run, folder):
     assert done.returncode == 1
     assert done.stdout.count("took") == 1
     assert all(setting in done.stdout.replace("\n", "") for setting in SMOKE[:2])
+    assert "SMOKE" in done.stdout
+    assert "SMOKE" in next((folder / "r").glob("study_*.md")).read_text()
     assert [line.count("| failed |") for line in table(folder, "transformer")] == [0, 1, 1]
     assert done.stderr.count("failed: unknown pooling 'attention'") == 2
 

@@ -2,12 +2,14 @@
 
 import csv
 import io
+from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
 
 from skin.config import CONF, ROOT
-from skin.results.table import COLUMNS, LABELS, Cell, as_csv, grid, markdown, report_values, rows, write
+from skin.files import write
+from skin.results.table import COLUMNS, LABELS, Cell, as_csv, grid, markdown, report_values, rows
 
 REPORT = {("temporal_graph", "fem", "overall"): 0.732, ("temporal_graph", "fem", "big"): 0.646}
 
@@ -131,3 +133,12 @@ def test_the_reports_overall_is_the_mean_of_its_labels(row):
     known = report_values(ROOT / "data" / "report_table.csv")
     each = [known[row, "fem", label] for label in ("big", "dynamic", "press", "dangerous")]
     assert known[row, "fem", "overall"] == pytest.approx(sum(each) / 4, abs=2e-3)
+
+
+def test_a_table_tells_its_budget(monkeypatch):
+    cell = Cell("rules", "fem", (run(0.8),), 0)
+    assert {line["budget"] for line in rows([cell], {}, "smoke")} == {"smoke"}
+    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
+    titles = import_module("reproduce_table").TITLES
+    assert "SMOKE" in titles["smoke"]
+    assert "SMOKE" not in titles["full"]

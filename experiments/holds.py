@@ -1,0 +1,68 @@
+"""When is the alarm raised, and does a held press stay one? python experiments/holds.py run=latest
+
+Plays dangerous taps, presses, holds of 1 s to 10 min and slow ramps before the live engine of a finished run,
+in the time of the device. Prints a line for each kind and writes holds_<row>.csv into out=.
+"""
+
+import csv
+import io
+
+from skin.config import DictConfig, command, overrides, plain
+from skin.errors import InputError
+from skin.files import results
+
+_OWN = ("gestures", "out", "run", "rate", "live")
+_LONG = "600 s"
+
+
+@command("holds")
+def main(config: DictConfig) -> None:
+    """Bring a finished run back and play every course before it."""
+    if config.gestures < 1 or not 0 < config.rate < float("inf"):
+        raise InputError(
+            f"holds need gestures and a rate above 0, got gestures={config.gestures} rate={config.rate:g}: "
+            "as in gestures=40 rate=100"
+        )
+
+    import torch
+    from rich.progress import track
+
+    from skin.build import build_device
+    from skin.console import quiet
+    from skin.device.simulated import Simulated
+    from skin.files import write
+    from skin.live import start
+    from skin.live.holds import COURSES, FIELDS, played, summary, trials
+    from skin.live.verdict import Patience
+    from skin.reload import changed, configuration, find
+    from skin.tracking import Store
+
+    quiet()
+    torch.set_num_threads(config.tracking.threads or 1)
+    store, live = Store.open(config.tracking), plain(config)["live"]
+    run = find(store, config.run)
+    given = [one for one in overrides() if one.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
+    stored = configuration(store, run, config.trust)
+    own = changed(stored, config, given)
+    of = start.trained(store, run, own, stored)
+    device = build_device(own)
+    if not isinstance(device, Simulated):
+        raise InputError("held touches are simulated: give a run of simulated touches")
+    engine, whole = start.engine(of, Patience(), live["touch"], live["drift"]), device.replace(stream=False)
+    found = io.StringIO()
+    table = csv.writer(found, lineterminator="\n")
+    table.writerow(FIELDS)
+    for course in COURSES:
+        count = max(1, config.gestures // 10) if _LONG in course else config.gestures
+        forces = track(trials(whole, course, count), course, count, transient=True)
+        outcomes = [played(engine, device, force, config.rate, n) for n, force in enumerate(forces)]
+        said = summary(course, outcomes)
+        table.writerow(said)
+        print(", ".join(f"{name} {value}" for name, value in zip(FIELDS, said, strict=True) if value != ""))
+    path = results(config.out) / f"holds_{own.row}.csv"
+    write(path, found.getvalue())
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Files are written whole or not at all, and a disk that refuses costs one sentence."""
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
+from skin.config import ROOT
+from skin.errors import InputError
+
+__all__ = ["results", "unwritable", "whole", "write"]
+
+
+def results(out: str | None) -> Path:
+    """Return the folder that ``out=`` names, relative to the current one; None: the repository's results."""
+    return ROOT / "results" if out is None else Path(out).expanduser()
+
+
+@contextmanager
+def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
+    """Give a temporary path beside ``path``, with its ending, that takes its place if the block ends well.
+
+    Folders that are missing are made.
+
+    Args:
+        path: of the file.
+        place: setting that chooses another folder, for the message.
+
+    Raises:
+        InputError: the disk is full or read-only, or the folder cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(
+            dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix, delete=False
+        ) as file:
+            partial = Path(file.name)
+        try:
+            yield partial
+            partial.chmod(0o644)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(path, error, place) from error
+
+
+def write(text: str, path: Path) -> Path:
+    """Write a text whole and return its path.
+
+    Raises:
+        InputError: as of :func:`whole`.
+    """
+    with whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return path
+
+
+def unwritable(path: Path | str, error: OSError, place: str) -> InputError:
+    """Return what a person is told where a disk refuses."""
+    # Arrow's own words repeat the number and hide the reason.
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    mend = "make room there" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "make it writable"
+    return InputError(f"cannot write {path}: {reason}: {mend}, or choose another place, as in {place}")

@@ -1,0 +1,245 @@
+"""Files of a stranger run no code: every payload would leave a marker, and none does."""
+
+import os
+import pickle
+from contextlib import suppress
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from skin.body.sheet import Sheet
+from skin.build import build_device, build_learner
+from skin.config import Tracking, checked, plain
+from skin.errors import InputError
+from skin.reload import configuration, find
+from skin.simulator._elastic import Elastic
+from skin.simulator.solid import hexahedra
+from skin.tracking import Store
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+SKIN = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "data.gestures=20"]
+
+
+class Payload:
+    """Leaves a marker when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        """Unpickle by making a folder."""
+        return os.mkdir, (str(self.marker),)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return the folder of a store without runs."""
+    return tmp_path_factory.mktemp("stranger")
+
+
+@pytest.fixture(scope="module")
+def store(folder):
+    """Return a store as commands find it in the folder."""
+    return Store.open(Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None))
+
+
+@pytest.fixture
+def marker(tmp_path):
+    """Return the path of a file that only a payload makes."""
+    return tmp_path / "marker"
+
+
+@pytest.fixture
+def bait(tmp_path, marker):
+    """Return a pickle with a payload."""
+    path = tmp_path / "bait.pkl"
+    path.write_bytes(pickle.dumps(Payload(marker)))
+    return path
+
+
+@pytest.fixture
+def put(store, configured, tmp_path):
+    """Return a function that stores a finished run and returns its id."""
+
+    def put(change=None, *overrides, text=None, learned=None):
+        config = plain(checked(configured(*SKIN, "learner=rules", *overrides)))
+        config.pop("tracking")
+        config |= change or {}
+        path = tmp_path / "rules.json" if learned is None else learned
+        if learned is None:
+            path.write_text("{}")
+        with store.run("bait", {"learned": path.name, "row": "bait", "simulator": "naive"}) as run:
+            text = OmegaConf.to_yaml(OmegaConf.create(config)) if text is None else text
+            store.client.log_text(run.info.run_id, text, "config.yaml")
+            store.client.log_artifact(run.info.run_id, str(path))
+        return run.info.run_id
+
+    return put
+
+
+def refused(done, marker, *words):
+    """Check that a command ended with one sentence, and that no payload ran."""
+    assert not marker.exists(), "the payload ran"
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    for word in words:
+        assert word in done.stderr, done.stderr
+
+
+CASES = {
+    # where the payload is built, and by which command
+    "a function of a library": ("live.py", lambda bait, marker: {
+        "body": {"_target_": "pandas.read_pickle", "filepath_or_buffer": str(bait)}}),
+    "a function of the standard library": ("embeddings.py", lambda bait, marker: {
+        "layout": {"_target_": "shutil.copyfile", "src": str(bait), "dst": str(marker)}}),
+    "deep in a list, with arguments by place": ("margins.py", lambda bait, marker: {
+        "learner": {"_target_": "skin.learner.ensemble.Ensemble", "members": {"a": [
+            [{"_target_": "os.mkdir", "_args_": [str(marker)]}]]}}}),
+    "a module that torch.optim imports": ("stream.py", lambda bait, marker: {
+        "layout": {"_target_": "torch.optim.optimizer.torch.load", "f": str(bait), "weights_only": False}}),
+    "a module that a module of skin imports": ("evaluate.py", lambda bait, marker: {
+        "layout": {"_target_": "skin.tracking.os.mkdir", "path": str(marker)}}),
+    "a name made by interpolation": (None, lambda bait, marker: {
+        "row": "os.mkdir", "body": {"_target_": "${row}", "_args_": [str(marker)]}}),
+    "a method of a class": (None, lambda bait, marker: {
+        "body": {"_target_": "skin.config.Path.touch", "_args_": [
+            {"_target_": "skin.config.Path", "_args_": [str(marker)]}]}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [case for case, (command, _) in CASES.items() if command])
+def test_a_run_builds_only_parts_of_the_package(case, run, folder, put, bait, marker):
+    command, change = CASES[case]
+    identity = put(change(bait, marker))
+    refused(run(folder, command, f"run={identity}"), marker, "trust=true", identity)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_refused_would_have_run(case, store, put, bait, marker):
+    """Trust proves that the payloads work."""
+    found = find(store, put(CASES[case][1](bait, marker)))
+    with pytest.raises(InputError, match="trust=true"):
+        configuration(store, found)
+    assert not marker.exists()
+    trusted = configuration(store, found, trust=True)
+    for build in (build_device, build_learner):
+        with suppress(Exception):
+            build(trusted)
+    assert marker.exists()
+
+
+def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, bait, marker):
+    identity = put(CASES["a function of a library"][1](bait, marker) | {"trust": True})
+    refused(run(folder, "evaluate.py", f"run={identity}"), marker, "trust=true")
+    assert run(folder, "evaluate.py", f"run={identity}", "trust=true").returncode
+    assert marker.exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "row: !!python/object/apply:os.mkdir [MARKER]\n",
+        "a: &a [x, x]\nb: &b [*a, *a]\nrow: [*b, *b]\n",
+        "row: " + 2000 * "[",
+        "- row\n",
+        "row: \0",
+    ],
+)
+def test_yaml_makes_no_objects_and_does_not_grow(text, store, put, marker):
+    found = find(store, put(text=text.replace("MARKER", str(marker))))
+    with pytest.raises(InputError, match=found.info.run_id):
+        configuration(store, found)
+    assert not marker.exists()
+
+
+def test_what_a_run_is_called_leads_out_of_no_folder(store, put):
+    found = find(store, put({"row": "x/../../marker"}))
+    with pytest.raises(InputError, match="row"):
+        configuration(store, found)
+
+
+@pytest.mark.parametrize("learner", ["features", "network"])
+def test_what_a_run_learned_holds_numbers_alone(learner, run, folder, put, tmp_path, marker):
+    if learner == "features":
+        path, evil = tmp_path / "features.npz", np.array([Payload(marker)], dtype=object)
+        np.savez(path, train=evil, train_labels=evil, validation=evil, validation_labels=evil)
+    else:
+        path = tmp_path / "weights.pt"
+        torch.save({"layer": Payload(marker)}, path)
+    identity = put({}, f"learner={learner}", learned=path)
+    refused(run(folder, "evaluate.py", f"run={identity}"), marker, path.name)
+
+
+def test_a_calibration_makes_no_objects(run, tmp_path, marker):
+    path = tmp_path / "gains.yaml"
+    path.write_text(f"format: 1\ncount: 4\nsensors: !!python/object/apply:os.mkdir [{marker}]\n")
+    done = run(tmp_path, "generate.py", *SKIN, "out=x.csv", f"device.calibration={path}", store=False)
+    refused(done, marker, "gains.yaml")
+
+
+@pytest.fixture(scope="module")
+def recording(run, tmp_path_factory):
+    """Return a recording in both formats' folder."""
+    folder = tmp_path_factory.mktemp("recording")
+    for name in ("x.parquet", "x.csv"):
+        assert run(folder, "generate.py", *SKIN, "n=20", f"out={name}", store=False).returncode == 0
+    return folder
+
+
+def copied(run, folder, name):
+    """Read a recording with a command and write what it read."""
+    given = ["device=recording", f"device.path={name}", "out=y.csv"]
+    return run(folder, "generate.py", *SKIN, *given, store=False)
+
+
+def test_a_recording_makes_no_objects(run, recording, tmp_path, marker):
+    table = pq.read_table(recording / "x.parquet")
+    # What pyarrow before 14.0.1 unpickled while it read a schema.
+    kind = {"ARROW:extension:name": "arrow.py_extension_type"}
+    kind["ARROW:extension:metadata"] = pickle.dumps(Payload(marker), 0)
+    field = pa.field("reading_00", pa.float32(), metadata=kind)
+    place = table.schema.get_field_index("reading_00")
+    pq.write_table(table.cast(table.schema.set(place, field)), tmp_path / "x.parquet")
+    done = run(
+        tmp_path, "generate.py", *SKIN, "device=recording", "device.path=x.parquet", "out=y.csv", store=False
+    )
+    assert not marker.exists()
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_sidecar_is_json_alone(run, recording, tmp_path, marker):
+    (tmp_path / "x.csv").write_bytes((recording / "x.csv").read_bytes())
+    (tmp_path / "x.csv.json").write_bytes(pickle.dumps(Payload(marker), 0))
+    done = run(
+        tmp_path, "generate.py", *SKIN, "device=recording", "device.path=x.csv", "out=y.csv", store=False
+    )
+    refused(done, marker, "x.csv")
+
+
+def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, monkeypatch):
+    monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
+    command = ["generate.py", "simulator=fem", *SKIN[1:], "n=5", "body.cells=[12,12]", "out=x.csv"]
+    assert run(tmp_path, *command, store=False).returncode == 0
+    (known,) = (tmp_path / "cache").iterdir()
+    with np.load(known) as file:
+        names, before = list(file), (tmp_path / "x.csv").read_bytes()
+    np.savez(known, **dict.fromkeys(names, np.array([Payload(marker)], dtype=object)))
+    done = run(tmp_path, *command, store=False)
+    assert not marker.exists()
+    assert (done.returncode, (tmp_path / "x.csv").read_bytes()) == (0, before), done.stderr
+
+
+def test_a_stored_influence_is_built_anew_where_it_holds_objects(tmp_path, marker):
+    sheet = Sheet((0.02, 0.02), (4, 4), [{"material": "EcoFlex 00-30", "thickness": 0.01}])
+    elastic, path = Elastic(hexahedra(sheet, 1, {})), tmp_path / "influence.npy"
+    wanted = np.array(elastic.influence(2, path))
+    np.save(path, np.array([Payload(marker)], dtype=object))
+    np.testing.assert_array_equal(elastic.influence(2, path), wanted)
+    np.save(path, wanted[:3])
+    np.testing.assert_array_equal(elastic.influence(2, path), wanted)
+    assert not marker.exists()

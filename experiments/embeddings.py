@@ -29,6 +29,7 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
     from rich.progress import track
 
+    from skin.balance import announce
     from skin.build import build_device
     from skin.embedding.probe import probe
     from skin.files import write
@@ -40,6 +41,7 @@ def main(config: DictConfig) -> None:
     if config.run is not None:
         config, learner = _encoder(config)
     device = build_device(config)
+    announce(device)
     names, console = device.task.names, Console(stderr=True)
     each = len(settings.attributes) * 3 + (learner is not None) + 2
     steps = probe(device, settings, learner)

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from skin.balance import announce
 from skin.build import build_device
 from skin.config import fingerprint, plain
 from skin.device.simulated import Simulated
@@ -39,6 +40,7 @@ def learn(
         subprocess.CalledProcessError: the peer failed.
     """
     device, source = build_device(config), _source(config)
+    announce(device)
     where = folder / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
     if not isinstance(device, Simulated):
         raise InputError("peers are compared on simulated touches: leave device=simulated")

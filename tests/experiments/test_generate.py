@@ -17,6 +17,29 @@ def test_writes_a_recording(run, tmp_path):
     assert len(recording.metadata["config_hash"]) >= 16
 
 
+ONE_SIZE = ("touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]")
+
+
+def test_tells_the_balance_and_warns_where_a_shape_is_the_label(run, tmp_path):
+    """Bars have no room as big touches unless they are stretched."""
+    done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, store=False)
+    assert done.returncode == 0, done.stderr
+    told, header, big, small = done.stderr.splitlines()[:4]
+    assert told.startswith("balance: ")
+    assert header.split()[:3] == ["told", "disc", "bar"]
+    assert [big.split()[0], *big.split()[2:4]] == ["big", "100", "0"]
+    assert small.split()[0] == "small"
+    assert "warning: the shape alone tells big (" in done.stderr
+
+
+def test_refuses_such_gestures_if_strict(run, tmp_path):
+    done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, "touch.strict=true", store=False)
+    assert done.returncode == 2
+    assert "the shape alone tells big" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.glob("x.*"))
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -164,9 +164,10 @@ class Engine:
             return debounce(answer, frame.t, period)
 
         chance = chances.get("dangerous", 0.0)
-        raised = settled(self._labels["dangerous"], touched and chance > self._above)
+        # A probability that is no number is no reason to call a touch safe.
+        raised = settled(self._labels["dangerous"], touched and not chance <= self._above)
         self.alarm = raised or (self.alarm and contact)
-        self._highest = max(chance, self._highest) if self.alarm else 0.0
+        self._highest = max(self._highest, chance) if self.alarm else 0.0
         # An alarm does not wait until the touch is settled.
         shown = settled(self._touch, touched) or self.alarm
         answer = self._answers(chances)
@@ -175,7 +176,7 @@ class Engine:
         }
         if "dangerous" in self.task.names:
             said["dangerous"] = self.alarm
-            chances["dangerous"] = max(chance, self._highest)
+            chances["dangerous"] = max(self._highest, chance)
         since = self._since(frame)
         return Verdict(
             frame.t, frame.t_host, chances, shown, said if shown else {}, self.alarm, seen.gap, masked, since

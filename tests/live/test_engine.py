@@ -144,6 +144,35 @@ def test_an_alarm_outlives_a_restart_of_the_device_until_the_contact_ends():
             assert not said[-1].dangerous
 
 
+def test_an_answer_that_is_no_number_raises_the_alarm():
+    subject = engine()
+    play(subject, np.zeros((60, 4)))
+    subject._learner.probabilities = lambda touches: torch.full((1, 4), torch.nan)
+    assert not play(subject, np.zeros((10, 4)), start=0.6)[-1].dangerous
+    assert play(subject, np.full((10, 4), 1.0), start=0.7)[-1].dangerous
+
+
+def test_an_alarm_stays_while_the_model_changes_its_mind():
+    subject = engine()
+    play(subject, np.zeros((60, 4)))
+    play(subject, np.full((10, 4), 5.0), start=0.6)
+    subject._learner.probabilities = lambda touches: torch.zeros(1, 4)
+    held = play(subject, np.full((500, 4), 1.0), start=0.7)
+    assert all(verdict.dangerous for verdict in held)
+    assert held[-1].contact == pytest.approx(5.1, abs=0.15)
+    assert not any(verdict.dangerous for verdict in play(subject, np.zeros((200, 4)), start=5.7)[60:])
+
+
+def test_a_new_tare_takes_the_alarm_back():
+    subject = engine()
+    play(subject, np.zeros((60, 4)))
+    assert play(subject, np.full((100, 4), 5.0), start=0.6)[-1].dangerous
+    subject.tared()
+    tared = Newtons(np.ones(4), np.full(4, 5.0), np.zeros(4, bool))
+    verdict = subject.push(frame(1.61, np.full(4, 5.0)), tared)
+    assert (verdict.dangerous, verdict.contact) == (False, None)
+
+
 def test_labels_that_exclude_each_other_have_one_winner():
     task = Task(("grab", "hit", "tap", "pat"), "exclusive")
     verdict = play(engine(task=task), np.full((60, 4), 5.0))[-1]

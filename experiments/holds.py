@@ -1,27 +1,30 @@
 """When is the alarm raised, and does a held press stay one? python experiments/holds.py run=latest
 
 Plays dangerous taps, presses, holds of 1 s to 10 min and slow ramps before the live engine of a finished run,
-in the time of the device. Prints a line for each kind and writes holds_<row>.csv into out=.
+in the time of the device. Prints a line for each kind and writes holds_<row>_<run>.csv into out=.
 """
 
 import csv
 import io
+from math import inf
 
 from skin.config import DictConfig, command, overrides, plain
 from skin.errors import InputError
 from skin.files import results
 
-_OWN = ("gestures", "out", "run", "rate", "live")
+_OWN = ("holds", "out", "run")
 _LONG = "600 s"
 
 
 @command("holds")
 def main(config: DictConfig) -> None:
     """Bring a finished run back and play every course before it."""
-    if config.gestures < 1 or not 0 < config.rate < float("inf"):
+    settings = plain(config)["holds"]
+    count, rate = settings["gestures"], settings["rate"]
+    if not (isinstance(count, int) and count > 0 and isinstance(rate, int | float) and 0 < rate < inf):
         raise InputError(
-            f"holds need gestures and a rate above 0, got gestures={config.gestures} rate={config.rate:g}: "
-            "as in gestures=40 rate=100"
+            f"holds.gestures and holds.rate must be above 0, got {count} and {rate}: as in holds.gestures=40 "
+            "holds.rate=100"
         )
 
     import torch
@@ -39,7 +42,7 @@ def main(config: DictConfig) -> None:
 
     quiet()
     torch.set_num_threads(config.tracking.threads or 1)
-    store, live = Store.open(config.tracking), plain(config)["live"]
+    store = Store.open(config.tracking)
     run = find(store, config.run)
     given = [one for one in overrides() if one.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
     stored = configuration(store, run, config.trust)
@@ -48,19 +51,22 @@ def main(config: DictConfig) -> None:
     device = build_device(own)
     if not isinstance(device, Simulated):
         raise InputError("held touches are simulated: give a run of simulated touches")
-    engine, whole = start.engine(of, Patience(), live["touch"], live["drift"]), device.replace(stream=False)
+    engine, whole = (
+        start.engine(of, Patience(), settings["touch"], settings["drift"]),
+        device.replace(stream=False),
+    )
     found = io.StringIO()
     table = csv.writer(found, lineterminator="\n")
     table.writerow(FIELDS)
     for course in COURSES:
-        count = max(1, config.gestures // 10) if _LONG in course else config.gestures
-        forces = track(trials(whole, course, count), course, count, transient=True)
-        outcomes = [played(engine, device, force, config.rate, n) for n, force in enumerate(forces)]
+        number = max(1, count // 10) if _LONG in course else count
+        forces = track(trials(whole, course, number), course, number, transient=True)
+        outcomes = [played(engine, device, force, rate, n) for n, force in enumerate(forces)]
         said = summary(course, outcomes)
         table.writerow(said)
         print(", ".join(f"{name} {value}" for name, value in zip(FIELDS, said, strict=True) if value != ""))
-    path = results(config.out) / f"holds_{own.row}.csv"
-    write(path, found.getvalue())
+    path = results(config.out) / f"holds_{own.row}_{run.info.run_id[:8]}.csv"
+    write(found.getvalue(), path)
     print(path)
 
 

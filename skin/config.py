@@ -131,6 +131,7 @@ class Config:
     compare: dict[str, Any] | None = None
     direction: dict[str, Any] | None = None
     physics: dict[str, Any] | None = None
+    holds: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

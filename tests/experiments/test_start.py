@@ -19,6 +19,7 @@ VALUES = {
     "dead.py": "dead.devices=0",
     "direction.py": "direction.shear=-1",
     "embeddings.py": "embeddings.train=1",
+    "holds.py": "holds.gestures=0",
     "margins.py": "gestures=0",
     "moving.py": "moving.devices=0",
     "stream.py": "stream.hours=0",

@@ -1,6 +1,7 @@
 """The board, the terminal and the page, without a model behind them."""
 
 import json
+import os
 import re
 import urllib.error
 import urllib.request
@@ -48,6 +49,17 @@ def fetch(address, **headers):
     except urllib.error.HTTPError as error:
         with error:
             return error.code, ""
+
+
+def posted(address, **headers):
+    """Return the status of a request that sends nothing."""
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, b"", headers), timeout=30) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code
 
 
 def test_no_peak_between_two_looks_is_missed():
@@ -128,6 +140,73 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     assert picture["values"][2] == 2.0
     assert picture["valid"] == [True, True, True, True, False]
     assert len(b64decode(picture["picture"])) == facts["pixels"] ** 2
+
+
+def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
+    """A dark hole at the sensor that is pressed hardest would hide the press."""
+    subject = board()
+    valid, saturated = np.array([True, True, True, True, False]), np.array([False, False, True, False, False])
+    subject.show(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid)._replace(saturated=saturated), PLAIN)
+    look = subject.look()
+    assert look.values.tolist() == [1, 1, 4, 1, 0]
+    assert look.saturated.tolist() == saturated.tolist()
+    picture = Picture(PLACES, SIZE, 64, 4.0)
+    image = picture(look.values, look.valid)
+    # Where the unknown sensor is, the picture shows what lies around it; the saturated one is brightest.
+    row, column = (round(PLACES[4, axis] / SIZE[axis] * 64) for axis in (1, 0))
+    assert image[row, column] > 60
+    row, column = (round(PLACES[2, axis] / SIZE[axis] * 64) for axis in (1, 0))
+    assert image[row - 2 : row + 3, column - 2 : column + 3].max() > 235
+    sent = web.message(look, picture)
+    assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
+    assert picture(np.zeros(5), np.zeros(5, dtype=bool)).max() == 0
+
+
+def test_an_alarm_outlives_silence_in_every_view():
+    subject = board()
+    subject.say(PRESSED)
+    subject.say(None, "the device has fallen silent", alarm=True)
+    look = subject.look()
+    assert (look.verdict, look.alarm) == (None, True)
+    assert web.message(look, Picture(PLACES, SIZE, 8, 4.0))["alarm"] is True
+    console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        console.print(terminal.screen(subject, look, Picture(PLACES, SIZE, 24, 4.0)))
+    text = console.export_text()
+    assert "DANGEROUS" in text
+    assert "fallen silent" in text
+
+
+def test_the_views_say_since_when_something_touches():
+    assert terminal.since(None) == terminal.since(1.0) == ""
+    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", terminal.since(12.0))
+    assert "take a new tare" in terminal.since(75.0)
+
+
+def test_the_page_asks_for_a_tare_and_another_site_cannot():
+    subject = board()
+    with web.served(subject, 0) as address:
+        for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
+            assert not subject.tare.is_set()
+            assert posted(f"{address}/tare", **headers) == code
+        assert subject.tare.is_set()
+        assert fetch(f"{address}/tare")[0] == 405
+
+
+def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
+    pty = pytest.importorskip("pty", reason="pseudo-terminals need a POSIX system")
+    master, slave = pty.openpty()
+    subject = board()
+    with os.fdopen(slave) as typed, (tmp_path / "said").open("w") as file:
+        monkeypatch.setattr("sys.stdin", typed)
+        with terminal.shown(subject, Console(file=file)):
+            os.write(master, b"x\n")
+            assert not subject.tare.wait(0.3)
+            os.write(master, b"t\n")
+            assert subject.tare.wait(10)
+            os.write(master, b"\x04")
+            sleep(0.1)
+    os.close(master)
 
 
 def test_pictures_come_a_little_more_than_thirty_times_a_second():

@@ -62,7 +62,8 @@ def test_a_gradient_reaches_every_parameter(given):
     fusion(windows(kind)).square().sum().backward()
     for name, parameter in fusion.named_parameters():
         assert parameter.grad is not None, name
-        assert parameter.grad.abs().max() > 0, name
+        # A softmax takes the bias of a score away: that gradient is rounding, and may be 0.
+        assert parameter.grad.abs().max() > 0 or name.endswith(("score.bias", "gate.bias")), name
 
 
 def test_windows_do_not_see_each_other(given):

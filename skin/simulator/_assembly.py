@@ -102,7 +102,7 @@ class Structure:
             raise InputError(
                 f"sensor {number + 1} lies {sensors.positions[number, 2]:g} m deep, but plates and beams "
                 f"have a displacement only at the interfaces between layers, {depths} m: give one of them as "
-                "depth_m, split a layer in body.layers, or use simulator=naive"
+                "depth_m, split a layer in body.layers, or use simulator=solid"
             )
         return away.argmin(axis=1)
 

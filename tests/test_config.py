@@ -39,6 +39,12 @@ def test_an_option_names_a_class_of_its_own_module(group, option):
     assert get_class(stored["_target_"]).__module__ == f"skin.{group}.{option}"
 
 
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "simulator").glob("*.yaml")))
+def test_a_simulator_has_data_and_epochs(name):
+    assert OmegaConf.load(CONF / "data" / f"{name}.yaml").name == name, "step 2 of CONTRIBUTING.md"
+    assert OmegaConf.load(CONF / "train.yaml").epochs[name] > 0, "step 2 of CONTRIBUTING.md"
+
+
 @pytest.mark.parametrize("group", ["data", "experiment", "sweep"])
 def test_groups_of_values_build_nothing(group):
     for path in (CONF / group).glob("*.yaml"):

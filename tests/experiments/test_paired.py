@@ -57,6 +57,7 @@ def test_the_difference_has_its_standard_error(folder):
     ],
 )
 def test_bad_input_ends_with_code_2_and_says_what(folder, arguments, named, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(PAIRED.parent))  # as where a person starts it
     monkeypatch.setattr(sys, "argv", ["paired.py", *arguments, f"tracking.uri=sqlite:///{folder}/m.db"])
     with pytest.raises(SystemExit) as stop:
         runpy.run_path(str(PAIRED), run_name="__main__")

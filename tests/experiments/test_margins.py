@@ -27,7 +27,7 @@ def test_a_finished_run_is_sorted_by_margins(run, tmp_path):
     assert f"of {wrong} errors of big" in said[0]
     text = (tmp_path / "found" / "margins_rules.md").read_text()
     assert "## Alarm above 0." in text
-    assert "chosen on 64 fresh safe gestures for 2 % false alarms; false alarms: " in said[0]
+    assert "chosen on 64 fresh safe gestures for 2 % false alarms, finds " in said[0]
     with Image.open(tmp_path / "found" / "margins_rules.png") as picture:
         assert picture.size[0] > 800
     done = run(tmp_path, "margins.py", "run=latest", "gestures=0")

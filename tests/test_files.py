@@ -53,7 +53,7 @@ WRITERS = {
     "page.md": lambda path, device: write(200 * "a", path),
     "figure.png": lambda path, device: figures.save(figures.traces({"a": torch.ones(9, 3)}, 10.0), path),
     "gains.yaml": lambda path, device: values.write(values.Calibration({"gain": 99 * [1.0]}), path),
-    "verdicts.csv": lambda path, device: verdicts.verdicts(torch.ones(9, 4), TOUCH, path),
+    "verdicts.csv": lambda path, device: verdicts.verdicts(torch.ones(9, 4), TOUCH, None, path),
 }
 
 

@@ -1,12 +1,13 @@
-"""What comes of saying "dangerous" at every moment: touches found, and false alarms by the hour."""
+"""What comes of saying "dangerous" at every moment: touches found, and false alarms."""
 
+import math
 from dataclasses import dataclass
 
 import torch
-from scipy.stats import chi2
+from scipy.stats import binomtest, chi2
 from torch import Tensor
 
-__all__ = ["Alarms", "count_alarms"]
+__all__ = ["Alarms", "Reached", "count_alarms"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,53 @@ class Alarms:
             return float("nan"), float("nan")
         low = chi2.ppf(0.025, 2 * self.false) / 2 if self.false else 0.0
         return float(low) / self.idle_hours, float(chi2.ppf(0.975, 2 * self.false + 2)) / 2 / self.idle_hours
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The alarms of an operating point on some gestures.
+
+    Attributes:
+        dangerous: dangerous gestures.
+        found: those that raise the alarm.
+        safe: safe gestures.
+        raised: those that raise the alarm.
+    """
+
+    dangerous: int
+    found: int
+    safe: int
+    raised: int
+
+    @property
+    def recall(self) -> float:
+        """Share of the dangerous gestures that raise the alarm; NaN if there are none."""
+        return self.found / self.dangerous if self.dangerous else math.nan
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """Share of the safe gestures that raise the alarm; NaN if there are none."""
+        return self.raised / self.safe if self.safe else math.nan
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """False-alarm rates within 95 % confidence: exact (Clopper and Pearson, 1934)."""
+        if not self.safe:
+            return math.nan, math.nan
+        low, high = binomtest(self.raised, self.safe).proportion_ci(0.95)
+        return float(low), float(high)
+
+    def sentence(self) -> str:
+        """Return the false-alarm rate with its range, and the recall, in words; "-" where undefined."""
+        low, high = self.range
+        rate = "false alarms: - (no safe gesture)"
+        if self.safe:
+            rate = (
+                f"false alarms: {self.raised} of {self.safe} safe gestures, "
+                f"{100 * self.false_alarm_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
+            )
+        recall = f"{100 * self.recall:.1f} % of {self.dangerous}" if self.dangerous else "-"
+        return f"{rate}; dangerous gestures found: {recall}"
 
 
 def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float) -> Alarms:

@@ -11,7 +11,8 @@ from torch import Tensor
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation.operating_point import LABEL, OperatingPoint, Reached
+from skin.evaluation.alarm import Reached
+from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Answers
 from skin.labels import TOUCH, Measures, Thresholds
 from skin.signal.measurements import above_idle

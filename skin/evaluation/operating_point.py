@@ -2,24 +2,24 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
-from scipy.stats import binomtest
 from torch import Tensor
 
 from skin.config import Evaluation
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.alarm import Reached
 from skin.labels import Task
 from skin.recording import Touches
 
 if TYPE_CHECKING:
     from skin.evaluation.report import Answers
 
-__all__ = ["ENOUGH", "LABEL", "OperatingPoint", "Reached", "check", "choose", "gestures", "lowest", "read"]
+__all__ = ["ENOUGH", "LABEL", "OperatingPoint", "check", "choose", "gestures", "lowest", "read"]
 
 LABEL = "dangerous"
 ENOUGH = 2000
@@ -27,53 +27,6 @@ ENOUGH = 2000
 
 _APART = 1e-6  # scores closer than this may change places on another processor
 _MOST_DRAWS = 6
-
-
-@dataclass(frozen=True)
-class Reached:
-    """The alarms of an operating point on some gestures.
-
-    Attributes:
-        dangerous: dangerous gestures.
-        found: those that raise the alarm.
-        safe: safe gestures.
-        raised: those that raise the alarm.
-    """
-
-    dangerous: int
-    found: int
-    safe: int
-    raised: int
-
-    @property
-    def recall(self) -> float:
-        """Share of the dangerous gestures that raise the alarm; NaN if there are none."""
-        return self.found / self.dangerous if self.dangerous else math.nan
-
-    @property
-    def false_alarm_rate(self) -> float:
-        """Share of the safe gestures that raise the alarm; NaN if there are none."""
-        return self.raised / self.safe if self.safe else math.nan
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """False-alarm rates within 95 % confidence: exact (Clopper and Pearson, 1934)."""
-        if not self.safe:
-            return math.nan, math.nan
-        low, high = binomtest(self.raised, self.safe).proportion_ci(0.95)
-        return float(low), float(high)
-
-    def sentence(self) -> str:
-        """Return the false-alarm rate with its range, and the recall, in words; "-" where undefined."""
-        low, high = self.range
-        rate = "false alarms: - (no safe gesture)"
-        if self.safe:
-            rate = (
-                f"false alarms: {self.raised} of {self.safe} safe gestures, "
-                f"{100 * self.false_alarm_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
-            )
-        recall = f"{100 * self.recall:.1f} % of {self.dangerous}" if self.dangerous else "-"
-        return f"{rate}; dangerous gestures found: {recall}"
 
 
 @dataclass(frozen=True)
@@ -86,6 +39,8 @@ class OperatingPoint:
         safe: number of safe gestures it was chosen on; 0: it was not chosen but is the default of 0.5.
         raised: how many of them raise the alarm.
         seed: of the fresh gestures it was chosen on; None: it was chosen on a validation split.
+        dangerous: dangerous gestures among those it was chosen on.
+        found: how many of them raise the alarm.
     """
 
     threshold: float
@@ -93,6 +48,8 @@ class OperatingPoint:
     safe: int
     raised: int
     seed: int | None
+    dangerous: int = 0
+    found: int = 0
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":
@@ -121,7 +78,10 @@ class OperatingPoint:
         if not self.safe:
             return f"{wanted}: not chosen on any gestures, its false-alarm rate is unknown"
         kind = "safe validation" if self.seed is None else "fresh safe"
-        return f"{wanted}, chosen on {self.safe} {kind} gestures for {100 * self.target:g} % false alarms"
+        text = f"{wanted}, chosen on {self.safe} {kind} gestures for {100 * self.target:g} % false alarms"
+        if self.dangerous:
+            text += f", finds {100 * self.found / self.dangerous:.1f} % of {self.dangerous} dangerous ones"
+        return text
 
     def warning(self) -> str | None:
         """Return what makes this operating point unreliable, in one sentence; None: nothing."""
@@ -155,9 +115,12 @@ def read(text: str) -> OperatingPoint | None:
             int(stored["safe"]),
             int(stored["raised"]),
             None if stored["seed"] is None else int(stored["seed"]),
+            int(stored["dangerous"]),
+            int(stored["found"]),
         )
         known = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
-        if not known or not math.isfinite(point.threshold) or not 0 <= point.raised <= point.safe:
+        counted = 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
+        if not known or not counted or not math.isfinite(point.threshold):
             raise ValueError(text)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise InputError(
@@ -213,13 +176,13 @@ def choose(learner: "Answers", device: AbstractDevice, settings: Evaluation) -> 
         return None
     touches, target = gestures(device, settings), settings.false_alarm_rate
     assert touches.labels is not None  # it has learnt from them
-    chance, dangerous = _column(learner.probabilities(touches), touches.labels, device.task)
-    safe = chance[~dangerous]
-    if not len(safe):
+    chances = learner.probabilities(touches)
+    chance, dangerous = _column(chances, touches.labels, device.task)
+    if dangerous.all():
         return OperatingPoint.default(target)
-    threshold = lowest(safe, target)
     seed = device.data_seed if isinstance(device, Simulated) else None
-    return OperatingPoint(threshold, target, len(safe), int((safe > threshold).sum()), seed)
+    point = OperatingPoint(lowest(chance[~dangerous], target), target, 0, 0, seed)
+    return replace(point, **asdict(point.reached(chances, touches.labels, device.task)))
 
 
 def lowest(safe: Tensor, target: float) -> float:

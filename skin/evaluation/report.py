@@ -15,8 +15,9 @@ from skin.config import Evaluation
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.evaluation.alarm import Reached
 from skin.evaluation.metrics import confusion, metrics
-from skin.evaluation.operating_point import OperatingPoint, Reached
+from skin.evaluation.operating_point import OperatingPoint
 from skin.labels import Task
 from skin.layout.scattered import Scattered
 from skin.recording import Touches

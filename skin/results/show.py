@@ -56,7 +56,7 @@ def results(lines: Sequence[dict[str, str]], title: str, console: Console | None
     table = Table(title=title, box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("row", "data"):
         table.add_column(head, no_wrap=True)
-    for head in ("overall", "big", "dyn.", "press", "dang.", "recall", "false", "device", "layout"):
+    for head in ("overall", "big", "dyn.", "press", "dang.", "recall", "false", "dev.", "lay."):
         table.add_column(head, no_wrap=True, justify="right")
     for start in range(0, len(lines), len(LABELS)):
         group = {line["label"]: line for line in lines[start : start + len(LABELS)]}

@@ -12,8 +12,9 @@ from scipy.stats import beta
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.errors import InputError
+from skin.evaluation.alarm import Reached
 from skin.evaluation.metrics import metrics
-from skin.evaluation.operating_point import OperatingPoint, Reached, check, choose, gestures, lowest, read
+from skin.evaluation.operating_point import OperatingPoint, check, choose, gestures, lowest, read
 from skin.evaluation.report import evaluate
 from skin.labels import TOUCH, TOUCH_OR_NOT, Task
 
@@ -153,6 +154,8 @@ def test_the_chosen_point_has_the_wanted_rate_on_its_gestures(device):
     reached = point.reached(Peak().probabilities(fresh), fresh.labels, TOUCH)
     assert (point.safe, point.raised, point.target, point.seed) == (64, 5, 0.1, 0)
     assert (reached.safe, reached.raised) == (64, 5)
+    assert (point.dangerous, point.found) == (reached.dangerous, reached.found) == (64, reached.found)
+    assert f"finds {100 * reached.recall:.1f} % of 64 dangerous ones" in point.sentence()
     assert choose(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold < point.threshold
 
 
@@ -203,6 +206,7 @@ def test_what_is_stored_reads_back_to_the_last_digit():
         {"target": 2},
         {"safe": "many"},
         {"raised": 9999},
+        {"found": 1},
         {"label": "big"},
         {"seed": {}},
     ],

@@ -27,7 +27,7 @@ def test_a_finished_run_is_sorted_by_margins(run, tmp_path):
     assert f"of {wrong} errors of big" in said[0]
     text = next((tmp_path / "found").glob("margins_rules_*.md")).read_text()
     assert "## Alarm above 0." in text
-    assert "chosen on 64 fresh safe gestures for 2 % false alarms; false alarms: " in said[0]
+    assert "chosen on 64 fresh safe gestures for 2 % false alarms, finds " in said[0]
     with Image.open(next((tmp_path / "found").glob("margins_rules_*.png"))) as picture:
         assert picture.size[0] > 800
     few = ["device.test_gestures=32", "evaluation.devices=0", "evaluation.layouts=0", "out=found"]

@@ -16,4 +16,9 @@ def test_no_number_is_cut_on_a_narrow_terminal():
     text = seen.getvalue()
     assert "…" not in text
     assert "12.3 ± 1.2 (85.0)" in text
-    assert all(head in text for head in ("overall", "recall", "device", "layout"))
+    assert all(head in text for head in ("overall", "recall", "false", "dev.", "lay."))
+    # A temporal_graph of one seed, with the report's number, fits 80 columns.
+    line |= {"ours_sd": ""}
+    seen = io.StringIO()
+    results([line | {"label": label} for label in LABELS], "title", Console(file=seen, width=40))
+    assert max(map(len, seen.getvalue().splitlines())) <= 80

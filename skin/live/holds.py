@@ -22,6 +22,7 @@ FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
 _CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is asked about
+_AHEAD = 0.5  # s before these
 _SPARSE = 5.0  # s from one frame that is asked about to the next otherwise
 _SEGMENTS = count()  # of the device's clock: every touch begins with an empty window
 _TAP = {"dynamic": 0, "press": 0, "dangerous": 1}
@@ -128,7 +129,7 @@ def played(engine: Engine, device: Simulated, force: np.ndarray, rate: float, se
     answers: list[tuple[float, bool, bool]] = []
     for number, (t, row) in enumerate(zip(time.tolist(), said, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
-        close = any(0 <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
+        close = any(-_AHEAD <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
         if not close and number % max(1, round(_SPARSE * rate)):
             engine.add(frame)
         elif (verdict := engine.push(frame, newtons)) is not None:

@@ -13,7 +13,7 @@ SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", 
 LEARNERS = {
     "rules": ["experiment=rules"],
     "features": ["experiment=features", "learner.rounds=30"],
-    "network": ["experiment=gru", "trainer.max_epochs=5", "fusion.hidden=32", "data.batch_size=16"],
+    "network": ["experiment=gru", "trainer.max_epochs=16", "fusion.hidden=32", "data.batch_size=16"],
     "ensemble": [
         "experiment=best",
         "trainer.max_epochs=3",

@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 BUDGET ?= full
 SEEDS ?= 1
 PEERS := .venv-peers
-TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile -rs
+TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs
 # Each rounds sums of floating-point numbers in its own way; the first is the suite's default.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell

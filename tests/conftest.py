@@ -33,6 +33,12 @@ CONF = ROOT / "conf"
 PATIENCE = 600  # s: machines are busy at times
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first: what is left at the end is shared well among the processes."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory):
     """Keep operators of tests apart from the user's; commands that tests start inherit the variable."""

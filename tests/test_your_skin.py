@@ -92,16 +92,14 @@ def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
 @pytest.mark.slow
 def test_the_training_of_the_page_runs(home):
     store = f"tracking.uri=sqlite:///{home}/mlflow.db tracking.artifacts={home}/artifacts"
-    # A coarser mesh than the page's, for time.
-    run(
-        f"{COMMANDS[1].strip()} body.cells=[15,10] simulator.divisions=1 evaluation.safe_gestures=64 {store}",
-        home,
-    )
+    # A coarser mesh and less evaluation than the page's, for time.
+    few = "body.cells=[15,10] simulator.divisions=1 evaluation.devices=1 evaluation.layouts=1"
+    run(f"{COMMANDS[1].strip()} {few} evaluation.safe_gestures=64 {store}", home)
     run(
         f"{COMMANDS[2].strip()} {store}".replace("seconds=30", "seconds=1 live.touch=0.3 live.web_port=0"),
         home,
     )
-    said = run(f"{COMMANDS[3].strip()} {store} out={home}/found", home)
+    said = run(f"{COMMANDS[3].strip()} gestures=1000 {store} out={home}/found", home)
     assert said.startswith("within 10 % of their thresholds lie ")
     with sqlite3.connect(home / "mlflow.db") as database:
         states = database.execute("select name, status from runs order by start_time").fetchall()

@@ -7,6 +7,7 @@ import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
 from skin.evaluation.metrics import angles, confusion, metrics
+from skin.evaluation.operating_point import OperatingPoint
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
 
@@ -100,8 +101,12 @@ def test_no_recall_is_made_up_where_no_gesture_is_safe_or_none_is_dangerous(scor
     chances, labels = scored
     labels = labels.clone()
     labels[:, 3] = dangerous
-    found = metrics(chances, labels, TOUCH, 0.02)
-    assert math.isnan(found["dangerous/recall"])
+    found = metrics(chances, labels, TOUCH, OperatingPoint(0.5, 0.02, 64, 1, 0))
+    undefined, other = "false_alarm_rate", "alarm_recall"
+    if not dangerous:
+        undefined, other = other, undefined
+    assert math.isnan(found[f"dangerous/{undefined}"])
+    assert 0 <= found[f"dangerous/{other}"] <= 1
     assert math.isnan(found["dangerous/balanced_accuracy"])
     assert 0 < found["dangerous/accuracy"] < 1
     assert 0 < found["overall/accuracy"] < 1

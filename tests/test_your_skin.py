@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import sqlite3
 import subprocess
 import sys
@@ -30,7 +31,7 @@ def home(tmp_path_factory):
     return home
 
 
-def run(command: str, home: Path) -> str:
+def started(command: str, home: Path) -> str:
     """Run a command of the page as a user's shell would, and return what it prints."""
     environment = {
         **os.environ,
@@ -57,7 +58,7 @@ def test_the_page_has_the_files_and_commands_of_the_walk():
 
 
 def test_the_configuration_that_the_page_prints_is_the_users(home):
-    shown = OmegaConf.create(run(COMMANDS[0], home))
+    shown = OmegaConf.create(started(COMMANDS[0], home))
     body = instantiate(shown.body)
     assert (body.size, body.cells, len(body.layers)) == ((0.15, 0.10), (30, 20), 3)
     assert [layer.material.young for layer in body.layers] == [560e3, 40e3, 69e3]
@@ -71,7 +72,7 @@ def test_the_configuration_that_the_page_prints_is_the_users(home):
 
 
 def test_the_overrides_of_the_page_describe_the_same_sheet(home):
-    shown = OmegaConf.create(run(COMMANDS[4], home))
+    shown = OmegaConf.create(started(COMMANDS[4], home))
     body = instantiate(shown.body)
     sensors = instantiate(shown.layout).sensors(body)
     assert (body.size, body.thickness) == ((0.15, 0.10), pytest.approx(0.016))
@@ -81,7 +82,7 @@ def test_the_overrides_of_the_page_describe_the_same_sheet(home):
 
 @pytest.mark.parametrize("line", COMMANDS[5].splitlines())
 def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
-    shown = OmegaConf.create(run(f"{line.partition('  #')[0]} --cfg job", home))
+    shown = OmegaConf.create(started(f"{line.partition('  #')[0]} --cfg job", home))
     body = instantiate(shown.body)
     assert not body.flat
     assert shown.simulator._target_ == "skin.simulator.solid.Solid"
@@ -90,18 +91,23 @@ def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
 
 
 @pytest.mark.slow
-def test_the_training_of_the_page_runs(home):
-    store = f"tracking.uri=sqlite:///{home}/mlflow.db tracking.artifacts={home}/artifacts"
+def test_the_training_of_the_page_runs(home, run, monkeypatch):
+    monkeypatch.setenv("HOME", str(home))
+
+    def follow(command: str, *more: str) -> str:
+        """Run a command of the page that shares its imports with others, and return what it prints."""
+        words = [os.path.expanduser(word) for word in shlex.split(command.replace("\\\n", " "))]
+        done = run(home, Path(words[1]).name, *words[2:], *more)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
     # A coarser mesh and less evaluation than the page's, for time.
-    few = "body.cells=[15,10] simulator.divisions=1 evaluation.devices=1 evaluation.layouts=1"
-    run(f"{COMMANDS[1].strip()} {few} evaluation.safe_gestures=64 {store}", home)
-    run(
-        f"{COMMANDS[2].strip()} {store}".replace("seconds=30", "seconds=1 live.touch=0.3 live.web_port=0"),
-        home,
-    )
-    said = run(f"{COMMANDS[3].strip()} gestures=1000 {store} out={home}/found", home)
+    few = ["evaluation.devices=1", "evaluation.layouts=1", "evaluation.safe_gestures=64"]
+    follow(COMMANDS[1], "body.cells=[15,10]", "simulator.divisions=1", *few)
+    follow(COMMANDS[2].replace("seconds=30", "seconds=1"), "live.touch=0.3", "live.web_port=0")
+    said = follow(COMMANDS[3].replace("gestures=2000", "gestures=1000"), f"out={home}/found")
     assert said.startswith("within 10 % of their thresholds lie ")
-    with sqlite3.connect(home / "mlflow.db") as database:
+    with sqlite3.connect(home / "m.db") as database:
         states = database.execute("select name, status from runs order by start_time").fetchall()
     database.close()
     assert states == [("custom solid 0", "FINISHED"), ("margins of custom solid 0", "FINISHED")]

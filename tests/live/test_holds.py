@@ -24,23 +24,29 @@ LEARNERS = {
 RATE = 10.0  # Hz, of the device
 
 
-@pytest.fixture(scope="module", params=[(name, gate) for name in LEARNERS for gate in (False, True)], ids=str)
-def engine(request, configured):
-    """Return the live engine of a small run, and its device."""
-    name, stream = request.param
-    config = configured(*SMALL, *LEARNERS[name], f"data.stream={stream}")
+@pytest.fixture(scope="module", params=LEARNERS)
+def trained(request, configured):
+    """Return a small run that has learned what touch is, and its device."""
+    config = configured(*SMALL, *LEARNERS[request.param], "data.stream=true")
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device)
     learner.fit(data)
     of = start.Trained(device, learner, device.window, data.touches("train").positions, device.rate)
-    return start.engine(of, Patience()), device
+    return of, device.replace(stream=False)
+
+
+@pytest.fixture(scope="module", params=[None, 0.3], ids=["learned", "threshold"])
+def engine(request, trained):
+    """Return a live engine with each gate, and the device."""
+    of, device = trained
+    return start.engine(of, Patience(), request.param), device
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("course", COURSES)
 def test_an_alarm_stays_until_the_touch_ends(engine, course):
     subject, device = engine
-    forces = list(trials(device.replace(stream=False), course, 1 if "600" in course else 2))
+    forces = trials(device, course, 1 if "hold" in course else 2)
     found = [played(subject, device, force, RATE, number) for number, force in enumerate(forces)]
     assert not any(one.early for one in found)
     raised = [one for one in found if one.raised is not None]
@@ -53,7 +59,7 @@ def test_an_alarm_stays_until_the_touch_ends(engine, course):
 def test_a_hold_that_becomes_dangerous_late_is_found(engine):
     """Ten seconds of a light touch, then a press: the plain window never shows the skin untouched."""
     subject, device = engine
-    (strongest,) = trials(device.replace(stream=False), "hold 1 s", 1)
+    (strongest,) = trials(device, "hold 1 s", 1)
     peak = strongest.max(axis=0)
     load = np.interp(np.arange(0, 20, 0.1), [0, 0.2, 10, 10.2, 18, 18.2], [0, 0.15, 0.15, 1, 1, 0])
     found = played(subject, device, load[:, None] * peak, RATE, 99)

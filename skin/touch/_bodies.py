@@ -43,17 +43,22 @@ class Fit(NamedTuple):
             InputError: none of the shapes has room.
         """
         chance = np.random.default_rng(0).random((2, _PROBES, 4))
-        redrawn, fitted = np.empty((2, 2, len(shapes.names)))
-        for shape in range(len(shapes.names)):
-            number = np.full(_PROBES, shape)
-            for row, big in enumerate((False, True)):
-                same = np.full(_PROBES, big)
-                redrawn[row, shape] = _as_they_are(same, settings, shapes, chance[row], number)["fits"].mean()
-                fitted[row, shape] = _fitted(same, settings, shapes, chance[row], number, same)["fits"].mean()
+
+        def fits(fitted: bool) -> np.ndarray:
+            """Return the share of small and big bodies of each shape that have room, (2, N)."""
+            found = np.empty((2, len(shapes.names)))
+            for row, shape in np.ndindex(found.shape):
+                same, number = np.full(_PROBES, bool(row)), np.full(_PROBES, shape)
+                given = settings, shapes, chance[row], number
+                drawn = _fitted(same, *given, same) if fitted else _as_they_are(same, *given)
+                found[row, shape] = drawn["fits"].mean()
+            return found
+
+        redrawn = fits(fitted=False)
         totals = redrawn.sum(axis=1, keepdims=True)
         if totals.all() and (redrawn / totals).max(axis=0).sum() / 2 <= settings.leak:
             return None
-        small, big = fitted >= _RARE
+        small, big = fits(fitted=True) >= _RARE
         if not big.any():
             raise _no_room(settings, shapes.body.size)
         return cls(big, small | big)

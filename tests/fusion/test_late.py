@@ -64,5 +64,6 @@ def test_a_transformer_looks_back_over_the_whole_window():
     states = []
     head.encoder.register_forward_hook(lambda *call: states.append(call[-1]))
     head(x)
-    states[0][0, 59].sum().backward()
-    assert (x.grad[0] != 0).any(dim=1).all()
+    # Not the sum: the layer's norm keeps that at 0, and its gradient would be rounding.
+    states[0][0, 59, 0].backward()
+    assert (x.grad[0].abs().amax(dim=1) > 1e-6).all()

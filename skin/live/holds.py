@@ -23,7 +23,8 @@ _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
 _CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is asked about
 _AHEAD = 0.5  # s before these
-_SPARSE = 5.0  # s from one frame that is asked about to the next otherwise
+_MINUTE = 60.0  # s
+_SPARSE = 0.1, 5.0  # s from one frame that is asked about to the next otherwise, and in a touch of minutes
 _SEGMENTS = count()  # of the device's clock: every touch begins with an empty window
 _TAP = {"dynamic": 0, "press": 0, "dangerous": 1}
 _PRESS = {"dynamic": 0, "press": 1, "dangerous": 1}
@@ -125,12 +126,13 @@ def played(engine: Engine, device: Simulated, force: np.ndarray, rate: float, se
     newtons = Newtons(np.ones(len(dead)), constants.offset.double().numpy(), dead)
     touched = np.flatnonzero(true.any(axis=1))
     begin, end, segment = time[touched[0]], time[touched[-1]], next(_SEGMENTS)
+    step = max(1, round(_SPARSE[bool(end - begin > _MINUTE)] * rate))
     engine.tared()
     answers: list[tuple[float, bool, bool]] = []
     for number, (t, row) in enumerate(zip(time.tolist(), said, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
         close = any(-_AHEAD <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
-        if not close and number % max(1, round(_SPARSE * rate)):
+        if not close and number % step:
             engine.add(frame)
         elif (verdict := engine.push(frame, newtons)) is not None:
             answers.append((t, verdict.dangerous, verdict.contact is not None))

@@ -60,8 +60,7 @@ class Outcome:
     Attributes:
         peak: largest true reading, N.
         raised: s from the first force to the alarm; None: there was none.
-        kept: once raised, the alarm stayed until the force ended, but for readings below the contact
-            threshold.
+        kept: once raised, the alarm stayed until the force ended.
         cleared: s from the end of the force to the end of the alarm; None: there was none, or it stayed.
         early: an alarm before the touch.
     """
@@ -128,24 +127,24 @@ def played(engine: Engine, device: Simulated, force: np.ndarray, rate: float, se
     begin, end, segment = time[touched[0]], time[touched[-1]], next(_SEGMENTS)
     step = max(1, round(_SPARSE[bool(end - begin > _MINUTE)] * rate))
     engine.tared()
-    answers: list[tuple[float, bool, bool]] = []
+    answers: list[tuple[float, bool]] = []
     for number, (t, row) in enumerate(zip(time.tolist(), said, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
         close = any(-_AHEAD <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
         if not close and number % step:
             engine.add(frame)
         elif (verdict := engine.push(frame, newtons)) is not None:
-            answers.append((t, verdict.dangerous, verdict.contact is not None))
+            answers.append((t, verdict.dangerous))
     return _outcome(answers, float(np.abs(true).max()), begin, end)
 
 
-def _outcome(answers: list[tuple[float, bool, bool]], peak: float, begin: float, end: float) -> Outcome:
-    raised = next((t for t, alarm, _ in answers if alarm and t >= begin), None)
-    early = any(alarm for t, alarm, _ in answers if t < begin)
+def _outcome(answers: list[tuple[float, bool]], peak: float, begin: float, end: float) -> Outcome:
+    raised = next((t for t, alarm in answers if alarm and t >= begin), None)
+    early = any(alarm for t, alarm in answers if t < begin)
     if raised is None:
         return Outcome(peak, None, True, None, early)
-    kept = all(alarm for t, alarm, contact in answers if raised <= t <= end and contact)
-    last = max(t for t, alarm, _ in answers if alarm)
+    kept = all(alarm for t, alarm in answers if raised <= t <= end)
+    last = max(t for t, alarm in answers if alarm)
     cleared = None if last >= answers[-1][0] else max(0.0, float(last - end))
     return Outcome(peak, float(raised - begin), kept, cleared, early)
 

@@ -5,7 +5,7 @@ values per sensor. Lines that start with # are JSON: what values mean, where a g
 invalid channels. Unit, layout and start time stand in ``x.csv.json``. Lines are only ever added, each in one
 piece, so the file is valid up to its last whole frame whatever ends the program.
 
-A line that is damaged later costs itself: see :func:`skin.session.stored.read`. Events have checksums. The
+A line that is damaged later costs itself: see :func:`skin.session.reading.read`. Events have checksums. The
 line that begins a gesture repeats the invalid and saturated channels and names what values mean by its
 checksum, so that a lost line never leaves a gesture with the baseline of another.
 """
@@ -23,7 +23,8 @@ from skin.errors import InputError
 from skin.port.frame import Frame
 from skin.session.lines import Lines, sealed, write_whole
 from skin.session.newtons import Newtons
-from skin.session.stored import Stored, read
+from skin.session.reading import read
+from skin.session.stored import Stored
 from skin.session.takes import Take
 
 __all__ = ["Log", "Stored", "check", "read"]

@@ -88,9 +88,7 @@ class Serial(AbstractDevice):
         if self.labels not in _LABELS:
             raise InputError(f"device.labels must be one of {', '.join(_LABELS)}, got {self.labels}")
         if self.gestures < 1 or not self.tare >= 0:
-            raise InputError(
-                f"device.gestures={self.gestures} must be 1 or more, tare={self.tare} not negative"
-            )
+            raise InputError(f"device.gestures={self.gestures} must be 1 or more, tare={self.tare} 0 or more")
         if self.scale is not None and not self.scale > 0:
             raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
         if self.labels == "none" and self.stream:
@@ -98,16 +96,11 @@ class Serial(AbstractDevice):
         self.rate = 10.0 if self.rate is None else float(self.rate)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
+        self._positions = torch.from_numpy(self.sensors.positions).float()
         self.recording: Recording | None = None
         self._known = None if self.calibration is None else read(self.calibration)
         if self._known is not None:
             self._known.fits(len(self.sensors))
-
-    @property
-    def length(self) -> float:
-        """Duration of a window, s."""
-        assert self.rate is not None
-        return self.window / self.rate
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read when first asked for; labels are None where nobody knows them."""
@@ -124,8 +117,7 @@ class Serial(AbstractDevice):
         """Return a device of the same shapes whose touches are 0: a run is brought back without a touch."""
         assert self.rate is not None
         empty = torch.zeros(1, self.window, len(self.sensors))
-        positions = torch.from_numpy(self.sensors.positions).float()
-        touches = Touches(empty, empty == 0, positions, torch.zeros(1, len(self.task)), self.rate)
+        touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)
         return Blank(self.task, self.size, touches)
 
     def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
@@ -135,9 +127,9 @@ class Serial(AbstractDevice):
                 "device=serial needs a port: add device.port=/dev/ttyACM0; experiments/emulate.py makes one"
             )
         tap = Tap(partial(open_wire, self.port, self.baudrate))
-        limits = None if self.limits is None else tuple(self.limits)
-        settings: dict[str, Any] = {"format": self.format, "limits": limits, "timeout": self.timeout}
-        settings |= {"backoff": self.backoff, "silence": self.silence}
+        names = "format", "timeout", "backoff", "silence"
+        settings: dict[str, Any] = {name: getattr(self, name) for name in names}
+        settings["limits"] = None if self.limits is None else tuple(self.limits)
         return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **settings), tap
 
     def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
@@ -216,9 +208,8 @@ class Serial(AbstractDevice):
             np.stack([window.values for window in windows]), np.stack([window.valid for window in windows])
         )
         saturated = valid & np.stack([window.saturated for window in windows])
-        positions = torch.from_numpy(self.sensors.positions).float()
         known = [torch.from_numpy(values) for values in (readings, valid, saturated)]
-        return Touches(known[0], known[1], positions, None, self.rate, saturated=known[2])
+        return Touches(known[0], known[1], self._positions, None, self.rate, saturated=known[2])
 
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin falls silent, or a person ends it."""

@@ -102,9 +102,7 @@ class Simulated(AbstractDevice):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if self.stream and self.direction:
-            raise InputError(
-                "a stream's window shows part of a path: give either data.direction=true or data.stream=true"
-            )
+            raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         true = true_sensors(self)
@@ -210,7 +208,7 @@ class Simulated(AbstractDevice):
         true = Strip.of(timeline, true_readings(self, timeline.movie, complete))
         if self.randomise:
             return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
-        return self._felt_strip(true, noise).cut(torch.from_numpy(starts), self.window)
+        return Strip(timeline, self._felt(true.whole, noise)).cut(torch.from_numpy(starts), self.window)
 
     @torch.no_grad()
     def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Strip:
@@ -226,10 +224,7 @@ class Simulated(AbstractDevice):
         key = Stream.TEST, 1, number
         timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
         true = Strip.of(timeline, true_readings(self, timeline.movie, complete=False))
-        return self._felt_strip(true, generator(Stream.NOISE, self.seed, *key))
-
-    def _felt_strip(self, true: Strip, noise: np.random.Generator) -> Strip:
-        return Strip(true.timeline, self._felt(true.whole, noise))
+        return Strip(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings as the device tells them."""

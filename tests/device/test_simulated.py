@@ -191,5 +191,5 @@ def test_the_direction_of_sliding_is_a_label_that_changes_nothing_else(plain):
 
 
 def test_a_stream_tells_no_direction():
-    with pytest.raises(InputError, match=r"give either data.direction=true or data.stream=true"):
+    with pytest.raises(InputError, match=r"leave out data.stream=true"):
         device(direction=True, stream=True)

@@ -5,7 +5,7 @@ in the time of the device. Prints a line for each kind and writes holds_<row>_<r
 """
 
 import csv
-import io
+from functools import partial
 from math import inf
 
 from skin.config import DictConfig, command, overrides, plain
@@ -13,7 +13,6 @@ from skin.errors import InputError
 from skin.files import results
 
 _OWN = ("holds", "out", "run")
-_LONG = "600 s"
 
 
 @command("holds")
@@ -30,12 +29,11 @@ def main(config: DictConfig) -> None:
     import torch
     from rich.progress import track
 
-    from skin.build import build_device
     from skin.console import quiet
     from skin.device.simulated import Simulated
-    from skin.files import write
+    from skin.files import whole
     from skin.live import start
-    from skin.live.holds import COURSES, FIELDS, played, summary, trials
+    from skin.live.holds import FIELDS, courses
     from skin.live.verdict import Patience
     from skin.reload import changed, configuration, find
     from skin.tracking import Store
@@ -48,25 +46,16 @@ def main(config: DictConfig) -> None:
     stored = configuration(store, run, config.trust)
     own = changed(stored, config, given)
     of = start.trained(store, run, own, stored)
-    device = build_device(own)
-    if not isinstance(device, Simulated):
+    if not isinstance(of.device, Simulated):
         raise InputError("held touches are simulated: give a run of simulated touches")
-    engine, whole = (
-        start.engine(of, Patience(), settings["touch"], settings["drift"]),
-        device.replace(stream=False),
-    )
-    found = io.StringIO()
-    table = csv.writer(found, lineterminator="\n")
-    table.writerow(FIELDS)
-    for course in COURSES:
-        number = max(1, count // 10) if _LONG in course else count
-        forces = track(trials(whole, course, number), course, number, transient=True)
-        outcomes = [played(engine, device, force, rate, n) for n, force in enumerate(forces)]
-        said = summary(course, outcomes)
-        table.writerow(said)
+    engine = start.engine(of, Patience(), settings["touch"], settings["drift"])
+    lines = [FIELDS]
+    for said in courses(engine, of.device.replace(stream=False), count, rate, partial(track, transient=True)):
+        lines.append(said)
         print(", ".join(f"{name} {value}" for name, value in zip(FIELDS, said, strict=True) if value != ""))
     path = results(config.out) / f"holds_{own.row}_{run.info.run_id[:8]}.csv"
-    write(found.getvalue(), path)
+    with whole(path) as partly, partly.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(lines)
     print(path)
 
 

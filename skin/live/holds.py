@@ -1,6 +1,6 @@
 """Taps, held presses and slow ramps before an engine, in the time of the device: when is the alarm raised?"""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -15,7 +15,7 @@ from skin.port.frame import Frame
 from skin.session.newtons import Newtons
 from skin.streams import Stream, generator
 
-__all__ = ["COURSES", "FIELDS", "Outcome", "played", "summary", "trials"]
+__all__ = ["COURSES", "FIELDS", "Outcome", "courses", "played", "summary", "trials"]
 
 FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "cleared_s")
 
@@ -23,6 +23,7 @@ _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
 _CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is asked about
 _AHEAD = 0.5  # s before these
+_LONG = "600 s"  # in the names of courses of minutes
 _MINUTE = 60.0  # s
 _SPARSE = 0.1, 5.0  # s from one frame that is asked about to the next otherwise, and in a touch of minutes
 _SEGMENTS = count()  # of the device's clock: every touch begins with an empty window
@@ -163,3 +164,21 @@ def summary(course: str, found: Sequence[Outcome]) -> list[str]:
     times += [float(np.median(cleared))] if cleared else []
     words = [f"{value:.2f}" for value in times]
     return [course, *map(str, counts), *words, *[""] * (len(FIELDS) - 5 - len(words))]
+
+
+def courses(
+    engine: Engine, device: Simulated, number: int, rate: float, track: Callable[..., Iterable[np.ndarray]]
+) -> Iterator[list[str]]:
+    """Play every course before an engine and yield a line of each, as :func:`summary` gives it.
+
+    Args:
+        engine: at rest.
+        device: as in :func:`played`.
+        number: touches of each course; a tenth of it of those of minutes.
+        rate: of the device, Hz.
+        track: wraps the touches of a course, to show how far it is, as ``rich.progress.track``.
+    """
+    for course in COURSES:
+        many = max(1, number // 10) if _LONG in course else number
+        forces = track(trials(device, course, many), course, many)
+        yield summary(course, [played(engine, device, force, rate, n) for n, force in enumerate(forces)])

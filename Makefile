@@ -13,6 +13,9 @@ ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AV
 NUMERICAL := $(addprefix tests/,body calibration contact embedding evaluation fusion layout learner model proof \
 	representation session signal simulator test_classifier.py test_labels.py test_material.py touch)
 
+# Hundreds of tests start a command of this project: without bytecode each would compile it anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help install test roundings slow check bench physics peers ui reproduce-table clean
 

@@ -33,6 +33,11 @@ CONF = ROOT / "conf"
 PATIENCE = 600  # s: machines are busy at times
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Use one process more than there are cores: who tests a port mostly waits."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first: what is left at the end is shared well among the processes."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}

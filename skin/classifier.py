@@ -72,6 +72,7 @@ class TouchClassifier(pl.LightningModule):
         self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
         self.task = task
         self._make_optimizer, self._warmup = optimizer, warmup
+        self._batches: dict[str, list[tuple[int, dict[str, Tensor]]]] = {"train": [], "val": []}
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the logits (B, L) of frames."""
@@ -101,11 +102,16 @@ class TouchClassifier(pl.LightningModule):
         frames, labels = batch
         logits = self(frames)
         loss = self.loss(logits, labels)
-        values = {f"{stage}_loss": loss.detach()} | {
-            f"{stage}_{name}": value for name, value in self._accuracy(logits.detach(), labels).items()
-        }
-        self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(labels))
+        values = {"loss": loss.detach()} | self._accuracy(logits.detach(), labels)
+        self._batches[stage].append((len(labels), values))
         return loss
+
+    def _log(self, stage: str) -> None:
+        """Log the means over an epoch: Lightning's own means take longer than the step of a small network."""
+        batches, self._batches[stage] = self._batches[stage], []
+        count = sum(size for size, _ in batches)
+        for name in batches[0][1]:
+            self.log(f"{stage}_{name}", sum(size * values[name] for size, values in batches) / count)
 
     def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
         if self.task.kind == "exclusive":
@@ -122,8 +128,16 @@ class TouchClassifier(pl.LightningModule):
         return self._step(batch, "train")
 
     def validation_step(self, batch: Batch, index: int) -> None:
-        """Log the loss and accuracy of one batch."""
+        """Keep the loss and the accuracy of one batch."""
         self._step(batch, "val")
+
+    def on_train_epoch_end(self) -> None:
+        """Log the loss and the accuracy of the epoch."""
+        self._log("train")
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the loss and the accuracy on the validation split."""
+        self._log("val")
 
     def configure_optimizers(self) -> Any:
         """Return the optimizer over all parameters, and how its learning rate changes from step to step."""

@@ -111,22 +111,25 @@ def test_the_head_is_as_wide_as_the_task():
     assert classifier(GESTURES)(Frames(torch.randn(2, 3, 2), None)).shape == (2, 3)
 
 
-def test_what_a_step_logs(monkeypatch):
+def test_what_an_epoch_logs(monkeypatch):
     network = classifier(hidden=())
     logged = {}
-    monkeypatch.setattr(network, "log_dict", lambda values, **_: logged.update(values))
+    monkeypatch.setattr(network, "log", lambda name, value: logged.update({name: value.item()}))
     with torch.no_grad():
         network.head[0].weight.zero_()
         network.head[0].bias.copy_(torch.tensor([1.0, 1.0, -1.0, -1.0]))
-    labels = torch.tensor([[1.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0]])
-    network.validation_step((Frames(torch.randn(2, 3, 2), None), labels), 0)
-    assert {name: value.item() for name, value in logged.items() if name != "val_loss"} == {
-        "val_accuracy": 0.75,
-        "val_accuracy_big": 1.0,
-        "val_accuracy_dynamic": 0.5,
-        "val_accuracy_press": 1.0,
-        "val_accuracy_dangerous": 0.5,
-    }
+    labels = torch.tensor([[1.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]])
+    for _ in range(2):
+        # Batches count by their size; the next epoch begins anew.
+        for batch in (labels[:2], labels[2:]):
+            network.validation_step((Frames(torch.randn(len(batch), 3, 2), None), batch), 0)
+        network.on_validation_epoch_end()
+        thirds = {"big": 2, "dynamic": 2, "press": 3, "dangerous": 1}
+        assert {name: 3 * logged.pop(f"val_accuracy_{name}") for name in thirds} == pytest.approx(thirds)
+        assert logged.pop("val_accuracy") == pytest.approx(8 / 12)
+        right, wrong = math.log1p(math.exp(-1)), math.log1p(math.exp(1))
+        assert logged.pop("val_loss") == pytest.approx((8 * right + 4 * wrong) / 12)
+        assert not logged
 
 
 def test_exclusive_accuracy_counts_the_largest(monkeypatch):

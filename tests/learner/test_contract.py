@@ -45,12 +45,21 @@ def made(request, configured, made_up_device, tmp_path, monkeypatch):
     return lambda: instantiate(config.learner, seed=0), data, made_up_device
 
 
+@pytest.fixture(scope="module")
+def trained():
+    """Return learners that have learnt, by option: a training takes seconds."""
+    return {}
+
+
 @pytest.fixture
-def fitted(made):
+def fitted(request, made, trained):
+    """Return a learner that has learnt, its data, and the device."""
     make, data, device = made
-    learner = make()
-    learner.fit(data)
-    return learner, data, device
+    option = request.node.callspec.params["made"]
+    if option not in trained:
+        trained[option] = make()
+        trained[option].fit(data)
+    return trained[option], data, device
 
 
 def test_it_learns(fitted):

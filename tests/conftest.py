@@ -17,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -107,6 +108,67 @@ def configured() -> Callable[..., DictConfig]:
     return make
 
 
+class Command:
+    """A command in the background, with what tests need of ``subprocess.Popen``; its output goes to files."""
+
+    def __init__(self, ask: Callable[[dict], int | None], job: dict) -> None:
+        self.args, self.returncode = job["command"], None
+        self._ask, self._out, self._err = ask, Path(job["out"]), Path(job["err"])
+        self._read = {self._out: 0, self._err: 0}
+        self.pid = ask(job)
+
+    def __enter__(self) -> "Command":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.kill()
+        self.wait()
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text()
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    def lines(self, errors: bool = False) -> Iterator[str]:
+        """Yield the lines that were not read yet, as they come, until the command ends."""
+        path = self._err if errors else self._out
+        ended = False
+        while not ended:
+            ended = self.poll() is not None
+            with path.open() as file:
+                file.seek(self._read[path])
+                while (line := file.readline()).endswith("\n"):
+                    self._read[path] = file.tell()
+                    yield line.rstrip()
+            sleep(0.02)
+
+    def poll(self) -> int | None:
+        """Return the exit code, or None while the command runs."""
+        if self.returncode is None:
+            self.returncode = self._ask({"ended": self.pid, "wait": False})
+        return self.returncode
+
+    def wait(self, timeout: float = PATIENCE) -> int:
+        """Return the exit code once the command has ended."""
+        deadline = monotonic() + timeout
+        while self.poll() is None:
+            if monotonic() > deadline:
+                self.kill()
+                raise TimeoutError(f"{self.args} goes on after {timeout} s: {self.out} {self.err}")
+            sleep(0.01)
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
 @pytest.fixture(scope="session")
 def starter(own_cache) -> Iterator[subprocess.Popen]:
     """Run the process that forks commands; see tests/starter.py."""
@@ -117,30 +179,48 @@ def starter(own_cache) -> Iterator[subprocess.Popen]:
 
 
 @pytest.fixture(scope="session")
-def run(request, tmp_path_factory) -> Callable[..., subprocess.CompletedProcess]:
-    """Return a function that runs ``experiments/<script>`` in a folder, with a store of its own there.
+def begin(request, tmp_path_factory) -> Callable[..., Command]:
+    """Return a function that starts ``experiments/<script>``, or a script at a path, in a folder.
 
-    ``store=False`` names no store. The command is a process of its own that shares its imports with others;
-    with ``fresh=True`` it shares nothing, as where a person starts it.
+    The command is a process of its own that shares its imports with others. ``stdin`` is the path of what it
+    reads, a terminal for example.
     """
-    said = tmp_path_factory.mktemp("said")
+    said, numbers = tmp_path_factory.mktemp("said"), count()
 
-    def run(folder, script, *arguments, store=True, fresh=False) -> subprocess.CompletedProcess:
-        own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
-        command = [str(ROOT / "experiments" / script), *map(str, arguments), *own]
-        if fresh:
-            command = [sys.executable, *command]
-            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
-        out, err = said / "out", said / "err"
-        job = {"command": command, "folder": str(folder), "environment": dict(os.environ)}
-        job |= {"out": str(out), "err": str(err), "seconds": PATIENCE}
-        for file in (out, err):
-            file.write_text("")
+    def ask(job: dict) -> int | None:
         process = request.getfixturevalue("starter")
         process.stdin.write(json.dumps(job) + "\n")
         process.stdin.flush()
-        code = int(process.stdout.readline())
-        return subprocess.CompletedProcess(command, code, out.read_text(), err.read_text())
+        return json.loads(process.stdout.readline())
+
+    def begin(folder, script, *arguments, stdin=os.devnull) -> Command:
+        files = [said / f"{next(numbers)}" for _ in range(2)]
+        for file in files:
+            file.touch()
+        job = {"command": [str(ROOT / "experiments" / script), *map(str, arguments)], "folder": str(folder)}
+        job |= {"in": stdin, "out": str(files[0]), "err": str(files[1])}
+        job |= {"environment": dict(os.environ), "seconds": PATIENCE}
+        return Command(ask, job)
+
+    return begin
+
+
+@pytest.fixture(scope="session")
+def run(begin) -> Callable[..., subprocess.CompletedProcess]:
+    """Return a function that runs ``experiments/<script>`` in a folder, with a store of its own there.
+
+    ``store=False`` names no store. The command is started as by ``begin``; with ``fresh=True`` it shares
+    nothing, as where a person starts it.
+    """
+
+    def run(folder, script, *arguments, store=True, fresh=False) -> subprocess.CompletedProcess:
+        own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
+        if fresh:
+            command = [sys.executable, ROOT / "experiments" / script, *arguments, *own]
+            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
+        command = begin(folder, script, *arguments, *own)
+        code = command.wait()
+        return subprocess.CompletedProcess(command.args, code, command.out, command.err)
 
     return run
 

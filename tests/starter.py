@@ -1,9 +1,9 @@
 """Runs commands, each in a fork of a process that has imported the heavy libraries once.
 
-A line of standard input is a job, the answering line its exit code. A job has a process of its own, with its
-own folder, environment, output and end, as one that a shell starts; only imports are shared, and the empty
-database that MLflow takes seconds to make. Where there is no fork (Windows), or none that libraries bear
-(macOS), it is started anew.
+A line of standard input is a job, and its process's number the answer; or it asks for the exit code of such a
+process. A job has a process of its own, with its own folder, environment, files and end, as one that a shell
+starts; only imports are shared, and the empty database that MLflow takes seconds to make. Where there is no
+fork (Windows), or none that libraries bear (macOS), it is started anew.
 """
 
 import atexit
@@ -36,20 +36,27 @@ WARM = (
 
 def main() -> None:
     """Run jobs until standard input ends; returns in every fork, too, which then runs its script."""
-    if not hasattr(os, "fork") or sys.platform == "darwin":
-        for line in sys.stdin:
-            print(_started(json.loads(line)), flush=True)
-        return
-    made = _warm()
-    _share_database(Path(os.environ["SKIN_CACHE"]) / "empty.db")
-    assert threading.active_count() == 1, "a fork keeps one thread"
-    gc.freeze()  # else every fork would copy what it never changes
+    forks = hasattr(os, "fork") and sys.platform != "darwin"
+    started: dict[int, subprocess.Popen[bytes]] = {}
+    made = _warm() if forks else {}
+    if forks:
+        _share_database(Path(os.environ["SKIN_CACHE"]) / "empty.db")
+        assert threading.active_count() == 1, "a fork keeps one thread"
+        gc.freeze()  # else every fork would copy what it never changes
     for line in sys.stdin:
-        child = os.fork()
-        if child == 0:
-            _become(json.loads(line), made)
+        job = json.loads(line)
+        if (number := job.get("ended")) in started:
+            answer = started[number].wait() if job["wait"] else started[number].poll()
+        elif number is not None:
+            ended, status = os.waitpid(number, 0 if job["wait"] else os.WNOHANG)
+            answer = os.waitstatus_to_exitcode(status) if ended else None
+        elif not forks:
+            process = _started(job)
+            started[answer := process.pid] = process
+        elif (answer := os.fork()) == 0:
+            _become(job, made)
             return
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        print(json.dumps(answer), flush=True)
 
 
 def _warm() -> dict[str, str]:
@@ -86,7 +93,7 @@ def _become(job: dict[str, Any], made: dict[str, str]) -> None:
     os.environ.clear()
     os.environ.update(made | job["environment"])
     os.chdir(job["folder"])
-    for number, name in enumerate((os.devnull, job["out"], job["err"])):
+    for number, name in enumerate((job["in"], job["out"], job["err"])):
         file = os.open(name, os.O_RDWR)
         os.dup2(file, number)
         os.close(file)
@@ -112,10 +119,10 @@ def _end(code: int) -> None:
     os._exit(code)
 
 
-def _started(job: dict[str, Any]) -> int:
-    with open(job["out"], "w") as out, open(job["err"], "w") as err:
-        command, files = [sys.executable, *job["command"]], {"stdout": out, "stderr": err}
-        return subprocess.call(command, cwd=job["folder"], env=job["environment"], **files)
+def _started(job: dict[str, Any]) -> subprocess.Popen[bytes]:
+    with open(job["in"]) as given, open(job["out"], "w") as out, open(job["err"], "w") as err:
+        command, files = [sys.executable, *job["command"]], {"stdin": given, "stdout": out, "stderr": err}
+        return subprocess.Popen(command, cwd=job["folder"], env=job["environment"], **files)
 
 
 if __name__ == "__main__":

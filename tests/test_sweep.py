@@ -1,7 +1,5 @@
 """A sweep counts its jobs as Hydra does, tells the time left, goes on after a failure, and resumes."""
 
-import os
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -77,15 +75,9 @@ def runs(folder):
 
 
 @pytest.mark.slow
-def test_a_sweep_that_was_killed_goes_on_where_it_was(run, tmp_path):
-    script, *arguments = sweep(tmp_path, "seed=0,1,2")
-    command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as first:
-        for line in first.stdout:
-            if line.startswith("[2/3]"):
-                os.kill(first.pid, signal.SIGKILL)
-                break
-        first.wait(60)
+def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
+    with begin(tmp_path, *sweep(tmp_path, "seed=0,1,2")) as first:
+        next(line for line in first.lines() if line.startswith("[2/3]"))
     assert [one[:2] for one in runs(tmp_path)][:2] == [("sweep", "RUNNING"), ("rules naive 0", "FINISHED")]
     again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
     assert again.returncode == 0, again.stderr

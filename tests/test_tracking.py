@@ -1,7 +1,6 @@
 """A run's status can be trusted, whatever ends it."""
 
 import json
-import os
 import signal
 import sqlite3
 import subprocess
@@ -74,11 +73,11 @@ def test_an_interrupted_run_is_killed(store):
     ("number", "expected"),
     [(signal.SIGTERM, "KILLED"), (signal.SIGINT, "KILLED"), (signal.SIGKILL, "RUNNING")],
 )
-def test_a_signal_leaves_no_finished_run(settings, store, number, expected):
-    command = [sys.executable, "-c", BEGIN + WAIT, settings.uri, settings.artifacts]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert process.stdout.readline() == "open\n"
-        os.kill(process.pid, number)
+def test_a_signal_leaves_no_finished_run(begin, tmp_path, settings, store, number, expected):
+    (tmp_path / "wait.py").write_text(BEGIN + WAIT)
+    with begin(ROOT, tmp_path / "wait.py", settings.uri, settings.artifacts) as process:
+        assert next(process.lines()) == "open"
+        process.send_signal(number)
         process.wait(60)
     assert store.find(fingerprint="f")[0].info.status == expected
     assert not store.find("FINISHED", fingerprint="f")

@@ -3,24 +3,19 @@
 import os
 import re
 import signal
-import subprocess
-import sys
 from contextlib import contextmanager
 from itertools import count
-from threading import Timer
 
 import numpy as np
 import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.config import ROOT
 from skin.port.text import Header, encode_header, encode_line
 from skin.session.log import read as read_session
 from skin.storage import read
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
-PATIENCE = 300.0  # s: machines are busy at times
 PACE = 0.002  # s of the wall for 10 ms of the device
 
 
@@ -45,49 +40,45 @@ class Person:
 
     def __init__(self, process, keyboard):
         self.process, self._keyboard = process, keyboard
-        self.heard = []
 
     def until(self, words):
         """Read on until a line has some words; return it."""
-        for line in self.process.stderr:
-            self.heard.append(line.rstrip())
+        for line in self.process.lines(errors=True):
             if words in line:
                 return line.strip()
-        raise AssertionError(f"waited in vain for {words!r} after\n" + "\n".join(self.heard))
+        raise AssertionError(f"waited in vain for {words!r} after\n{self.process.err}")
 
     def types(self, line):
         os.write(self._keyboard, line.encode() + b"\n")
 
 
-@contextmanager
-def person_at(folder, script, *arguments):
-    """Start a command on a terminal of its own."""
-    keyboard, terminal = os.openpty()
-    command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
-    with subprocess.Popen(
-        command, cwd=folder, stdin=terminal, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        os.close(terminal)
-        impatience = Timer(PATIENCE, process.kill)
-        impatience.start()
+@pytest.fixture
+def person_at(begin):
+    """Return a function that starts a command on a terminal of its own."""
+
+    @contextmanager
+    def person_at(folder, script, *arguments):
+        keyboard, terminal = os.openpty()
         try:
-            yield Person(process, keyboard)
+            with begin(folder, script, *arguments, stdin=os.ttyname(terminal)) as process:
+                yield Person(process, keyboard)
         finally:
-            impatience.cancel()
-            process.kill()
             os.close(keyboard)
+            os.close(terminal)
+
+    return person_at
 
 
 def ended(person):
     """Return exit code and results of a command that ends by itself."""
-    said, errors = person.process.communicate(timeout=300)
-    assert "Traceback" not in errors, errors
-    assert "Fatal" not in errors, errors
-    return person.process.returncode, said
+    code = person.process.wait()
+    assert "Traceback" not in person.process.err, person.process.err
+    assert "Fatal" not in person.process.err, person.process.err
+    return code, person.process.out
 
 
 @pytest.mark.slow
-def test_recording_with_enter_s_q_and_going_on_after_a_kill(address, tmp_path):
+def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, tmp_path):
     command = ["record.py", *SKIN, "out=s.csv", f"device.port={address}", "device.gestures=6"]
     asked = re.compile(r"next: (big|small), (dynamic|static), (press|tap), (dangerous|safe) - press Enter")
     with person_at(tmp_path, *command) as person:
@@ -124,7 +115,7 @@ def test_recording_with_enter_s_q_and_going_on_after_a_kill(address, tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_at_a_prompt_keeps_what_there_is(address, tmp_path):
+def test_ctrl_c_at_a_prompt_keeps_what_there_is(person_at, address, tmp_path):
     with person_at(tmp_path, "record.py", *SKIN, "out=s.csv", f"device.port={address}") as person:
         person.until("next: ")
         person.types("")
@@ -135,7 +126,7 @@ def test_ctrl_c_at_a_prompt_keeps_what_there_is(address, tmp_path):
 
 
 @pytest.mark.slow
-def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(address, tmp_path):
+def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, address, tmp_path):
     command = ["record.py", *SKIN, "out=f.csv", f"device.port={address}", "record.free=true"]
     with person_at(tmp_path, *command) as person:
         person.until("2 of any gestures")
@@ -151,7 +142,7 @@ def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(address, tmp_p
 
 
 @pytest.mark.slow
-def test_evaluating_a_person(run, address, tmp_path):
+def test_evaluating_a_person(run, person_at, address, tmp_path):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     small = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
     small += ["evaluation.layouts=1", "evaluation.safe_gestures=64", "evaluation.gestures=96"]

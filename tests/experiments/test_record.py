@@ -3,10 +3,7 @@
 import re
 import resource
 import shutil
-import signal
 import socket
-import subprocess
-import sys
 from contextlib import contextmanager
 from itertools import count
 from threading import Event, Thread
@@ -16,7 +13,6 @@ import pytest
 
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
-from skin.config import ROOT
 from skin.port.text import Header, encode_header, encode_line
 from skin.session.lines import locked
 from skin.session.log import read as read_session
@@ -129,16 +125,10 @@ def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, tmp_path):
-    with skin({}) as port:
-        command = [sys.executable, ROOT / "experiments" / "record.py", "out=s.csv", *FREE, port]
-        with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as first:
-            for line in first.stderr:
-                if line.startswith("2 of"):
-                    break
-            refused(record(*FREE, port), "being recorded by another process")
-            first.send_signal(signal.SIGKILL)
-            first.communicate(timeout=60)
+def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp_path):
+    with skin({}) as port, begin(tmp_path, "record.py", "out=s.csv", *FREE, port) as first:
+        next(line for line in first.lines(errors=True) if line.startswith("2 of"))
+        refused(record(*FREE, port), "being recorded by another process")
     with skin({}) as port:
         done = record(*FREE, port, "seconds=3")
     assert done.returncode == 0, done.stderr

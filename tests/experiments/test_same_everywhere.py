@@ -2,8 +2,6 @@
 
 import re
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -11,7 +9,6 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.config import ROOT
 from skin.device.serial import Serial
 from skin.layout.grid import Grid
 from skin.storage import read
@@ -23,17 +20,17 @@ COUNT = 8
 PATIENCE = 300  # s: machines are busy at times
 
 
-def stream(folder):
+def stream(begin, folder):
     """Return the bytes that an emulated skin sends for some gestures, and its N per count."""
     fast = ["port=tcp:0", "emulate.speed=20", f"gestures={COUNT}"]
-    command = [sys.executable, ROOT / "experiments" / "emulate.py", *SKIN, *fast]
-    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
-        port = process.stdout.readline().strip()
-        scale = re.search(r"device\.scale=(\S+)", process.stdout.readline())[1]
+    with begin(folder, "emulate.py", *SKIN, *fast) as process:
+        lines = process.lines()
+        port = next(lines)
+        scale = re.search(r"device\.scale=(\S+)", next(lines))[1]
         with socket.create_connection(("127.0.0.1", int(port.rpartition(":")[2])), timeout=PATIENCE) as skin:
             pieces = iter(lambda: skin.recv(65536), b"")
             data = b"".join(pieces)
-        process.communicate(timeout=PATIENCE)
+        process.wait()
     return data, scale
 
 
@@ -45,14 +42,14 @@ def answers(folder, said):
 
 
 @pytest.mark.slow
-def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, played, tmp_path):
+def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played, tmp_path):
     def tell(script, *overrides):
         done = run(tmp_path, script, *overrides)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     tell("train.py", "experiment=rules", *SKIN, *SMALL)
-    data, scale = stream(tmp_path)
+    data, scale = stream(begin, tmp_path)
     assert data.count(b"# gesture") == COUNT
     port = played(lambda reader, stop: reader.sendall(data))
     there = [f"device.port={port}", f"device.scale={scale}", f"device.gestures={COUNT}"]

@@ -1,8 +1,6 @@
 """The commands of a skin at a port, end to end: emulate, record, play back, evaluate."""
 
 import signal
-import subprocess
-import sys
 import time
 from contextlib import contextmanager
 
@@ -10,7 +8,6 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.config import ROOT
 from skin.session.log import read as read_session
 from skin.storage import read
 
@@ -18,40 +15,37 @@ SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 PATIENCE = 300  # s: machines are busy at times
 
 
-@contextmanager
-def emulated(*overrides):
-    """Run the emulator; give what device.port takes and the process."""
-    with subprocess.Popen(
-        [sys.executable, ROOT / "experiments" / "emulate.py", *SMALL, *overrides],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process.stdout.readline().strip(), process
-        finally:
-            process.kill()
+@pytest.fixture
+def emulated(begin, tmp_path):
+    """Return a function that runs the emulator and gives device.port, its lines and the process."""
+
+    @contextmanager
+    def emulated(*overrides):
+        with begin(tmp_path, "emulate.py", *SMALL, *overrides) as process:
+            lines = process.lines()
+            yield next(lines), lines, process
+
+    return emulated
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_the_emulator_well(tmp_path):
+def test_ctrl_c_ends_the_emulator_well(emulated, tmp_path):
     link = tmp_path / "skin"
-    with emulated(f"link={link}") as (port, process):
+    with emulated(f"link={link}") as (port, lines, process):
         assert port == str(link)
-        assert "device.scale=0.0390625" in process.stdout.readline()
+        assert "device.scale=0.0390625" in next(lines)
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 0
+        assert process.wait() == 0
     assert not link.is_symlink()
 
 
 @pytest.mark.slow
-def test_a_session_that_was_killed_goes_on_and_is_played_back(run, tmp_path):
+def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulated, tmp_path):
     path = tmp_path / "s.csv"
-    with emulated("emulate.speed=5", "touch.window=30") as (port, _):
+    with emulated("emulate.speed=5", "touch.window=30") as (port, _, _):
         settings = ["device.labels=announced", "device.scale=0.0390625", f"device.port={port}"]
         command = ["record.py", *SMALL, f"out={path}", *settings]
-        with subprocess.Popen(
-            [sys.executable, ROOT / "experiments" / command[0], *command[1:]], stderr=subprocess.DEVNULL
-        ) as killed:
+        with begin(tmp_path, *command) as killed:
             deadline = time.monotonic() + PATIENCE
             while not path.exists() or '"event": "end"' not in path.read_text():
                 assert time.monotonic() < deadline

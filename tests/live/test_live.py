@@ -3,9 +3,7 @@
 import re
 import signal
 import socket
-import subprocess
-import sys
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Event, Thread
 from time import monotonic, sleep
@@ -37,14 +35,6 @@ note();
 """
 
 
-def started(folder, script, *overrides):
-    """Start a command; what it says goes to files."""
-    with (folder / f"{script}.out").open("w") as out, (folder / f"{script}.err").open("w") as err:
-        return subprocess.Popen(
-            [sys.executable, ROOT / "experiments" / script, *overrides], cwd=folder, stdout=out, stderr=err
-        )
-
-
 def until(found, process, what):
     """Wait until a function gives something true, and return it."""
     deadline = monotonic() + PATIENCE
@@ -67,19 +57,18 @@ def store(run, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(store, browser, tmp_path):
+def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begin, store, browser, tmp_path):
     link = tmp_path / "skin"
     faults = ["faults.unplug=[10]", "faults.away=2"]
     pace = ["emulate.rate=50", "emulate.gap=1.5"]
-    emulator = started(tmp_path, "emulate.py", "simulator=naive", f"link={link}", *pace, *faults)
-    live = None
-    try:
-        told = lambda: re.search(r"device\.scale=(\S+)\n", (tmp_path / "emulate.py.out").read_text())  # noqa: E731
-        scale = until(told, emulator, "the port")[1]
+    with ExitStack() as both:
+        emulator = both.enter_context(
+            begin(tmp_path, "emulate.py", "simulator=naive", f"link={link}", *pace, *faults)
+        )
+        scale = until(lambda: re.search(r"device\.scale=(\S+)\n", emulator.out), emulator, "the port")[1]
         reader = ["device=serial", f"device.port={link}", f"device.scale={scale}", "device.backoff=[0.2,0.5]"]
-        live = started(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store)
-        said = tmp_path / "live.py.err"
-        page = until(lambda: re.search(r"page: (http\S+)", said.read_text()), live, "the page")[1]
+        live = both.enter_context(begin(tmp_path, "live.py", *reader, "web=true", "live.web_port=0", *store))
+        page = until(lambda: re.search(r"page: (http\S+)", live.err), live, "the page")[1]
         browser.open(page)
         browser.run(WATCH)
         log = lambda: browser.run("return log")  # noqa: E731
@@ -96,23 +85,16 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(stor
         assert browser.run("return pictures") > 20
         assert "1 reconnected" in browser.run("return document.getElementById('line').textContent")
         live.send_signal(signal.SIGINT)
-        assert live.wait(60) == 0, said.read_text()
-        lines = (tmp_path / "live.py.out").read_text()
-        assert "DANGEROUS: " in lines
-        assert "unplugged" in lines
-        assert "Traceback" not in said.read_text()
-        played = (tmp_path / "emulate.py.out").read_text()
-        assert re.search(r"gesture \d+: .*(?<!not )dangerous", played), played
-    finally:
-        for process in (live, emulator):
-            if process and process.poll() is None:
-                process.kill()
-                process.wait()
+        assert live.wait(60) == 0, live.err
+    assert "DANGEROUS: " in live.out
+    assert "unplugged" in live.out
+    assert "Traceback" not in live.err
+    assert re.search(r"gesture \d+: .*(?<!not )dangerous", emulator.out), emulator.out
 
 
 @pytest.mark.slow
 def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
-    live = run(tmp_path, "live.py", "seconds=5", *store, store=False)
+    live = run(tmp_path, "live.py", "seconds=5", *store, store=False, fresh=True)
     assert live.returncode == 0, live.stderr
     assert re.search(r"\d+ verdicts, 10\.0 Hz, frame to verdict", live.stderr)
     assert "filling the window" in live.stdout
@@ -133,7 +115,7 @@ def test_bad_input_is_one_sentence(run, tmp_path, override, needed):
 
 
 @pytest.mark.slow
-def test_a_skin_that_lost_its_power_is_found_again(store, tmp_path):
+def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
     peers, stop = [], Event()
 
     def serve():
@@ -155,21 +137,17 @@ def test_a_skin_that_lost_its_power_is_found_again(store, tmp_path):
         thread.start()
         port = f"device.port=socket://127.0.0.1:{server.getsockname()[1]}"
         reader = ["device=serial", port, "device.silence=1", "device.backoff=[0.2,0.5]", "device.tare=1"]
-        live = started(tmp_path, "live.py", *reader, *store)
         try:
-            said = tmp_path / "live.py.out"
-            until(lambda: "fallen silent" in said.read_text(), live, "silence")
-            after = lambda: said.read_text().rpartition("fallen silent")[2]  # noqa: E731
-            until(lambda: "no touch" in after(), live, "a verdict")
-            live.send_signal(signal.SIGINT)
-            assert live.wait(60) == 0
+            with begin(tmp_path, "live.py", *reader, *store) as live:
+                until(lambda: "fallen silent" in live.out, live, "silence")
+                after = lambda: live.out.rpartition("fallen silent")[2]  # noqa: E731
+                until(lambda: "no touch" in after(), live, "a verdict")
+                live.send_signal(signal.SIGINT)
+                assert live.wait(60) == 0
         finally:
-            live.kill()
-            live.wait()
             stop.set()
             thread.join(60)
             for peer in peers:
                 peer.close()
-    said = (tmp_path / "live.py.err").read_text()
-    assert "Traceback" not in said
-    assert "1 reconnected" in said
+    assert "Traceback" not in live.err
+    assert "1 reconnected" in live.err

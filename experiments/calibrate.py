@@ -24,14 +24,14 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
 
     from skin.build import build_device
-    from skin.calibration import gauge, session
-    from skin.calibration.bench import bench
-    from skin.calibration.fit import fit
-    from skin.calibration.outcome import judge
-    from skin.calibration.protocol import demo
-    from skin.calibration.show import about, show
-    from skin.calibration.values import write
     from skin.device.simulated import Simulated
+    from skin.hardware.calibration import bench_session, gauge
+    from skin.hardware.calibration.bench import bench
+    from skin.hardware.calibration.fit import fit
+    from skin.hardware.calibration.outcome import judge
+    from skin.hardware.calibration.protocol import demo
+    from skin.hardware.calibration.show import about, show
+    from skin.signal.calibration import write
 
     settings = plain(config)["calibrate"]
     device = build_device(config)
@@ -40,7 +40,7 @@ def main(config: DictConfig) -> None:
     if settings["demo"]:
         print(demo(device, settings, config.session))
     shape = settings["indenter"], settings["radius"]
-    said = session.read(config.session, *shape, settings["unit"])
+    said = bench_session.read(config.session, *shape, settings["unit"])
     rows = None if config.presses is None else gauge.read(config.presses, *shape, settings["delay"])
     with Console(stderr=True).status("fitting"):
         found = bench(device, said, rows)

@@ -21,9 +21,9 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.device.simulated import Simulated
-    from skin.emulator.emulator import Emulator, Settings
-    from skin.emulator.faults import Faults
-    from skin.emulator.outlet import outlet
+    from skin.hardware.emulator.emulator import Emulator, Settings
+    from skin.hardware.emulator.faults import Faults
+    from skin.hardware.emulator.outlet import outlet
 
     groups = plain(config)
     settings, faults = Settings.of(groups["emulate"]), Faults.of(groups["faults"])

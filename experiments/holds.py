@@ -32,9 +32,9 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.device.simulated import Simulated
     from skin.files import whole
-    from skin.live import start
-    from skin.live.holds import FIELDS, courses
-    from skin.live.verdict import Patience
+    from skin.hardware.live import start
+    from skin.hardware.live.holds import FIELDS, courses
+    from skin.hardware.live.verdict import Patience
     from skin.reload import changed, configuration, find
     from skin.tracking import Store
 

@@ -16,9 +16,9 @@ def main(config: DictConfig) -> None:
     if device["port"] is None:
         raise InputError("which port? add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER")
 
-    from skin.port.errors import SkinDisconnected, SkinTimeout
-    from skin.port.listening import Listener
-    from skin.port.opening import open_skin
+    from skin.wire.diagnosis import Listener
+    from skin.wire.errors import SkinDisconnected, SkinTimeout
+    from skin.wire.open import open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sensors = None if config.n is None else range(config.n)

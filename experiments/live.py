@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 from skin.config import DictConfig, command, overrides, plain
 
 if TYPE_CHECKING:
-    from skin.live.verdict import Patience
+    from skin.hardware.live.verdict import Patience
 
 
 @command("live")
 def main(config: DictConfig) -> None:
     """Bring a finished run back, open what is watched, and show verdicts until somebody ends it."""
-    from skin.live.verdict import Patience
+    from skin.hardware.live.verdict import Patience
 
     live = plain(config)["live"]
     patience = Patience(**live["patience"])
@@ -33,9 +33,9 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
 
     from skin.build import build_device
     from skin.console import quiet
-    from skin.live import start, terminal, web
-    from skin.live.board import Board, Facts
-    from skin.live.session import Session
+    from skin.hardware.live import start, terminal, web
+    from skin.hardware.live.board import Board, Facts
+    from skin.hardware.live.loop import Session
     from skin.reload import changed, configuration, find
     from skin.tracking import Store, ends_on_signal
 

@@ -23,7 +23,7 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.device.serial import Serial
-    from skin.session.recorder import finish, record
+    from skin.hardware.record.recorder import finish, record
 
     device = build_device(config)
     if not isinstance(device, Serial):

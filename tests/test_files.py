@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from skin.calibration import values
-from skin.calibration.session import Session
-from skin.calibration.session import write as write_session
 from skin.config import Tracking
 from skin.errors import InputError
 from skin.files import write
+from skin.hardware.calibration.bench_session import Session
+from skin.hardware.calibration.bench_session import write as write_session
 from skin.labels import TOUCH
 from skin.recording import Recording
 from skin.refusal import refusal
 from skin.results import animation, figures, verdicts
 from skin.results.scene import simulated
+from skin.signal import calibration
 from skin.simulator import _elastic, _store
 from skin.storage import write as write_recording
 from skin.tracking import Store
@@ -52,7 +52,7 @@ WRITERS = {
     "session.parquet": sessions,
     "page.md": lambda path, device: write(200 * "a", path),
     "figure.png": lambda path, device: figures.save(figures.traces({"a": torch.ones(9, 3)}, 10.0), path),
-    "gains.yaml": lambda path, device: values.write(values.Calibration({"gain": 99 * [1.0]}), path),
+    "gains.yaml": lambda path, device: calibration.write(calibration.Calibration({"gain": 99 * [1.0]}), path),
     "verdicts.csv": lambda path, device: verdicts.verdicts(torch.ones(9, 4), TOUCH, None, path),
 }
 

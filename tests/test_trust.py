@@ -57,7 +57,7 @@ def test_parts_of_libraries_may_be_built(name):
         "skin.learner.network.torch.optim.Adam",
         "skin.learner.base.AbstractLearner",
         "skin.learner.rules.Rules.load",
-        "skin.emulator.outlet.AbstractOutlet",
+        "skin.hardware.emulator.outlet.AbstractOutlet",
         "skinny.Learner",
         None,
         ["skin.learner.rules.Rules"],

@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.pieces import FORMATS, Spoken, binary, damaged, line, senseless
-from skin.port.decoder import Decoder
-from skin.port.frame import Frame
+from skin.signal.frame import Frame
+from skin.wire.decoder import Decoder
 
 __all__ = ["fuzz"]
 

@@ -19,10 +19,10 @@ import torch
 from benchmarks.setting import configuration
 from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
+from skin.hardware.live.engine import Detection, Engine
 from skin.learner.network import Network
-from skin.live.engine import Detection, Engine
-from skin.port.frame import Frame
-from skin.session.newtons import Newtons
+from skin.signal.frame import Frame
+from skin.wire.conversion import Newtons
 
 __all__ = ["measure"]
 
@@ -70,8 +70,8 @@ def _untrained(row: str) -> tuple[Simulated, Engine]:
 
 
 def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
-    from skin.live import start
-    from skin.live.verdict import Patience
+    from skin.hardware.live import start
+    from skin.hardware.live.verdict import Patience
     from skin.reload import changed, find
     from skin.reload import configuration as stored
     from skin.tracking import Store

@@ -16,12 +16,12 @@ from typing import get_args
 import numpy as np
 import psutil
 
-from skin.port.decoder import Decoder
-from skin.port.errors import SkinTimeout
-from skin.port.frame import Check, Frame
-from skin.port.live import Skin, Stats
-from skin.port.opening import open_skin
-from skin.port.text import encode_line
+from skin.signal.frame import Check, Frame
+from skin.wire.decoder import Decoder
+from skin.wire.errors import SkinTimeout
+from skin.wire.open import open_skin
+from skin.wire.skin import Skin, Stats
+from skin.wire.text import encode_line
 
 __all__ = ["decode_core_share", "soak"]
 

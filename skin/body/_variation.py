@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from skin.errors import InputError
-from skin.streams import Stream, generator
+from skin.rng import Stream, generator
 
 __all__ = ["along", "check_variation", "factors"]
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from skin.errors import InputError
 from skin.recording import Touches
+from skin.rng import Stream, generator
 from skin.simulator.base import AbstractSimulator
-from skin.streams import Stream, generator
 from skin.touch.sampler import Movie, TouchSampler
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from skin.errors import InputError
 from skin.labels import TOUCH
 from skin.layout.base import Sensors
 from skin.recording import Recording, Touches
+from skin.rng import Stream, generator
 from skin.simulator._relaxation import Relaxing, relaxes
 from skin.simulator.base import AbstractSimulator
-from skin.streams import Stream, generator
 from skin.touch.sampler import Movie
 
 if TYPE_CHECKING:

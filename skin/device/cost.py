@@ -16,7 +16,7 @@ from skin.labels import Task
 from skin.layout._grid import grid
 from skin.layout.base import AbstractLayout, Sensors
 from skin.recording import Touches
-from skin.streams import Stream, generator
+from skin.rng import Stream, generator
 
 __all__ = ["GESTURES", "VARIANTS", "Cost"]
 

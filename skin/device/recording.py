@@ -10,8 +10,8 @@ from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
+from skin.rng import Stream, generator
 from skin.storage import read
-from skin.streams import Stream, generator
 
 __all__ = ["Recorded"]
 

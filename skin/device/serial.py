@@ -10,25 +10,25 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.calibration.values import read
 from skin.device._blank import Blank
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
-from skin.port.detect import Format
-from skin.port.errors import SkinDisconnected, SkinTimeout
-from skin.port.frame import Frame
-from skin.port.live import Skin
-from skin.port.opening import open_skin
-from skin.port.text import Header
-from skin.port.wire import open_wire
 from skin.recording import Recording, Touches
-from skin.session.newtons import Newtons, newtons
-from skin.session.takes import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
-from skin.session.tap import Tap
-from skin.session.taring import Tare, settle
+from skin.signal.calibration import read
+from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
+from skin.signal.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
+from skin.wire.conversion import Newtons, newtons
+from skin.wire.detect import Format
+from skin.wire.errors import SkinDisconnected, SkinTimeout
+from skin.wire.listener import Tap
+from skin.wire.open import open_skin
+from skin.wire.skin import Skin
+from skin.wire.tare import Tare, settle
+from skin.wire.text import Header
+from skin.wire.transport import open_wire
 
 __all__ = ["Serial"]
 
@@ -45,7 +45,7 @@ class Serial(AbstractDevice):
     Args:
         body: the sheet of the model.
         layout: where its sensors are; the device must send as many values.
-        port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.port.opening.open_skin`.
+        port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: how many.
         seed: of the order of prompts.

@@ -19,9 +19,9 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout, Sensors
 from skin.recording import Recording, Touches, join
+from skin.rng import Stream, generator
 from skin.signal.imperfection import Imperfection
 from skin.simulator.base import AbstractSimulator
-from skin.streams import Stream, generator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import TouchSampler, balanced

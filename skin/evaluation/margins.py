@@ -15,7 +15,7 @@ from skin.evaluation.alarm import Reached
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Answers
 from skin.labels import TOUCH, Measures, Thresholds
-from skin.signal.measurements import above_idle
+from skin.signal.features import above_idle
 
 __all__ = ["ALARM", "Faint", "Margins", "Span", "margins", "spans"]
 

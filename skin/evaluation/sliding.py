@@ -18,7 +18,7 @@ from skin.evaluation.metrics import metrics
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Answers
 from skin.labels import TOUCH_OR_NOT, Task
-from skin.signal.gate import Gate, Threshold, gates, rise
+from skin.signal.contact_threshold import Gate, Threshold, gates, rise
 
 __all__ = ["Bin", "Sliding", "bins", "slide"]
 

@@ -15,8 +15,8 @@ from skin.foreign import arrays
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
-from skin.signal.bearing import bearings
-from skin.signal.measurements import measurements
+from skin.signal.features import measurements
+from skin.signal.sliding_direction import bearings
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -31,7 +31,8 @@ class Features(AbstractLearner):
 
     What a practitioner would try first; a network that does not beat it is not worth its cost. The
     measurements know no sensor by number, so it takes any layout. Where the task has a direction, signed
-    measurements (:mod:`skin.signal.bearing`) join them, and trees of least squares learn its cosines.
+    measurements (:mod:`skin.signal.sliding_direction`) join them, and trees of least squares learn its
+    cosines.
 
     Args:
         rounds: most trees per label; fewer if the validation loss stops falling.

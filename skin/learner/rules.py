@@ -15,7 +15,7 @@ from skin.errors import InputError
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
-from skin.signal.measurements import measurements
+from skin.signal.features import measurements
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger

@@ -20,7 +20,7 @@ from skin.files import whole
 from skin.files import write as write_text
 from skin.labels import Task
 from skin.recording import Recording, Touches
-from skin.signal.measurements import measurements
+from skin.signal.features import measurements
 from skin.storage import write
 
 __all__ = ["Foreign", "digest", "export"]

@@ -8,7 +8,7 @@ from torch import Tensor
 from skin.recording import Touches
 from skin.representation._channels import channels
 from skin.representation.base import AbstractRepresentation, Frames
-from skin.signal.measurements import measurements
+from skin.signal.features import measurements
 
 __all__ = ["Measured"]
 

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from skin.calibration import gauge, session
-from skin.calibration.bench import Bench, bench
 from skin.device.simulated import Simulated
 from skin.errors import InputError
+from skin.hardware.calibration import bench_session, gauge
+from skin.hardware.calibration.bench import Bench, bench
 from skin.recording import Touches
 from skin.results.figures import COLOURS, save
+from skin.rng import Stream, generator
 from skin.signal.resampling import resample
-from skin.streams import Stream, generator
 
 __all__ = ["Comparison", "Press", "Verdicts", "agreement", "compare", "figure", "page", "read", "touches"]
 
@@ -106,7 +106,7 @@ def read(device: Simulated, path: str, presses: str | None, settings: Mapping[st
         InputError: files that cannot be used, or that do not fit each other.
     """
     shape = settings["indenter"], settings["radius"]
-    said = session.read(path, *shape, settings["unit"])
+    said = bench_session.read(path, *shape, settings["unit"])
     rows = None if presses is None else gauge.read(presses, *shape, settings["delay"])
     found = compare(device, bench(device, said, rows), settings["scale"])
     if not found.presses:

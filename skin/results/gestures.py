@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from skin.device.simulated import Simulated
-from skin.emulator.gestures import Gesture, alike, gestures
 from skin.errors import InputError
+from skin.hardware.emulator.gestures import Gesture, alike, gestures
+from skin.hardware.record import log
 from skin.labels import TOUCH
 from skin.recording import Touches
-from skin.session import log
-from skin.session.takes import sentence
-from skin.streams import Stream, generator
+from skin.rng import Stream, generator
+from skin.signal.segmentation import sentence
 
 __all__ = ["Gestures", "Pair", "marked", "read", "touches"]
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.calibration.values import Calibration, read
 from skin.errors import InputError
+from skin.signal.calibration import Calibration, read
 from skin.signal.lag import lagged, rounded, unloading
 
 __all__ = ["Constants", "Imperfection"]

@@ -7,7 +7,7 @@ import numpy as np
 from skin.errors import InputError
 
 if TYPE_CHECKING:
-    from skin.port.frame import Frame
+    from skin.signal.frame import Frame
 
 __all__ = ["Resampled", "Window", "check_rate", "resample"]
 

@@ -9,18 +9,18 @@ import torch
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.body.sheet import Sheet
-from skin.calibration.values import Calibration
 from skin.device.serial import Serial
 from skin.device.simulated import Simulated
-from skin.emulator.emulator import Emulator, Settings
-from skin.emulator.faults import Faults
-from skin.emulator.gestures import gestures
-from skin.emulator.outlet import outlet
 from skin.errors import InputError
+from skin.hardware.emulator.emulator import Emulator, Settings
+from skin.hardware.emulator.faults import Faults
+from skin.hardware.emulator.gestures import gestures
+from skin.hardware.emulator.outlet import outlet
 from skin.layout.grid import Grid
-from skin.port.text import Header
-from skin.session.newtons import newtons
+from skin.signal.calibration import Calibration
 from skin.simulator.naive import Naive
+from skin.wire.conversion import newtons
+from skin.wire.text import Header
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)

@@ -11,9 +11,9 @@ from skin.errors import InputError
 from skin.labels import movie_labels
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
+from skin.rng import Stream, generator
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
-from skin.streams import Stream, generator
 from skin.touch.sampler import balanced
 
 LAYERS = [

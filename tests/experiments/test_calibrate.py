@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.calibration.values import read
+from skin.signal.calibration import read
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
 

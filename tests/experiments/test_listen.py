@@ -9,7 +9,7 @@ import tty
 import pytest
 
 from skin.config import ROOT
-from skin.port.text import Header, encode_header, encode_line
+from skin.wire.text import Header, encode_header, encode_line
 
 LISTEN = str(ROOT / "experiments" / "listen.py")
 

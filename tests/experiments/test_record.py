@@ -13,10 +13,10 @@ import pytest
 
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
-from skin.port.text import Header, encode_header, encode_line
-from skin.session.lines import locked
-from skin.session.log import read as read_session
+from skin.hardware.record.lines import locked
+from skin.hardware.record.log import read as read_session
 from skin.storage import read
+from skin.wire.text import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
 FREE = [*SKIN, "record.free=true", "device.tare=1", "device.backoff=[0.05,0.1]"]

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.session.log import read as read_session
+from skin.hardware.record.log import read as read_session
 from skin.storage import read
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.representation.measured import Measured
-from skin.signal.measurements import measurements
+from skin.signal.features import measurements
 
 TIME, SENSORS = 30, 5
 

@@ -8,18 +8,18 @@ import pytest
 
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
-from skin.emulator.gestures import gestures, in_time
 from skin.errors import InputError
+from skin.hardware.emulator.gestures import gestures, in_time
+from skin.hardware.record.log import Log
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
-from skin.port.frame import Frame
 from skin.results import gestures as compared
 from skin.results.compare import Verdicts
 from skin.results.gestures_page import figure, page
-from skin.session.log import Log
-from skin.session.newtons import Newtons
-from skin.session.takes import Take
+from skin.signal.frame import Frame
+from skin.signal.segmentation import Take
 from skin.simulator.naive import Naive
+from skin.wire.conversion import Newtons
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.calibration.values import Calibration
 from skin.errors import InputError
+from skin.signal.calibration import Calibration
 from skin.signal.imperfection import Imperfection
 
 NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}

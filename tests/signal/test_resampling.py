@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.port.frame import Frame
+from skin.signal.frame import Frame
 from skin.signal.resampling import Window, check_rate
 
 SENSORS = 5

@@ -1,0 +1,108 @@
+"""Tables of a bench: CSV or Parquet with a header, whatever wrote them."""
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from skin.body._memory import require_memory
+from skin.errors import InputError
+from skin.files import whole, write
+
+__all__ = ["load", "numbers", "save"]
+
+_KEY = b"skin_session"
+_RECORDED = b"time,seq,raw_"  # of experiments/record.py: all its columns are numbers
+_NUMBERS = b"0123456789+-.e,"
+_log = logging.getLogger("skin.hardware.record")
+
+
+def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
+    """Return a table and what is known about it: JSON in a Parquet schema, or in ``x.csv.json`` beside it.
+
+    Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of experiments/record.py are
+    skipped, with a warning.
+
+    Raises:
+        InputError: no such file, another ending, unreadable, or no rows.
+    """
+    path = Path(path).expanduser()
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError(f"{what} is a .csv or .parquet file, got {path.name}")
+    if not path.is_file():
+        raise InputError(f"no {what} {path}")
+    try:
+        if path.suffix == ".parquet":
+            with pa.parquet.ParquetFile(path) as file:
+                size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
+                require_memory(size, f"the {what} {path}", "give fewer rows")
+                table = file.read()
+            about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
+        else:
+            table = pa.csv.read_csv(pa.py_buffer(_rows(path)))
+            sidecar = path.with_name(path.name + ".json")
+            about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, RecursionError) as error:
+        raise InputError(f"cannot read the {what} {path}: {' '.join(str(error).split())}") from error
+    if not isinstance(about, dict):
+        raise InputError(f"the {what} {path} says {about!r} of itself, needed is an object, as in {{}}")
+    if not len(table):
+        raise InputError(f"the {what} {path} has no rows below its header")
+    return table.rename_columns([name.strip() for name in table.column_names]), about
+
+
+def _rows(path: Path) -> bytes:
+    """Return a CSV without comments, and without damaged lines where it is known what lines look like."""
+    lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
+    rows = [(number, line) for number, line in enumerate(lines, 1) if not line.startswith(b"#")]
+    header = rows[0][1] if rows else b""
+    if header.startswith(_RECORDED):
+        columns = header.count(b",")
+        good = [
+            row for row in rows[1:] if not row[1].translate(None, _NUMBERS) and row[1].count(b",") == columns
+        ]
+        if damaged := [number for number, _ in sorted(set(rows[1:]) - set(good))]:
+            _log.warning("%s: %d damaged lines skipped, the first is line %d", path, len(damaged), damaged[0])
+        rows = [rows[0], *good]
+    return b"".join(line + b"\n" for _, line in rows)
+
+
+def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
+    """Write what :func:`load` reads, under a temporary name first.
+
+    Raises:
+        InputError: another ending, or the file cannot be written.
+    """
+    path, table = Path(path).expanduser(), pa.table(dict(columns))
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError(f"a session is a .csv or .parquet file, got {path.name}: as in session=bench.csv")
+    with whole(path) as partial:
+        if path.suffix == ".parquet":
+            pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
+        else:
+            pa.csv.write_csv(table, partial)
+            write(json.dumps(dict(about)) + "\n", path.with_name(path.name + ".json"))
+    return path
+
+
+def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
+    """Return a column as float64; empty cells are NaN.
+
+    Raises:
+        InputError: the column is missing or holds something else than numbers.
+    """
+    if name not in table.column_names:
+        raise InputError(f"{where}: no column {name}, found {', '.join(table.column_names)}")
+    try:
+        # A copy, because Arrow's memory cannot be written to and torch warns of that.
+        return np.array(table[name].cast(pa.float64()).to_numpy())
+    except pa.ArrowException as error:
+        raise InputError(f"{where}: column {name} must hold numbers: {error}") from error

@@ -1,0 +1,119 @@
+"""A bench session: raw readings at the device's own rate, with the gauge's rows in it or beside it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.hardware.calibration import gauge as gauges
+from skin.hardware.calibration._columns import load, numbers, save
+from skin.hardware.calibration.gauge import GAUGE, Gauge
+
+__all__ = ["Session", "read", "write"]
+
+_UNITS = ("N", "adc")
+_OTHER = ("time", "t_us", "seq", *GAUGE)
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a skin said, and what pressed it meanwhile.
+
+    Attributes:
+        time: (T,), s.
+        raw: (T, S), in ``unit``; NaN where a frame was lost.
+        unit: ``N``, or ``adc`` for counts of a converter.
+        gauge: rows that were in the same file; None where they are elsewhere.
+        bits: of the converter; None where nobody knows.
+
+    Raises:
+        InputError: another unit, or times that do not grow.
+    """
+
+    time: np.ndarray
+    raw: np.ndarray
+    unit: str
+    gauge: Gauge | None = None
+    bits: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.unit not in _UNITS:
+            raise InputError(f"the session's unit must be {' or '.join(_UNITS)}, got {self.unit}")
+        if len(self.time) < 2:
+            raise InputError(f"a session needs at least two frames, this one has {len(self.time)}")
+        if (self.time == self.time[0]).all():
+            raise InputError(
+                f"the device's clock stood still: all {len(self.time)} frames of the session have the time "
+                f"{self.time[0]:g} s; let it send micros() and record again"
+            )
+        if (back := np.flatnonzero(~(np.diff(self.time) > 0))).size:
+            before, after = self.time[back[0] : back[0] + 2]
+            raise InputError(
+                f"the session's time must grow from frame to frame: after frame {back[0]} it goes from "
+                f"{before:.9g} to {after:.9g} s"
+            )
+        if self.bits is not None and not (isinstance(self.bits, int) and 1 <= self.bits <= 64):
+            raise InputError(f"the session's bits must be a whole number from 1 to 64, got {self.bits}")
+
+
+def read(path: str | Path, indenter: str, radius: float, unit: str | None = None) -> Session:
+    """Read a session.
+
+    It has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, whatever
+    their names; ``seq`` is ignored. Columns of a gauge may stand beside them, empty outside the presses. Unit
+    and bits may stand in the Parquet schema or in ``x.csv.json``: ``{"unit": "adc", "bits": 10}``.
+
+    Args:
+        path: .csv or .parquet.
+        indenter: of gauge rows that name none.
+        radius: m, of gauge rows that have none.
+        unit: ``N`` or ``adc`` where the file does not say; None: as the file says, else N.
+
+    Raises:
+        InputError: a file that cannot be used.
+    """
+    table, about = load(path, "session")
+    names = [name for name in table.column_names if name not in _OTHER]
+    if not names:
+        raise InputError(f"{path}: no column of a sensor beside {', '.join(table.column_names)}")
+    in_microseconds = "time" not in table.column_names and "t_us" in table.column_names
+    time = numbers(table, "t_us" if in_microseconds else "time", str(path))
+    time = 1e-6 * time if in_microseconds else time
+    raw = np.stack([numbers(table, name, str(path)) for name in names], axis=1)
+    inside = "force" in table.column_names
+    if inside and in_microseconds:
+        table = table.append_column("time", [time])
+    rows = gauges.of_table(table, str(path), indenter, radius) if inside else None
+    try:
+        return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write(session: Session, path: str | Path) -> Path:
+    """Write a session with its gauge, whole; single precision is enough for what a converter says.
+
+    Raises:
+        InputError: another ending than .csv or .parquet, or the file cannot be written.
+    """
+    digits = max(2, len(str(session.raw.shape[1] - 1)))
+    columns = {"time": session.time}
+    counts = session.unit == "adc" and np.isfinite(session.raw).all()
+    for number, values in enumerate(session.raw.T):
+        columns[f"raw_{number:0{digits}d}"] = values.astype(np.int32 if counts else np.float32)
+    about = {"unit": session.unit, "bits": session.bits}
+    return save(columns | _gauge_columns(session), about, path)
+
+
+def _gauge_columns(session: Session) -> dict[str, np.ndarray]:
+    """Return the gauge's columns at the session's times, masked outside of presses."""
+    if session.gauge is None:
+        return {}
+    gauge = session.gauge
+    force, press = gauge.at(session.time)
+    row = gauge.first[np.maximum(press, 0)]
+    columns = {"force": force, "x_m": gauge.place[row, 0], "y_m": gauge.place[row, 1]}
+    columns |= {"indenter": gauge.indenter[row], "radius_m": gauge.radius[row], "angle": gauge.angle[row]}
+    columns |= {"press": press}
+    return {name: np.ma.masked_array(values, press < 0) for name, values in columns.items()}

@@ -1,0 +1,130 @@
+"""The press protocol of a bench, and what an emulated device says to it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.hardware.calibration.bench_session import Session, write
+from skin.hardware.calibration.gauge import Gauge, per_newton
+
+__all__ = ["Protocol", "demo", "emulate", "true_readings"]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Idle, then staircases, one place after the other: up, down, up to the peak, and a sudden release.
+
+    The steps up tell gains, those down hysteresis, the release the lag, the rests offset, noise and drift.
+
+    Attributes:
+        peak: largest force of every press, N.
+        steps: shares of the peak on the way up; the way down takes them backwards.
+        hold: at every step, s.
+        ramp: from one step to the next, s; the release takes none.
+        idle: before the first press, s.
+        rest: after every press, s.
+        indenter: name as in ``touch.shapes``.
+        radius: half its larger extent, m.
+        rate: of gauge and session, Hz.
+
+    Raises:
+        InputError: a number that is not above 0.
+    """
+
+    peak: float = 120.0
+    steps: Sequence[float] = (0.1, 0.2, 0.4, 0.7, 1.0)
+    hold: float = 0.3
+    ramp: float = 0.05
+    idle: float = 3.0
+    rest: float = 2.0
+    indenter: str = "blurred_disc"
+    radius: float = 0.01
+    rate: float = 100.0
+
+    def __post_init__(self) -> None:
+        for name in ("peak", "hold", "ramp", "idle", "rest", "radius", "rate"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"calibrate.protocol.{name} must be above 0, got {getattr(self, name)}")
+
+    def gauge(self, places: np.ndarray) -> Gauge:
+        """Return a gauge's rows for presses at places (P, 2), m."""
+        levels = [0.0, *self.steps, *list(self.steps)[-2::-1], self.steps[-1]]
+        corners = np.cumsum([0.0, *[self.ramp, self.hold] * (len(levels) - 1)])
+        heights = self.peak * np.repeat(levels, 2)[1:]
+        inside = np.arange(0, corners[-1], 1 / self.rate)
+        one = np.concatenate([np.interp(inside, corners, heights), np.zeros(max(2, round(0.2 * self.rate)))])
+        pause, start = round(self.rest * self.rate), round(self.idle * self.rate)
+        starts = start + np.arange(len(places)) * (len(one) + pause)
+        frame = (starts[:, None] + np.arange(len(one))).ravel()
+        rows = len(frame)
+        return Gauge(
+            frame / self.rate,
+            np.tile(one, len(places)),
+            np.repeat(places, len(one), axis=0),
+            np.full(rows, self.radius),
+            np.zeros(rows),
+            np.full(rows, self.indenter),
+            np.repeat(np.arange(len(places)), len(one)),
+        )
+
+    def places(self, device: Simulated, generator: np.random.Generator) -> np.ndarray:
+        """Return two places per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
+        home = device.sensors.positions[:, :2]
+        beside = home + generator.uniform(-0.003, 0.003, home.shape)
+        return np.clip(np.concatenate([home, beside]), 0, device.size)
+
+
+def emulate(
+    device: Simulated,
+    gauge: Gauge,
+    protocol: Protocol,
+    generator: np.random.Generator,
+    bits: int | None = None,
+) -> Session:
+    """Return what a simulated device says while a gauge presses it, in N, or, given bits, in counts.
+
+    Counts are of a converter whose middle is at 0 N and whose ends are at twice the device's clip.
+    """
+    frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
+    time = np.arange(frames) / protocol.rate
+    true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
+    said = device.imperfection.raw(
+        torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
+    )[0].numpy()
+    if bits is None:
+        return Session(time, said.astype(float), "N", gauge)
+    middle = 2 ** (bits - 1)
+    counts = np.clip(np.round(middle + said * middle / (2 * device.clip)), 0, 2**bits - 1)
+    return Session(time, counts, "adc", gauge, bits)
+
+
+def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return true readings (T, S), N, of presses that give ``each`` (P, S) per N; 0 outside of them."""
+    force, press = gauge.at(time)
+    return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
+
+
+def demo(device: Simulated, settings: Mapping[str, Any], path: str) -> str:
+    """Write what an emulated device says to the protocol, and return a line about it.
+
+    Args:
+        device: whose constants are to be found.
+        settings: ``conf/calibrate.yaml`` under ``calibrate``.
+        path: .csv or .parquet.
+
+    Raises:
+        InputError: a protocol that cannot be used.
+    """
+    try:
+        protocol = Protocol(**settings["protocol"])
+    except TypeError as error:
+        raise InputError(f"calibrate.protocol: {error}") from error
+    randomness = np.random.default_rng(device.seed)
+    rows = protocol.gauge(protocol.places(device, randomness))
+    session = emulate(device, rows, protocol, randomness, settings["bits"])
+    return f"{write(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"

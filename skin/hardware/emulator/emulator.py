@@ -1,0 +1,246 @@
+"""The emulated skin: plays gestures into an outlet in real time."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from itertools import islice
+from threading import Event
+from time import monotonic
+from typing import Any, get_args
+
+import numpy as np
+import torch
+
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.hardware.emulator.faults import BANNER, KINDS, Faults
+from skin.hardware.emulator.gestures import Converter, Gesture, gestures, in_time
+from skin.hardware.emulator.outlet import AbstractOutlet
+from skin.rng import Stream, generator
+from skin.signal.frame import Check
+from skin.signal.segmentation import sentence
+from skin.wire.announcement import Announcement, encode
+from skin.wire.binary import encode_comment, encode_frame
+from skin.wire.text import Header, encode_header, encode_line
+
+__all__ = ["Emulator", "Settings"]
+
+_HEADER = 1.0  # s from one header to the next
+_LOOK = 0.05  # s between two looks whether somebody came
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How an emulated skin plays.
+
+    Attributes:
+        rate: of the device, Hz.
+        speed: of its clock against the wall's; another than 1 is for tests.
+        bits: of its converter; None: it sends N.
+        check: what protects a line: ``crc16``, ``xor`` or ``none``.
+        idle: before the first gesture, s.
+        gap: between two windows, s.
+        announce: tell every gesture before it is played, in the text format.
+        seed: of the gestures and of the faults; the device's own noise follows ``device.seed``.
+        id: its name.
+
+    Raises:
+        InputError: a setting that cannot be used.
+    """
+
+    rate: float = 100.0
+    speed: float = 1.0
+    bits: int | None = 10
+    check: Check = "crc16"
+    idle: float = 3.0
+    gap: float = 0.5
+    announce: bool = True
+    seed: int = 0
+    id: str = "emulated"
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "speed"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"emulate.{name} must be above 0, got {getattr(self, name)}")
+        for name in ("idle", "gap", "seed"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"emulate.{name} must be at least 0, got {getattr(self, name)}")
+        if self.bits is not None and not 2 <= self.bits <= 16:
+            raise InputError(f"emulate.bits must be 2 to 16, or null for N, got {self.bits}")
+        if self.check not in get_args(Check):
+            raise InputError(f"emulate.check must be one of {', '.join(get_args(Check))}, got {self.check}")
+
+    @classmethod
+    def of(cls, given: dict[str, Any]) -> "Settings":
+        """Return the settings that a configuration means."""
+        if unknown := sorted(set(given) - {entry.name for entry in fields(cls)}):
+            known = ", ".join(entry.name for entry in fields(cls))
+            raise InputError(f"emulate has no {', '.join(unknown)}: it takes {known}")
+        return cls(**given)
+
+
+class Emulator:
+    """Plays a simulated device's gestures, with its imperfections and faults, as firmware would send them.
+
+    It waits for the first reader; from then on it sends whether somebody listens or not.
+
+    Args:
+        device: the skin; its rate is the model's.
+        outlet: where it is plugged in.
+        settings: how it plays.
+        faults: what goes wrong.
+        binary: COBS frames instead of lines; there are no announcements among them.
+        told: is given a sentence about what happens, with the device's time, s.
+
+    Attributes:
+        converter: from N to what is sent.
+        frames: sent so far.
+    """
+
+    def __init__(
+        self,
+        device: Simulated,
+        outlet: AbstractOutlet,
+        settings: Settings,
+        faults: Faults,
+        binary: bool = False,
+        told: Callable[[float, str], None] = lambda t, text: None,
+    ) -> None:
+        faults.fits(len(device.sensors))
+        self.device, self.outlet, self.settings, self.faults = device, outlet, settings, faults
+        self.converter = Converter(settings.bits, float(device.constants.clip.max()))
+        self._told = told
+        self.binary = binary
+        self.frames = 0
+        self._number = self._zero = 0
+        self._held: np.ndarray | None = None
+        self._silent_until = -1
+        self._over = Event()
+        self._noise = generator(Stream.NOISE, device.seed, Stream.TEST, 2, settings.seed)
+        self._chance = generator(Stream.TEST, 3, settings.seed)
+        self._listed = {kind: faults.moments(kind, settings.rate) for kind in KINDS}
+
+    def run(self, seconds: float | None = None, count: int | None = None) -> None:
+        """Play until ``count`` gestures or ``seconds`` of the device are over, or until :meth:`stop`."""
+        self.await_reader()
+        end = None if seconds is None else round(seconds * self.settings.rate)
+        self._start = monotonic()
+        self._begin()
+        for values, gesture in self._pieces(count):
+            if gesture is not None:
+                self._announce(gesture[0], gesture[1])
+            if self._play(values, end):
+                return
+
+    def stop(self) -> None:
+        """Let :meth:`run` return before its next frame, wherever it waits; from another thread."""
+        self._over.set()
+
+    def await_reader(self) -> None:
+        """Wait until somebody opens the port."""
+        while not self.outlet.connected() and not self._over.wait(_LOOK):
+            pass
+
+    def _pieces(self, count: int | None) -> Iterator[tuple[np.ndarray, tuple[int, Gesture] | None]]:
+        """Yield what the converter says at rest, then gesture by gesture, each with the gap behind it."""
+        settings, sensors = self.settings, len(self.device.sensors)
+        yield self._felt(np.zeros((round(settings.idle * settings.rate), sensors))), None
+        gap = np.zeros((round(settings.gap * settings.rate), sensors))
+        for number, gesture in enumerate(islice(gestures(self.device, settings.seed), count)):
+            true = in_time(gesture.force, self.device.rate, settings.rate)
+            yield self._felt(np.concatenate([true, gap])), (number, gesture)
+
+    def _felt(self, true: np.ndarray) -> np.ndarray:
+        """Return what is sent for true readings (F, S), N."""
+        if len(true) < 2:
+            return np.zeros((0, true.shape[1]))
+        time = torch.from_numpy((self._number + np.arange(len(true))) / self.settings.rate)
+        said = self.device.imperfection.raw(
+            torch.from_numpy(true)[None].float(), self.device.constants, self._noise, time
+        )
+        return self.converter(said[0].double().numpy())
+
+    def _play(self, values: np.ndarray, end: int | None) -> bool:
+        """Send frames when they are due; return whether it is over."""
+        rate = self.settings.rate
+        chances = {kind: self.faults.happen(kind, len(values), rate, self._chance) for kind in KINDS}
+        for place, row in enumerate(values):
+            if end is not None and self._number >= end:
+                return True
+            due = self._start + self._number / (rate * self.settings.speed)
+            if self._over.wait(max(0.0, due - monotonic())):
+                return True
+            for kind in KINDS:
+                if chances[kind][place] or self._number in self._listed[kind]:
+                    getattr(self, f"_{kind}")()
+            if self._number % max(1, round(_HEADER * rate)) == 0:
+                self._header()
+            self._frame(self._broken(row))
+            self._number += 1
+        return False
+
+    def _frame(self, row: np.ndarray) -> None:
+        seq = self._number - self._zero
+        t_us = round(seq * 1e6 / self.settings.rate) % 2**32
+        if self.binary:
+            # Counts are whole and N are not.
+            data = encode_frame(row, seq, t_us, "f32" if self.settings.bits is None else "u16")
+        else:
+            numbers = row.tolist() if self.settings.bits is None else row.astype(int).tolist()
+            data = encode_line(numbers, seq, t_us, self.settings.check)
+        self._send(data)
+        self.frames += 1
+
+    def _send(self, data: bytes) -> None:
+        if self._number >= self._silent_until:
+            self.outlet.write(self.faults.damaged(data, self._chance))
+
+    def _broken(self, row: np.ndarray) -> np.ndarray:
+        faults = self.faults
+        if self._number < faults.since * self.settings.rate or not (faults.stuck or faults.dead):
+            return row
+        self._held = row if self._held is None else self._held
+        row = row.copy()
+        row[list(faults.stuck)] = self._held[list(faults.stuck)]
+        row[list(faults.dead)] = 0.0
+        return row
+
+    def _begin(self) -> None:
+        """Start counting, as a board does that has just got its power."""
+        self._zero = self._number
+        if self.faults.banner:
+            self._send(BANNER)
+        self._header()
+
+    def _header(self) -> None:
+        settings, unit = self.settings, "N" if self.settings.bits is None else "adc"
+        header = Header(1, len(self.device.sensors), settings.rate, unit, settings.bits, settings.id)
+        if self.binary:
+            self._send(encode_comment(encode_header(header, "none").rstrip()))
+        else:
+            self._send(encode_header(header, settings.check))
+
+    def _announce(self, number: int, gesture: Gesture) -> None:
+        t, frames = self._number / self.settings.rate, len(gesture.force) * self.settings.rate
+        self._told(t, f"gesture {number}: {sentence(gesture.labels)}")
+        if self.settings.announce and not self.binary:
+            seq = self._number - self._zero
+            self._send(encode(Announcement(number, seq, round(frames / self.device.rate), gesture.labels)))
+
+    def _silence(self) -> None:
+        self._told(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")
+        self._silent_until = self._number + round(self.faults.silent * self.settings.rate)
+
+    def _reset(self) -> None:
+        self._told(self._number / self.settings.rate, "reset")
+        self._begin()
+
+    def _unplug(self) -> None:
+        """Vanish, with the power: the clock stands still and begins anew."""
+        self._told(self._number / self.settings.rate, f"unplugged for {self.faults.away:g} s")
+        self.outlet.unplug()
+        if self._over.wait(self.faults.away / self.settings.speed):
+            return
+        self.outlet.plug()
+        self._told(self._number / self.settings.rate, f"plugged in again: {self.outlet.address}")
+        self._start += self.faults.away / self.settings.speed
+        self._begin()

@@ -1,0 +1,117 @@
+"""Gestures as the converter of an emulated skin says them, one after another, without end."""
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+import torch
+
+from skin.device.simulated import Simulated
+from skin.rng import Stream, generator
+from skin.touch.sampler import balanced
+
+__all__ = ["Converter", "Gesture", "alike", "gestures", "in_time"]
+
+_BATCH = 16  # every combination of the labels once
+_EDGE = 0.25  # of a frame, in which force rises and falls
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """A gesture as it is felt.
+
+    Attributes:
+        labels: name -> 0 or 1.
+        force: true readings, (T, S), N, at the model's rate.
+        applied: what presses on the skin altogether, (T,), N.
+    """
+
+    labels: Mapping[str, int]
+    force: np.ndarray
+    applied: np.ndarray
+
+
+@dataclass(frozen=True)
+class Converter:
+    """Turns N into what is sent.
+
+    The middle of a converter is at 0 N and its ends are at twice the clip, as in
+    skin.hardware.calibration.protocol.
+
+    Attributes:
+        bits: of the converter; None: N are sent.
+        clip: of the device, N.
+    """
+
+    bits: int | None
+    clip: float
+
+    @property
+    def scale(self) -> float:
+        """N per count; 1 where N are sent."""
+        return 1.0 if self.bits is None else 2 * self.clip / 2 ** (self.bits - 1)
+
+    def __call__(self, newtons: np.ndarray) -> np.ndarray:
+        """Return what is sent, float64."""
+        if self.bits is None:
+            return np.asarray(newtons, dtype=np.float64)
+        middle = 2 ** (self.bits - 1)
+        return np.clip(np.round(middle + newtons / self.scale), 0, 2**self.bits - 1).astype(np.float64)
+
+
+def gestures(device: Simulated, seed: int = 0) -> Iterator[Gesture]:
+    """Yield gestures that no training can draw, in an order of ``seed`` alone, balanced in sixteens."""
+    with ThreadPoolExecutor(1, "skin-gestures") as ahead:
+        # Drawn while the ones before are played: a device does not pause.
+        coming = ahead.submit(_batch, device, seed, 0)
+        for number in count(1):
+            ready = coming.result()
+            coming = ahead.submit(_batch, device, seed, number)
+            yield from ready
+
+
+def alike(device: Simulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
+    """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``skin.labels.TOUCH``."""
+    return _drawn(device, labels, generator(Stream.TEST, 5, seed))
+
+
+def _batch(device: Simulated, seed: int, number: int) -> list[Gesture]:
+    draw = generator(Stream.TEST, 2, seed, number)
+    return _drawn(device, balanced(_BATCH, draw), draw)
+
+
+@torch.no_grad()
+def _drawn(device: Simulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
+    movie = device.sampler.sample(len(labels), draw, labels)
+    readings = movie.respond(device.model, displacement=False).readings.double().numpy()
+    names, found, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
+    return [
+        Gesture(dict(zip(names, row, strict=True)), one, applied)
+        for row, one, applied in zip(found, readings, force, strict=True)
+    ]
+
+
+def in_time(force: np.ndarray, model_rate: float, rate: float) -> np.ndarray:
+    """Return true readings (F, S), N, at a device's rate.
+
+    A frame of the model stands for what happened since the one before, so it is held for its interval, and
+    rises and falls within a quarter of it at the edges towards a smaller neighbour. Its maximum over the
+    interval is the frame itself: what is reduced again is what was drawn, and no touch grows longer.
+
+    Args:
+        force: (T, S), N.
+        model_rate: of ``force``, Hz.
+        rate: of the device, Hz.
+    """
+    frames = round(len(force) * rate / model_rate)
+    place = (np.arange(frames) + 0.5) * model_rate / rate
+    now = np.minimum(place.astype(int), len(force) - 1)
+    share = (place - now)[:, None]
+    padded = np.concatenate([np.zeros_like(force[:1]), force, np.zeros_like(force[:1])])
+    here = padded[now + 1]
+    before, after = np.minimum(padded[now], here), np.minimum(padded[now + 2], here)
+    rising = before + (here - before) * np.clip(share / _EDGE, 0, 1)
+    falling = after + (here - after) * np.clip((1 - share) / _EDGE, 0, 1)
+    return np.where(share < 0.5, rising, falling)

@@ -1,0 +1,204 @@
+"""From frames to verdicts, without any input or output."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skin.errors import InputError
+from skin.evaluation.report import Answers
+from skin.hardware.live.verdict import Debounce, Patience, Verdict
+from skin.labels import Task
+from skin.recording import Touches
+from skin.signal.contact_detection import DRIFT, Contact
+from skin.signal.frame import Frame
+from skin.signal.resampling import Resampled, Window
+from skin.wire.conversion import Newtons
+
+__all__ = ["Detection", "Engine"]
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What counts as a contact.
+
+    Attributes:
+        threshold: N above the tared baseline.
+        drift: N/s, how fast the baseline may follow the untouched skin.
+        learned: the model's own answer that something touches counts too.
+        longest: s, the longest touch that the model was trained on.
+
+    Raises:
+        InputError: a value that cannot be used.
+    """
+
+    threshold: float
+    drift: float = DRIFT
+    learned: bool = False
+    longest: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.threshold < np.inf:
+            raise InputError(f"live.touch must be above 0 N, got {self.threshold}: as in live.touch=0.3")
+        if not 0 <= self.drift < np.inf:
+            raise InputError(
+                f"live.drift must be 0 N or more, got {600 * self.drift:g}: as in live.drift=0.2"
+            )
+
+
+class Engine:
+    """Says at every frame what the window that ends there shows.
+
+    An alarm is latched: once raised, it stays until the contact ends, whatever the model says. A contact that
+    lasts longer than any touch of the training is shown to the model as a press of the present readings that
+    follows the last idle readings: in the plain window nothing would tell it from an untouched skin.
+
+    Args:
+        learner: trained.
+        task: what its labels mean.
+        positions: (S, 3), m.
+        frames: T, frames of its window.
+        rate: that it was trained at, Hz.
+        detection: what counts as a contact.
+        patience: how long answers must hold.
+
+    Attributes:
+        alarm: the latest verdict was dangerous, and the contact has not ended.
+    """
+
+    def __init__(
+        self,
+        learner: Answers,
+        task: Task,
+        positions: Tensor,
+        frames: int,
+        rate: float,
+        detection: Detection,
+        patience: Patience | None = None,
+    ) -> None:
+        self.window = Window(frames, rate, len(positions))
+        self.task = task
+        self._learner, self._positions, self._detection = learner, positions, detection
+        self._patience = patience or Patience()
+        self._contact = Contact(len(positions), rate, detection.threshold, detection.drift)
+        self._held = min(max(1, round(detection.longest * rate)), max(1, frames - 2))
+        self._above = 0.5 if self._patience.above is None else self._patience.above
+        self._segment: int | None = None
+        self.tared()
+
+    def tared(self) -> None:
+        """Forget alarm and contact: the operator says that nothing touches the skin."""
+        self._contact.tared()
+        shape = self.window.frames, self.window.sensors
+        self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
+        self.alarm, self._highest = False, 0.0
+        self._restart()
+
+    def _restart(self) -> None:
+        patience = self._patience
+
+        def slow() -> Debounce:
+            return Debounce(patience.label, patience.label)
+
+        self._touch = slow()
+        self._labels = {name: slow() for name in self.task.gated}
+        self._labels |= {"dangerous": Debounce(patience.alarm, patience.calm)}
+
+    def add(self, frame: Frame) -> None:
+        """Let the window slide without asking: for frames that have waited while another was classified.
+
+        Args:
+            frame: as the device sent it.
+        """
+        if frame.segment != self._segment:
+            self._segment = frame.segment
+            self._restart()
+        self.window.add(frame)
+
+    def push(self, frame: Frame, newtons: Newtons) -> Verdict | None:
+        """Return what the window that ends with this frame is said to show.
+
+        Args:
+            frame: as the device sent it.
+            newtons: what its values mean.
+
+        Returns:
+            None while the window is not full, unless an alarm is latched.
+
+        Raises:
+            InputError: the stream is slower than the model's rate.
+        """
+        self.add(frame)
+        seen = self.window.read()
+        return self._waiting(frame, newtons) if seen is None else self._verdict(seen, frame, newtons)
+
+    def _waiting(self, frame: Frame, newtons: Newtons) -> Verdict | None:
+        """Keep a latched alarm while the window fills again after a restart of the device."""
+        if not self.alarm:
+            return None
+        seen = self.window.read(partial=True)
+        if seen is not None and not self._contact.update(*newtons(seen.values, seen.valid), frame.t_host):
+            self.alarm = False
+            return None
+        chances, said = {"dangerous": self._highest}, {"dangerous": True}
+        return Verdict(frame.t, frame.t_host, chances, True, said, True, True, (), self._since(frame))
+
+    def _since(self, frame: Frame) -> float | None:
+        """Return for how long the contact has lasted, s."""
+        since = self._contact.since
+        return None if since is None else frame.t_host - since
+
+    def _verdict(self, seen: Resampled, frame: Frame, newtons: Newtons) -> Verdict:
+        readings, valid = newtons(seen.values, seen.valid)
+        contact = self._contact.update(readings, valid, frame.t_host)
+        risen = bool(self._contact.rises(readings, valid).any())
+        if not contact and not risen:
+            self._idle = readings, valid
+        chances = self._asked(readings, valid, self._since(frame) or 0.0)
+        touched = contact or risen or (self._detection.learned and chances[self.task.gate or ""] > 0.5)
+        masked = tuple(np.flatnonzero(~valid.any(axis=0)).tolist())
+        period = self.window.period
+
+        def settled(debounce: Debounce, answer: bool) -> bool:
+            return debounce(answer, frame.t, period)
+
+        chance = chances.get("dangerous", 0.0)
+        # A probability that is no number is no reason to call a touch safe.
+        raised = settled(self._labels["dangerous"], touched and not chance <= self._above)
+        self.alarm = raised or (self.alarm and contact)
+        self._highest = max(self._highest, chance) if self.alarm else 0.0
+        # An alarm does not wait until the touch is settled.
+        shown = settled(self._touch, touched) or self.alarm
+        answer = self._answers(chances)
+        said = {
+            name: settled(self._labels[name], answer[name]) for name in self.task.gated if name != "dangerous"
+        }
+        if "dangerous" in self.task.names:
+            said["dangerous"] = self.alarm
+            chances["dangerous"] = max(self._highest, chance)
+        since = self._since(frame)
+        return Verdict(
+            frame.t, frame.t_host, chances, shown, said if shown else {}, self.alarm, seen.gap, masked, since
+        )
+
+    @torch.inference_mode()
+    def _asked(self, readings: np.ndarray, valid: np.ndarray, lasted: float) -> dict[str, float]:
+        """Return label -> probability of a window (T, S), N, at the end of a contact of ``lasted`` s."""
+        if lasted * self.window.rate > self._held:
+            before = (len(readings) - self._held) // 2
+            readings, valid = (
+                np.concatenate([idle[:before], now[-self._held :], idle[before + self._held :]])
+                for idle, now in zip(self._idle, (readings, valid), strict=True)
+            )
+        known = torch.from_numpy(readings)[None], torch.from_numpy(valid)[None]
+        touches = Touches(*known, self._positions, None, self.window.rate)
+        answers = self._learner.probabilities(touches)[0].tolist()
+        return dict(zip(self.task.names, answers, strict=True))
+
+    def _answers(self, chances: dict[str, float]) -> dict[str, bool]:
+        """Return which labels hold in this window: the likeliest one where they exclude each other."""
+        if self.task.kind == "exclusive":
+            best = max(chances, key=chances.__getitem__)
+            return {name: name == best for name in chances}
+        return {name: chance > 0.5 for name, chance in chances.items()}

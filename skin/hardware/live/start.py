@@ -1,0 +1,178 @@
+"""From a finished run to an engine that knows what it learned."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from mlflow.entities import Run
+from omegaconf import DictConfig, OmegaConf
+
+from skin.build import build_data, build_device, build_learner
+from skin.device.base import AbstractDevice
+from skin.device.recording import Recorded
+from skin.device.serial import Serial
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.report import Answers
+from skin.hardware.live.engine import Detection, Engine
+from skin.hardware.live.verdict import Patience
+from skin.reload import operating_point, restore
+from skin.signal.contact_detection import DRIFT
+from skin.signal.contact_threshold import Threshold, rise
+from skin.tracking import Store
+from skin.wire.conversion import newtons
+from skin.wire.open import open_skin
+from skin.wire.skin import Skin
+from skin.wire.tare import Tare
+
+__all__ = ["Source", "Trained", "advice", "engine", "source", "trained"]
+
+_FEW = 10  # gestures, where only their shape matters
+_FAINT = 0.3  # N that end a contact where nothing else is known
+_MANY = 4000  # windows of streams, a tenth of which tunes what touch is
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A run brought back.
+
+    Attributes:
+        device: that it was trained on, with few gestures.
+        learner: trained.
+        window: T, frames.
+        positions: (S, 3), m.
+        rate: Hz.
+        point: where its alarm is raised; None where it knows no label ``dangerous``.
+    """
+
+    device: AbstractDevice
+    learner: Answers
+    window: int
+    positions: torch.Tensor
+    rate: float
+    point: OperatingPoint | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where frames come from.
+
+    Attributes:
+        name: of it, for a person.
+        skin: open.
+        tare: finds out what its values mean.
+    """
+
+    name: str
+    skin: Skin
+    tare: Tare
+
+
+def source(device: AbstractDevice) -> Source:
+    """Open a skin at a port, a recording, or the simulator, as the configuration names the device.
+
+    Raises:
+        InputError: it cannot be opened, or is a device that has no stream.
+    """
+    if isinstance(device, Serial):
+        skin, _ = device.open(reconnect=True)
+        return Source(str(device.port), skin, device.taring(skin))
+    # Its readings are N, and what a run has learnt from such is without a baseline too.
+    if isinstance(device, Recorded):
+        return Source(device.path, open_skin(device.path, device.sensors), _plain(len(device.sensors)))
+    if isinstance(device, Simulated):
+        return Source("simulator", open_skin("simulated", device=device), _plain(len(device.sensors)))
+    raise InputError(
+        "only a skin at a port, a recording or the simulator can be watched: give device=serial "
+        "device.port=/dev/ttyACM0, device=recording device.path=FILE.parquet, or leave out device="
+    )
+
+
+def _plain(sensors: int) -> Tare:
+    return Tare(lambda baseline, header: newtons(sensors, None, 1.0, None, None), 0.0, 1.0)
+
+
+def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
+    """Return a run with what it learned.
+
+    Args:
+        store: where it is.
+        run: a finished training.
+        config: its configuration, changed as :func:`skin.reload.changed` does.
+        stored: its configuration as it was.
+
+    Raises:
+        InputError: what it learned does not fit the configuration.
+    """
+    own = OmegaConf.create(OmegaConf.to_container(config))
+    assert isinstance(own, DictConfig)
+    if "gestures" in own.device:
+        own.device.gestures = _FEW
+        own.device.fresh = False
+    device, learner = build_device(own), build_learner(own)
+    data = build_data(own, device)
+    restore(store, run, learner, data)
+    known = data.touches("train")
+    point = operating_point(run, learner, stored, config.evaluation)
+    return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
+
+
+def engine(of: Trained, patience: Patience, touch: float | None = None, drift: float = 600 * DRIFT) -> Engine:
+    """Return the engine of a run.
+
+    Args:
+        of: the run.
+        patience: how long answers must hold.
+        touch: N above its baseline from which on a reading is a touch; None: tuned on simulated streams of
+            its device, and what the run has learned about touch counts too.
+        drift: N in ten minutes that the baseline may follow while nothing touches.
+
+    Raises:
+        InputError: neither learned nor given, and no device that has streams; or no probability can raise
+            the alarm of the run.
+    """
+    if patience.above is None and of.point is not None:
+        if of.point.silent:
+            raise InputError(f"{of.point.warning()}: give live.patience.above=0.5, or train another run")
+        patience = replace(patience, above=of.point.threshold)
+    task = of.device.task
+    learned = touch is None and task.gate is not None
+    least = _tuned(of.device, learned) if touch is None else touch
+    detection = Detection(least, drift / 600, learned, _longest(of))
+    return Engine(of.learner, task, of.positions, of.window, of.rate, detection, patience)
+
+
+def _longest(of: Trained) -> float:
+    """Return the longest touch that a run was trained on, s; two thirds of its window if nobody knows."""
+    frames = of.window * 2 / 3
+    if isinstance(of.device, Simulated):
+        frames = of.device.sampler.settings.press[1]
+    return frames / of.rate
+
+
+def _tuned(device: AbstractDevice, learned: bool) -> float:
+    if not isinstance(device, Simulated):
+        if learned:
+            return _FAINT
+        raise InputError(
+            "this run does not know what no touch is: give live.touch=0.3 (N), or train on streams"
+        )
+    known = device.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches("validation")
+    assert known.labels is not None
+    return Threshold.tuned(rise(known), known.labels[:, -1] > 0.5).least
+
+
+def advice(stored: DictConfig, device: AbstractDevice) -> str | None:
+    """Return what to say of a run that watches a real skin with what it learned from equation 10, or None.
+
+    Args:
+        stored: the run's configuration.
+        device: what is watched.
+    """
+    reading = OmegaConf.select(stored, "device.simulator.reading")
+    if reading != "equation10" or not isinstance(device, Serial):
+        return None
+    return (
+        "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "
+        "mechanics (docs/results.md): train one with simulator=solid for a real skin"
+    )

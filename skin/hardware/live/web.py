@@ -1,0 +1,127 @@
+"""The skin on a page of this machine: one file, and pictures as server-sent events."""
+
+import asyncio
+import base64
+import json
+import socket
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from time import monotonic
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from skin.errors import InputError
+from skin.hardware.live.board import Board, Look
+from skin.hardware.live.picture import Picture
+from skin.hardware.live.terminal import since
+
+__all__ = ["HERTZ", "message", "served"]
+
+HERTZ = 33  # pictures a second: 30, and what a busy machine costs
+_PIXELS = 64
+_HOST = "127.0.0.1"
+_PAGE = Path(__file__).with_name("page.html")
+
+
+@contextmanager
+def served(board: Board, port: int) -> Iterator[str]:
+    """Serve the page while the block runs; give its address.
+
+    Args:
+        board: what is shown.
+        port: 0 takes a free one.
+
+    Raises:
+        InputError: the port is in use or not allowed.
+    """
+    try:
+        listening = socket.create_server((_HOST, port))
+    except (OSError, OverflowError) as error:
+        raise InputError(f"no page on port {port}: {error}; give live.web_port=0, or another") from error
+    settings = uvicorn.Config(
+        _application(board), log_config=None, access_log=False, lifespan="off", timeout_graceful_shutdown=1
+    )
+    server = uvicorn.Server(settings)
+    thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="skin-page", daemon=True)
+    thread.start()
+    try:
+        yield f"http://{_HOST}:{listening.getsockname()[1]}"
+    finally:
+        board.closed.set()
+        server.should_exit = True
+        thread.join(5)
+        listening.close()
+
+
+def message(look: Look, picture: Picture) -> dict[str, Any]:
+    """Return what a page is sent for each picture: forces in N, the picture as base64 of uint8 row by row."""
+    verdict = look.verdict
+    said = None
+    if verdict is not None:
+        said = {
+            "touched": verdict.touched,
+            "dangerous": verdict.dangerous,
+            "gap": verdict.gap,
+            "since": since(verdict.contact),
+            "words": verdict.words(),
+        }
+    return {
+        "number": look.number,
+        "values": [round(value, 3) for value in look.values.tolist()],
+        "valid": look.valid.tolist(),
+        "saturated": look.saturated.tolist(),
+        "picture": base64.b64encode(picture(look.values, look.valid).tobytes()).decode(),
+        "verdict": said,
+        "trouble": look.trouble,
+        "alarm": look.alarm,
+        "line": look.line,
+    }
+
+
+def _application(board: Board) -> Starlette:
+    facts = board.facts
+    picture = Picture(facts.positions, facts.size, _PIXELS, facts.top)
+
+    async def page(request: Request) -> Response:
+        return FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})
+
+    async def skin(request: Request) -> Response:
+        known = {"positions": facts.positions.tolist(), "size": list(facts.size), "pixels": _PIXELS}
+        named = {"title": facts.title, "port": facts.port, "top": facts.top, "window": facts.window}
+        return JSONResponse(known | named)
+
+    async def pictures(request: Request) -> Response:
+        return StreamingResponse(_events(board, picture), media_type="text/event-stream")
+
+    async def tare(request: Request) -> Response:
+        # Another site's page can send a plain POST here, but not with a header of its own.
+        if request.headers.get("x-skin") != "tare":
+            return Response(status_code=403)
+        board.tare.set()
+        return Response(status_code=204)
+
+    # Names that lead here from elsewhere are refused: another site's page must not read the skin.
+    here = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
+    routes = [Route("/", page), Route("/skin.json", skin), Route("/pictures", pictures)]
+    routes.append(Route("/tare", tare, methods=["POST"]))
+    return Starlette(routes=routes, middleware=[here])
+
+
+async def _events(board: Board, picture: Picture) -> AsyncIterator[str]:
+    number, due = 0, monotonic()
+    while not board.closed.is_set():
+        look = board.look(number)
+        number = look.number
+        yield f"data: {json.dumps(message(look, picture))}\n\n"
+        # A picture that is a little late does not delay the next; those that are very late are left out.
+        due = max(due + 1 / HERTZ, monotonic() - 1 / HERTZ)
+        await asyncio.sleep(max(0.0, due - monotonic()))

@@ -1,0 +1,155 @@
+"""A session on disk: raw frames as they come, and what happened between them.
+
+A CSV that experiments/calibrate.py reads too: ``time`` (s since the start), ``seq`` and a column of raw
+values per sensor. Lines that start with # are JSON: what values mean, where a gesture begins and ends, gaps,
+invalid channels. Unit, layout and start time stand in ``x.csv.json``. Lines are only ever added, each in one
+piece, so the file is valid up to its last whole frame whatever ends the program.
+
+A line that is damaged later costs itself: see :func:`skin.hardware.record.reading.read`. Events have
+checksums. The line that begins a gesture repeats the invalid and saturated channels and names what values
+mean by its checksum, so that a lost line never leaves a gesture with the baseline of another.
+"""
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.hardware.record.lines import Lines, sealed, write_whole
+from skin.hardware.record.reading import read
+from skin.hardware.record.stored import Stored
+from skin.signal.frame import Frame
+from skin.signal.segmentation import Take
+from skin.wire.conversion import Newtons
+
+__all__ = ["Log", "Stored", "check", "read"]
+
+
+class Log:
+    """A session that is being written; one that exists is resumed.
+
+    Args:
+        path: x.csv.
+        about: what is written beside it; a resumed session keeps its own.
+        sensors: S.
+
+    Attributes:
+        done: numbers of the gestures that are whole.
+
+    Raises:
+        InputError: the file cannot be written, is no session, or one of another device, layout, window or
+            rate.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any], sensors: int) -> None:
+        self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
+        self._segment, self._anchor = -1, 0.0
+        self._meaning: str | None = None
+        header = ",".join(["time", "seq", *(f"raw_{number:02d}" for number in range(sensors))]) + "\n"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stored = self._resume(path, about, header)
+            self._about = stored.about if stored else dict(about) | {"started_unix": time.time()}
+            if stored is None:
+                write_whole(path.with_name(path.name + ".json"), json.dumps(self._about) + "\n")
+                write_whole(path, header)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}: give another out=") from error
+        self._lines = Lines(path)
+        self.done = set(stored.takes) if stored else set()
+        self._last = stored.end if stored else -1.0
+
+    @staticmethod
+    def _resume(path: Path, about: Mapping[str, Any], header: str) -> Stored | None:
+        """Return what is there; None if that is a header at most."""
+        whole = path.read_bytes() if path.exists() else b""
+        if header.encode().startswith(whole):
+            return None
+        stored = read(path)
+        check(path, stored.about, about)
+        # What a power cut left of a last line would make the next one wrong.
+        os.truncate(path, whole.rfind(b"\n") + 1)
+        return stored
+
+    def mark(self, event: str, **what: Any) -> None:
+        """Say what happens before the next frame."""
+        self._lines.add(sealed(event, **what)[0])
+
+    def meaning(self, meaning: Newtons) -> None:
+        """Say what values from now on mean; its ``zero`` is the baseline."""
+        said = {name: value.tolist() for name, value in vars(meaning).items()}
+        line, self._meaning = sealed("meaning", **said)
+        self._lines.add(line)
+
+    def begin(self, take: Take, frame: Frame) -> None:
+        """Say that a gesture's window begins at or just before a frame."""
+        begin = round(self._time(frame) - (frame.t - take.begin), 9)
+        known = {"number": take.number, "time": begin, "labels": take.labels}
+        self.mark("begin", **known, meaning=self._meaning, **self._marked)
+
+    def end(self, take: Take) -> None:
+        """Say that it is over, and let it reach the disk."""
+        self.mark("broken" if take.broken else "end", number=take.number, lost=take.lost)
+        self._lines.sync()
+        if not take.broken:
+            self.done.add(take.number)
+
+    def frame(self, frame: Frame) -> None:
+        """Add a frame, raw."""
+        if frame.after:
+            self.mark("gap", after=frame.after, lost=frame.lost)
+        none = np.zeros(len(frame.values), dtype=bool)
+        marks = {"invalid": ~frame.valid, "saturated": none if frame.saturated is None else frame.saturated}
+        for event, found in marks.items():
+            channels = np.flatnonzero(found).tolist()
+            if channels != self._marked[event]:
+                self.mark(event, channels=channels)
+                self._marked[event] = channels
+        self._last = self._time(frame)
+        values = ",".join(f"{value:.9g}" for value in frame.values.tolist())
+        self._lines.add(f"{self._last:.9f},{'' if frame.seq is None else frame.seq},{values}")
+
+    @property
+    def time(self) -> float:
+        """When the last frame came, s since the session began."""
+        return self._last
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._lines.close()
+
+    def _time(self, frame: Frame) -> float:
+        """Return s since the start of the session, by the device's clock within a segment."""
+        if frame.segment != self._segment:
+            ago = time.monotonic() - frame.t_host
+            self._segment = frame.segment
+            self._anchor = time.time() - ago - self._about["started_unix"] - frame.t
+            self._anchor = max(self._anchor, self._last + 1e-3 - frame.t)
+        return frame.t + self._anchor
+
+
+def check(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise InputError where a session was recorded otherwise than the configuration or the device is now."""
+    both = {name: (about[name], value) for name, value in now.items() if name in about}
+    differ = {name: pair for name, pair in both.items() if pair[0] != pair[1]}
+    if "positions" in differ:
+        raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
+    if "unit" in differ:
+        raise InputError(
+            "{} was recorded in {}, the device sends {}: give another out=".format(path, *differ["unit"])
+        )
+    if None not in (pair := differ.get("id", (None,))):
+        raise InputError(
+            "{} was recorded from the device {}, this is {}: give another out=".format(path, *pair)
+        )
+    if {"window", "rate"} & set(differ):
+        (window, new_window), (rate, new_rate) = both["window"], both["rate"]
+        raise InputError(
+            f"{path} has windows of {window} frames at {rate:g} Hz, the configuration has {new_window} at "
+            f"{new_rate:g} Hz: give touch.window={window} device.rate={rate:g}"
+        )

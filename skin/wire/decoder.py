@@ -1,0 +1,154 @@
+"""From bytes to frames, without any input or output."""
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.signal.frame import After, Counters, Frame, FrameError
+from skin.wire.detect import Format, Found, Raw, Speech, detect, refusal
+from skin.wire.quality import Quality
+from skin.wire.sequence import HostClock, Order
+from skin.wire.text import Header, parse_header
+
+__all__ = ["Decoder"]
+
+_LONGEST = 65536  # bytes of a line
+_ENOUGH = 4096  # bytes in which the format must show
+_PATIENCE = 2.0  # s of receiving in which it must
+_PAUSE = 0.2  # s: what a silence counts for, because a board may take seconds to start
+_PER_FIELD = 12  # bytes
+
+
+class Decoder:
+    """Turns bytes into frames; resynchronises at the next delimiter and never raises for what it is fed.
+
+    The format is found by itself (two binary frames with a right CRC, or three lines of one field count)
+    and kept. Without a CRC, what comes before the first delimiter is left out, for it may look whole.
+
+    Args:
+        sensors: S; None learns it from the header or from eight lines.
+        format: ``auto``, ``text`` or ``binary``.
+
+    Attributes:
+        counters: what was seen; kept by :meth:`restart`.
+        speech: the format, once it is known.
+        header: what the device tells of itself, if it does.
+    """
+
+    def __init__(self, sensors: int | None = None, format: Format = "auto") -> None:
+        self.sensors, self.format = sensors, format
+        self.counters, self.quality = Counters(), Quality()
+        self.header: Header | None = None
+        self._order, self._clock = Order(), HostClock()
+        self._all_valid = np.ones(sensors or 0, dtype=bool)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.speech: Speech | None = None
+        self._buffer = b""
+        self._found = Found(None, None, None)
+        self._receiving, self._fed_at = 0.0, float("nan")
+        self._whole = self._overlong = self._synchronous = False
+        self._missing = 0
+
+    def restart(self, after: After = "reconnect") -> None:
+        """Begin with another connection: find the format anew, demand the same number of sensors."""
+        self._begin()
+        self._order.cut(after)
+
+    def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
+        """Return the frames that end in ``data``.
+
+        Args:
+            data: any bytes, cut anywhere.
+            now: s, the host's monotonic clock at their arrival.
+        """
+        self.counters.bytes += len(data)
+        if self.speech is None:
+            # Where nothing is recognised for long, only the latest is searched.
+            self._buffer = self._buffer[-2 * self._enough :]
+        self._buffer += data
+        if self.speech is None and not self._recognise(data, now):
+            return []
+        assert self.speech is not None
+        *pieces, self._buffer = self._buffer.split(self.speech.delimiter)
+        good, bad = self.counters.frames, sum(self.counters.bad.values())
+        frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
+        if len(self._buffer) > _LONGEST:
+            self._buffer, self._overlong = b"", True
+        self.quality.count(now, self.counters.frames - good, sum(self.counters.bad.values()) - bad)
+        return frames
+
+    def refusal(self) -> InputError | None:
+        """Return why nothing can be read, once 2 s of receiving or 4 kB (or four frames) show no format."""
+        if self.speech or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
+            return None
+        return refusal(self._buffer, self._found, self.sensors)
+
+    @property
+    def _enough(self) -> int:
+        """Bytes in which the format must show: 4 kB, or four frames."""
+        return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
+
+    def _recognise(self, data: bytes, now: float) -> bool:
+        """Keep the beginning until it shows its format; it is decoded again from its first byte then."""
+        passed = now - self._fed_at
+        self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
+        self._fed_at = now
+        if b"\n" not in data and b"\0" not in data:
+            return False
+        self._found = detect(self._buffer, self.sensors, self.format)
+        self.speech = self._found.speech
+        if self.speech is None:
+            return False
+        self.header = self._found.header or self.header
+        self.sensors = self.speech.sensors
+        self._all_valid = np.ones(self.sensors, dtype=bool)
+        self._all_valid.flags.writeable = False
+        return True
+
+    def _frame(self, piece: bytes, now: float) -> Frame | None:
+        assert self.speech is not None
+        first, self._whole = not self._whole, True
+        try:
+            if self._overlong or len(piece) > _LONGEST:
+                self._overlong = False
+                raise FrameError("long")
+            raw = self.speech.read(piece)
+            if raw is None:
+                self._comment(piece)
+                return None
+            if first and self.speech.check != "crc16":
+                raise FrameError("structure")
+            return self._placed(raw, now)
+        except FrameError as bad:
+            self._count_bad(bad)
+            return None
+
+    def _comment(self, piece: bytes) -> None:
+        assert self.speech is not None
+        if text := self.speech.comment(piece):
+            self.header = parse_header(text) or self.header
+
+    def _count_bad(self, bad: FrameError) -> None:
+        if not self._synchronous and not self._missing:
+            self.counters.skipped += 1
+            return
+        self._synchronous = False
+        self._missing += 1
+        self.counters.bad[bad.reason] += 1
+        self.quality.note(bad)
+
+    def _placed(self, raw: Raw, now: float) -> Frame:
+        t_us = now * 1e6 if raw.t_us is None else raw.t_us
+        t, segment, lost, after = self._order.place(raw.seq, t_us, self._missing)
+        counters = self.counters
+        counters.frames += 1
+        counters.resyncs += self._missing > 0
+        counters.lost += lost
+        counters.gaps += after == "gap"
+        counters.resets += after == "reset"
+        counters.weak += self.speech is not None and self.speech.check != "crc16"
+        self._synchronous, self._missing = True, 0
+        if after and after != "gap":
+            self._clock.restart()
+        return Frame(raw.seq, t, self._clock(t, now), raw.values, self._all_valid, segment, lost, after)

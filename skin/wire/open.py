@@ -1,0 +1,167 @@
+"""The door: a serial port, a socket, a recording or the simulator, all behind one skin."""
+
+from collections.abc import Callable, Iterator, Sized
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from math import inf
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.wire.decoder import Decoder
+from skin.wire.detect import Format
+from skin.wire.feed import Feed, Piece, Player, Wire
+from skin.wire.health import Health, Limits
+from skin.wire.reader import Reader
+from skin.wire.skin import Skin
+from skin.wire.transport import ByteStream, open_wire
+
+if TYPE_CHECKING:
+    from skin.device.simulated import Simulated
+    from skin.recording import Touches
+
+__all__ = ["Settings", "open_skin"]
+
+_STRIP = 600.0  # s of simulated touches in one piece
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How a skin is read.
+
+    Args:
+        baudrate: bits per second, for serial ports.
+        format: ``auto``, ``text`` or ``binary``.
+        limits: smallest and largest value a channel can send, as in :class:`skin.wire.health.Health`; None:
+            the largest count, where the device tells its bits.
+        timeout: s without a frame after which iterating and reading give up.
+        queue: frames that are kept for whoever is late.
+        reconnect: wait for an unplugged skin; its first frame has ``after="reconnect"``.
+        backoff: s before the first attempt to reconnect, and the longest between two.
+        silence: s without a byte after which a socket is closed and opened again, if ``reconnect``; None or
+            0: never. A computer that lost its power cannot say that it is gone. Serial ports are left open:
+            the system tells when one is unplugged, and opening one restarts many boards.
+        realtime: False plays a recording or the simulator as fast as frames are taken.
+
+    Raises:
+        InputError: a setting that cannot be used.
+    """
+
+    baudrate: int = 115200
+    format: Format = "auto"
+    limits: tuple[float | None, float | None] | None = None
+    timeout: float = 5.0
+    queue: int = 4096
+    reconnect: bool = False
+    backoff: tuple[float, float] = (1.0, 10.0)
+    silence: float | None = 5.0
+    realtime: bool = True
+
+    def __post_init__(self) -> None:
+        if self.format not in get_args(Format):
+            raise InputError(f"device.format must be one of {', '.join(get_args(Format))}, got {self.format}")
+        for name in ("baudrate", "timeout", "queue"):
+            if not 0 < getattr(self, name) < inf:
+                raise InputError(f"device.{name} must be above 0, got {getattr(self, name)}")
+        if self.limits is not None and len(self.limits) != 2:
+            raise InputError(f"device.limits must be [smallest, largest], got {list(self.limits)}")
+        if len(self.backoff) != 2 or not 0 < self.backoff[0] <= self.backoff[1] < inf:
+            raise InputError(f"device.backoff must be [first, longest] in s, got {list(self.backoff)}")
+        if self.silence is not None and not 0 <= self.silence < inf:
+            raise InputError(f"device.silence must be in s, or 0 for never, got {self.silence}")
+
+
+def open_skin(
+    port: str,
+    layout: Sized | None = None,
+    *,
+    opener: Callable[[], ByteStream] | None = None,
+    device: "Simulated | None" = None,
+    baseline: np.ndarray | None = None,
+    **settings: Any,
+) -> Skin:
+    """Open a skin; use it in a ``with`` statement.
+
+    Args:
+        port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:number``, a recording (``x.parquet``, ``x.csv``) or
+            ``simulated``.
+        layout: the sensors (anything with a length); None learns their number.
+        opener: opens the stream of bytes instead, and again after each unplugging.
+        device: what ``simulated`` plays.
+        baseline: (S,), from an earlier tare.
+        settings: as in :class:`Settings`.
+
+    Raises:
+        InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
+    """
+    chosen, sensors = Settings(**settings), None if layout is None else len(layout)
+    decoder = None
+    if opener is None and port == "simulated":
+        connect = _player(_simulated(device, chosen.realtime))
+    elif opener is None and port.endswith((".parquet", ".csv")):
+        connect = _player(_recorded(port, sensors, chosen.realtime))
+    else:
+        decoder = Decoder(sensors, chosen.format)
+        watched = chosen.reconnect and port.startswith("socket://")
+        silence = (chosen.silence if watched else None) or inf
+        connect = _wire(opener or partial(open_wire, port, chosen.baudrate), decoder, chosen.limits, silence)
+    try:
+        reader = Reader(connect, chosen.queue, chosen.reconnect, chosen.backoff)
+    except OSError as error:
+        raise InputError(f"cannot open {port}: {error}") from error
+    return Skin(reader, decoder, chosen.timeout, baseline)
+
+
+def _wire(
+    opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float
+) -> Callable[[], Feed]:
+    """Return what connects; from the second time on the decoder begins anew.
+
+    What channels can send stays known: a cable may come loose under a press that drives them to their limit.
+    """
+    connections, health = count(), Health()
+
+    def connect() -> Feed:
+        stream = opener()
+        if next(connections):
+            decoder.restart()
+            health.restart()
+        return Wire(stream, decoder, limits, silence, health)
+
+    return connect
+
+
+def _player(player: Player) -> Callable[[], Feed]:
+    return lambda: player
+
+
+def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
+    # Here, because it brings torch, which a wire does not need.
+    from skin.storage import read
+
+    touches = read(path).touches
+    found = touches.readings.shape[2]
+    if sensors not in (None, found):
+        raise InputError(
+            f"{path} has {found} sensors, the layout has {sensors}: give the layout it was recorded with, "
+            "as in layout=file layout.path=FILE.csv"
+        )
+    return Player(_pieces(touches), touches.rate, realtime)
+
+
+def _simulated(device: "Simulated | None", realtime: bool) -> Player:
+    if device is None:
+        raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
+    return Player(_strips(device), device.rate, realtime)
+
+
+def _strips(device: "Simulated") -> Iterator[Piece]:
+    for number in count():
+        yield from _pieces(device.strip(max(1, round(_STRIP * device.rate)), number=number).whole.touches)
+
+
+def _pieces(touches: "Touches") -> Iterator[Piece]:
+    saturated = touches.valid & False if touches.saturated is None else touches.saturated
+    yield from zip(touches.readings.double().numpy(), touches.valid.numpy(), saturated.numpy(), strict=True)

@@ -1,0 +1,108 @@
+"""Frames in order: what is missing, what started anew, and what the device's clock says."""
+
+from typing import NamedTuple
+
+from skin.signal.frame import After, FrameError
+
+__all__ = ["HostClock", "Order", "Place"]
+
+_WRAP = 2**32  # microseconds: 71.6 minutes
+_WRAPS = (2**16, 2**32)  # of seq: what firmware counts in
+_ACROSS = 4096  # frames that may be missing where seq wraps
+_WRAP_GAP = 60_000_000  # microseconds that may be missing where the clock wraps
+
+
+class Place(NamedTuple):
+    """Where a frame belongs; as in :class:`skin.signal.frame.Frame`."""
+
+    t: float
+    segment: int
+    lost: int
+    after: After
+
+
+def steps(before: int, seq: int) -> int:
+    """Return by how many frames ``seq`` is ahead of ``before``, u16 or u32 wrapped; 0 if it is not."""
+    if seq > before:
+        return seq - before
+    for wrap in _WRAPS:
+        if wrap - _ACROSS <= before < wrap and seq - before + wrap <= _ACROSS:
+            return seq - before + wrap
+    return 0
+
+
+class Order:
+    """Follows seq and the device's clock from frame to frame."""
+
+    def __init__(self) -> None:
+        self.segment = 0
+        self._after: After = ""
+        self._last: tuple[int, float] | None = None
+        self._wrapped = 0
+
+    def cut(self, after: After) -> None:
+        """Begin another segment with the next frame, for the reason given."""
+        self._after = after
+
+    def place(self, seq: int | None, t_us: float, missing: int) -> Place:
+        """Return where a frame belongs.
+
+        Args:
+            seq: its number; None where the device gives none.
+            t_us: the device's clock, microseconds.
+            missing: bad frames since the last good one, all that is known without seq.
+
+        Raises:
+            FrameError: ``repeat``: the same number at the same time once more.
+        """
+        if seq is None:
+            return self._begin(t_us) if self._after else self._follow(t_us, missing)
+        last, self._last = self._last, (seq, t_us)
+        if self._after or last is None:
+            return self._begin(t_us)
+        if last == (seq, t_us):
+            raise FrameError("repeat")
+        ahead, elapsed = steps(last[0], seq), t_us - last[1]
+        if elapsed < 0 and last[1] < _WRAP and elapsed + _WRAP <= _WRAP_GAP:
+            elapsed += _WRAP
+            self._wrapped += _WRAP
+        if not ahead or elapsed < 0:
+            self._after = "reset"
+            return self._begin(t_us)
+        return self._follow(t_us + self._wrapped, ahead - 1)
+
+    def _follow(self, t_us: float, lost: int) -> Place:
+        return Place(t_us * 1e-6, self.segment, lost, "gap" if lost else "")
+
+    def _begin(self, t_us: float) -> Place:
+        after, self._after, self._wrapped = self._after, "", 0
+        self.segment += bool(after)
+        return Place(t_us * 1e-6, self.segment, 0, after)
+
+
+class HostClock:
+    """Maps the device's clock to the host's by the least delayed frames of the last seconds.
+
+    A frame waits in buffers, some less than others: the smallest difference between its arrival and the
+    device's clock is nearest to the truth. It is looked for anew every few seconds, so a device's clock that
+    is wrong by 0.5 % (a ceramic resonator) puts t_host wrong by 20 ms at most.
+    """
+
+    _SPAN = 2.0  # s
+
+    def __init__(self) -> None:
+        self._latest = float("-inf")
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget how the clocks are related: the device started anew."""
+        self._least = self._before = float("inf")
+        self._since: float | None = None
+
+    def __call__(self, t: float, arrival: float) -> float:
+        """Return the host's time of a frame, s, from the device's and that of its arrival, s."""
+        if self._since is None or arrival - self._since > self._SPAN:
+            self._before, self._least, self._since = self._least, float("inf"), arrival
+        self._least = min(self._least, arrival - t)
+        self._latest = max(self._latest, t + min(self._least, self._before))
+        return self._latest

@@ -1,0 +1,141 @@
+"""The text protocol: one frame a line, ``seq,t_us,v0,...,vN-1*HHHH``.
+
+A line that starts with # is a comment. The header is one, best with a checksum too:
+``# skin proto=1 n=25 rate=100 unit=adc bits=10 id=arm-L``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import NamedTuple
+
+from skin.signal.frame import Check, FrameError
+from skin.wire.checksum import crc16, xor8
+
+__all__ = ["Header", "Line", "encode_header", "encode_line", "parse_header", "parse_line"]
+
+
+class Line(NamedTuple):
+    """The numbers of a line, and what protects them."""
+
+    fields: list[float]
+    check: Check
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a device tells of itself.
+
+    Attributes:
+        proto: version of the protocol.
+        n: number of sensors.
+        rate: frames per second, Hz.
+        unit: of the values: ``adc``, ``N``.
+        bits: of the converter: the largest count is ``2**bits - 1``.
+        id: name of the device.
+    """
+
+    proto: int = 1
+    n: int | None = None
+    rate: float | None = None
+    unit: str | None = None
+    bits: int | None = None
+    id: str | None = None
+
+
+def encode_line(values: Sequence[float], seq: int, t_us: int, check: Check = "crc16") -> bytes:
+    """Return a line, LF at its end.
+
+    Args:
+        values: (S,), whole numbers or floats.
+        seq: number of the frame.
+        t_us: the device's clock, microseconds, modulo 2**32.
+        check: what protects the line.
+    """
+    return _checked(",".join(map(_number, (seq, t_us, *values))), check)
+
+
+def encode_header(header: Header, check: Check = "crc16") -> bytes:
+    """Return the header's line, LF at its end."""
+    known = {name: value for name, value in vars(header).items() if value is not None}
+    words = " ".join(f"{name}={_number(value)}" for name, value in known.items())
+    return _checked(f"# skin {words}", check)
+
+
+def parse_line(line: bytes) -> Line:
+    """Return what a line without its end says; comma, semicolon, tab or blanks separate, one may trail.
+
+    Raises:
+        FrameError: ``checksum`` is wrong or unknown, or a field is no finite ``number``.
+    """
+    body, check = _verified(line)
+    try:
+        if b"_" in body:  # Python's own grammar, which no device means
+            raise ValueError
+        fields = [float(field) for field in _split(body.strip())]
+    except ValueError:
+        raise FrameError("number") from None
+    if not all(map(isfinite, fields)):
+        raise FrameError("number")
+    return Line(fields, check)
+
+
+def parse_header(line: bytes) -> Header | None:
+    """Return the header if this comment is one whose checksum, where it has one, is right; else None."""
+    try:
+        body, _ = _verified(line)
+    except FrameError:
+        return None
+    words = body.decode("ascii", "replace").lstrip("#").split()
+    if words[:1] != ["skin"]:
+        return None
+    told = dict(word.split("=", 1) for word in words[1:] if "=" in word)
+    return Header(
+        _whole(told.get("proto")) or 1,
+        _whole(told.get("n")),
+        _positive(told.get("rate")),
+        told.get("unit"),
+        _whole(told.get("bits")),
+        told.get("id"),
+    )
+
+
+def _verified(line: bytes) -> tuple[bytes, Check]:
+    body, star, tail = line.rpartition(b"*")
+    if not star:
+        return line, "none"
+    # Written out and compared: int() takes blanks, signs and underscores for hex.
+    if len(tail) == 4 and tail.upper() == b"%04X" % crc16(body):
+        return body, "crc16"
+    if len(tail) == 2 and tail.upper() == b"%02X" % xor8(body):
+        return body, "xor"
+    raise FrameError("checksum")
+
+
+def _checked(text: str, check: Check) -> bytes:
+    body = text.encode("ascii")
+    tails = {"crc16": b"*%04X" % crc16(body), "xor": b"*%02X" % xor8(body), "none": b""}
+    return body + tails[check] + b"\n"
+
+
+def _split(body: bytes) -> list[bytes]:
+    for separator in (b",", b";", b"\t"):
+        if separator in body:
+            return body.removesuffix(separator).split(separator)
+    return body.split()
+
+
+def _number(value: object) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _whole(word: str | None) -> int | None:
+    return int(word) if word and word.isascii() and word.isdigit() and len(word) < 10 else None
+
+
+def _positive(word: str | None) -> float | None:
+    try:
+        value = float(word or "")
+    except ValueError:
+        return None
+    return value if isfinite(value) and value > 0 else None

@@ -1,0 +1,62 @@
+"""Statistics of one channel, on samples whose parameters are known."""
+
+import numpy as np
+import pytest
+
+from skin.hardware.calibration._channel import clip_and_gain, decay, idle, quantum
+
+TIME = np.arange(6000) / 100
+
+
+def noise(seed: int, spread: float) -> np.ndarray:
+    return spread * np.random.default_rng(seed).standard_normal(len(TIME))
+
+
+@pytest.mark.parametrize("step", [0.0, 0.01, 0.05, 0.08, 0.1])
+def test_noise_is_found_under_steps_of_its_own_size(step):
+    values = 3.21 + noise(0, 0.05)
+    values = np.round(values / step) * step if step else values
+    found = idle(TIME, values, step)
+    assert found.noise == pytest.approx(0.05, rel=0.06)
+    assert found.offset == pytest.approx(3.21, abs=0.004)
+    assert found.drift == 0
+
+
+def test_one_outlier_in_ten_changes_little():
+    values = noise(1, 0.05)
+    values[::10] += 5
+    found = idle(TIME, values, 0.0)
+    assert found.noise == pytest.approx(0.05, rel=0.2)
+    assert abs(found.offset) < 0.01
+
+
+def test_a_drift_is_told_from_none():
+    found = idle(TIME, 1.0 - 0.004 * TIME + noise(2, 0.05), 0.0)
+    assert found.drift == pytest.approx(-0.004, rel=0.05)
+    assert found.offset == pytest.approx(1.0, abs=0.01)
+    assert found.noise == pytest.approx(0.05, rel=0.05)
+    wrong = sum(idle(TIME, noise(seed, 0.05), 0.0).drift != 0 for seed in range(40))
+    assert wrong <= 6
+
+
+def test_the_smallest_step_is_found_in_single_precision():
+    values = np.round(noise(3, 1.0) / 0.07) * 0.07
+    assert quantum(values.astype(np.float32)) == pytest.approx(0.07, rel=1e-3)
+    assert quantum(noise(3, 1.0)) == 0
+
+
+def test_a_decay_gives_its_time_constant():
+    values = 8 * np.exp(-TIME / 0.12) + noise(4, 0.05)
+    assert decay(TIME, values, 0.4)[0] == pytest.approx(0.12, rel=0.03)
+    assert decay(TIME, noise(4, 0.05), 0.4) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("limit", [None, 6.0])
+def test_gain_and_plateau(limit):
+    true = np.repeat([0.5, 1.0, 3.0, 5.0, 8.0, 10.0], 1000)
+    said = np.minimum(1.3 * true, limit or np.inf) + noise(5, 0.05)
+    said[::20] = 0.0
+    gain, error, found = clip_and_gain(true, said, 0.05)
+    assert gain == pytest.approx(1.3, rel=0.01)
+    assert error < 0.02
+    assert found == (None if limit is None else pytest.approx(limit, abs=0.01))

@@ -1,0 +1,40 @@
+"""An emulator that plays in a thread ends when it is told to, whatever it waits for."""
+
+import socket
+import time
+from threading import Thread
+
+import pytest
+
+from skin.body.sheet import Sheet
+from skin.device.simulated import Simulated
+from skin.hardware.emulator.emulator import Emulator, Settings
+from skin.hardware.emulator.faults import Faults
+from skin.hardware.emulator.outlet import outlet
+from skin.layout.grid import Grid
+from skin.simulator.naive import Naive
+
+SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+
+
+@pytest.mark.parametrize("waits_for", ["a reader", "the next frame", "its power"])
+def test_it_stops_wherever_it_waits(waits_for):
+    device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
+    port = outlet("tcp:0", None)
+    rate = 0.005 if waits_for == "the next frame" else 100.0
+    faults = Faults(unplug=[0.0], away=600.0) if waits_for == "its power" else Faults()
+    emulator = Emulator(device, port, Settings(rate=rate, idle=600.0), faults)
+    thread = Thread(target=emulator.run)
+    thread.start()
+    try:
+        if waits_for != "a reader":
+            with socket.create_connection(("127.0.0.1", int(port.address.rpartition(":")[2]))) as reader:
+                assert reader.recv(1)
+                deadline = time.monotonic() + 20
+                while waits_for == "its power" and port.connected():
+                    assert time.monotonic() < deadline
+    finally:
+        emulator.stop()
+        thread.join(20)
+        port.unplug()
+    assert not thread.is_alive()

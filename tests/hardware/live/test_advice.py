@@ -1,0 +1,26 @@
+"""What is said of a run that should not watch a real skin."""
+
+import pytest
+
+from skin.build import build_device
+from skin.config import checked
+from skin.hardware.live.start import advice
+
+PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
+
+
+@pytest.mark.parametrize(
+    ("trained", "warned"),
+    [("fem", True), ("solid", False), ("naive", False)],
+)
+def test_a_run_on_equation_10_is_announced_at_a_port_only(configured, trained, warned):
+    stored = configured(f"simulator={trained}")
+    said = advice(stored, build_device(checked(configured(*PORT))))
+    assert (said is not None) == warned
+    assert said is None or "simulator=solid" in said
+    assert advice(stored, build_device(checked(configured("simulator=naive")))) is None
+
+
+def test_another_reading_of_plates_is_not(configured):
+    stored = configured("simulator=fem", "simulator.reading=interface")
+    assert advice(stored, build_device(checked(configured(*PORT)))) is None

@@ -1,0 +1,76 @@
+"""Calibration files: what is written is read, and what a person may write."""
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.signal.calibration import Calibration, read, write
+
+WHOLE = Calibration(
+    {
+        "gain": [1.1, None, 0.9],
+        "offset": [0.1, 2.5, -0.3],
+        "clip": [None, 7.5, None],
+        "noise": [1e-05, 0.2, 0.0],
+    },
+    {"dead": [], "stuck": [1]},
+    {"gain": [0.9, 1.1], "dead": [0, 1]},
+    0.0123456789012345,
+    511.5,
+    {"unit": "adc"},
+)
+
+
+def test_a_file_keeps_everything(tmp_path):
+    assert read(write(WHOLE, tmp_path / "folder" / "mine.yaml")) == WHOLE
+    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["mine.yaml"]
+
+
+def test_a_person_may_write_little(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("format: 1\ncount: 4\nsensors: {noise: 1e-2}\nranges: {dead: [0, 3]}\n")
+    values = read(path).values()
+    assert values["noise"].tolist() == [0.01] * 4
+    assert values["gain"].tolist() == [1.0] * 4
+    assert np.isinf(values["clip"]).all()
+
+
+def test_what_is_unknown_of_a_sensor_is_the_median_of_the_others():
+    values = WHOLE.values()
+    np.testing.assert_allclose(values["gain"], [1.1, 1.0, 0.9])
+    np.testing.assert_array_equal(values["clip"], [7.5, 7.5, 7.5])
+    assert values["dead"].tolist() == [False, True, False]
+    assert values["level"][1] == 2.5
+
+
+def test_true_readings_behind_raw_ones():
+    said = np.array([2.0, 1.0, 4.0]) * [1.1, 1, 0.9] + [0.1, 0, -0.3]
+    true = WHOLE.corrected(said / WHOLE.scale + 511.5)
+    np.testing.assert_allclose(true, [2.0, np.nan, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("hello", "is no calibration"),
+        ("format: 2", "is no calibration"),
+        ("format: 1\ncount: 2\n", "is no calibration"),
+        ("a: [", "cannot read"),
+        ("format: 1\ncount: 2\nsensors: {gian: 1}", "sensors takes gain, .* got gian"),
+        ("format: 1\ncount: 2\nsensors: {gain: [1]\n  ,noise: [1, 2]}", "as many numbers"),
+        ("format: 1\ncount: 2\nsensors: {gain: [1, x]}", "gain must be numbers from 0 up"),
+        ("format: 1\ncount: 2\nsensors: {noise: -1}", "noise must be numbers from 0 up"),
+        ("format: 1\ncount: 2\nsensors: {gain: 1}\nranges: {gain: [2, 1]}", r"ranges.gain must be \[low"),
+        ("format: 1\ncount: 2\nsensors: {gain: 1}\nbroken: {dead: [2]}", "breaks sensors 0 to 1"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(tmp_path, text, reason):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=reason):
+        read(path)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no calibration .*experiments/calibrate.py"):
+        read(tmp_path / "none.yaml")

@@ -1,0 +1,124 @@
+"""Which frames are a gesture."""
+
+from collections import Counter
+from time import sleep
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.labels import TOUCH, TOUCH_OR_NOT
+from skin.signal.frame import Frame
+from skin.signal.resampling import Window
+from skin.signal.segmentation import Announced, Continuous, Prompted, plan
+from skin.wire.announcement import Announcement, encode
+from skin.wire.listener import Tap
+
+LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}
+
+
+def frames(numbers, rate=100.0, segment=0):
+    return [Frame(n, n / rate, n / rate, np.array([float(n)]), np.array([True]), segment) for n in numbers]
+
+
+def window(seconds):
+    return Window(round(10 * seconds), 10.0, 1)
+
+
+def heard(*said):
+    """Return a tap that has heard announcements among other bytes, cut anywhere."""
+    data = b"1,2*00\n" + b"".join(map(encode, said)) + b"half a li"
+    pieces = [data[:20], data[20:]]
+    tap = Tap(lambda: SimpleNamespace(read=lambda: pieces.pop(0), close=lambda: None))()
+    assert tap.read() + tap.read() == data
+    return tap
+
+
+def shown(director, sequence):
+    return [take for frame in sequence if (take := director.show(frame))]
+
+
+def test_an_announced_gesture_is_its_frames():
+    director = Announced(window(0.3), heard(Announcement(0, 10, 30, LABELS)), TOUCH)
+    (take,) = shown(director, frames(range(60)))
+    assert [frame.seq for frame in take.frames] == list(range(10, 40))
+    assert (take.labels, take.lost, take.broken) == (LABELS, 0, False)
+
+
+def test_a_window_keeps_its_place_where_its_first_frames_are_lost():
+    director = Announced(window(0.3), heard(Announcement(0, 10, 30, LABELS)), TOUCH)
+    (take,) = shown(director, frames([*range(10), *range(14, 60)]))
+    assert take.begin == pytest.approx(0.1)
+    assert (take.frames[0].seq, take.frames[-1].seq, take.lost) == (14, 39, 4)
+
+
+def test_a_gesture_that_was_half_over_is_none():
+    director = Announced(
+        window(0.3), heard(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH
+    )
+    assert [take.number for take in shown(director, frames(range(15, 70)))] == [1]
+
+
+def test_windows_that_touch_each_other_are_two():
+    director = Announced(
+        window(0.1), heard(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH
+    )
+    assert [take.number for take in shown(director, frames(range(25)))] == [0, 1]
+
+
+def test_a_restart_breaks_a_gesture_off():
+    director = Announced(window(0.3), heard(Announcement(0, 0, 30, LABELS)), TOUCH)
+    (take,) = shown(director, frames(range(10)) + frames(range(5), segment=1))
+    assert take.broken
+
+
+def test_a_label_that_is_not_announced_is_missed():
+    with pytest.raises(InputError, match="no press"):
+        shown(
+            Announced(window(0.3), heard(Announcement(0, 0, 30, {"big": 1, "dynamic": 1})), TOUCH),
+            frames(range(3)),
+        )
+
+
+def test_a_touch_is_always_a_touch():
+    director = Announced(window(0.1), heard(Announcement(0, 0, 10, LABELS)), TOUCH_OR_NOT)
+    (take,) = shown(director, frames(range(20)))
+    assert take.labels["touch"] == 1
+
+
+def test_every_combination_once_per_repetition_in_another_order():
+    wanted = [tuple(labels.values()) for labels in plan(TOUCH.names, 3, seed=1)]
+    assert set(Counter(wanted).values()) == {3}
+    assert len(set(wanted[:16])) == 16
+    assert wanted[:16] != wanted[16:32]
+    assert wanted == [tuple(labels.values()) for labels in plan(TOUCH.names, 3, seed=1)]
+
+
+def test_a_person_begins_skips_and_ends():
+    said = []
+    director = Prompted(
+        window(0.1), enumerate(plan(TOUCH.names, 1, 0)), said.append, iter(["\n", "s\n", "\n"])
+    )
+    takes = []
+    for frame in frames(range(2000)):
+        if take := director.show(frame):
+            takes.append(take)
+        if director.over:
+            break
+        # Frames come while the person types.
+        sleep(0.001)
+    assert [take.number for take in takes] == [0, 2]
+    assert [len(take.frames) for take in takes] == [10, 10]
+    assert sum(line.startswith("next: ") for line in said) == 4
+    assert takes[0].labels == next(plan(TOUCH.names, 1, 0))
+
+
+def test_windows_one_after_the_other():
+    takes = shown(Continuous(window(0.1), first=5), frames(range(35)))
+    assert [(take.number, take.frames[0].seq) for take in takes] == [(5, 0), (6, 10), (7, 20)]
+
+
+def test_windows_that_wait_for_a_touch():
+    takes = shown(Continuous(window(0.1), wanted=lambda values: values[0] % 50 > 40), frames(range(120)))
+    assert [take.frames[0].seq for take in takes] == [41, 91]

@@ -1,0 +1,115 @@
+"""What a person meets at a real pseudo-terminal, beyond tests/port/test_open_skin.py."""
+
+import os
+import subprocess
+import sys
+from threading import Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from skin.body.sheet import Sheet
+from skin.config import ROOT
+from skin.device.serial import Serial
+from skin.hardware.live.loop import Session
+from skin.hardware.record.log import read
+from skin.hardware.record.recorder import record
+from skin.layout.grid import Grid
+from skin.wire.open import open_skin
+from skin.wire.tare import Tare
+from skin.wire.text import Header, encode_header, encode_line
+
+PATIENT = 300.0  # s: machines are busy at times
+SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+
+
+@pytest.mark.parametrize("script", ["listen.py", "record.py"])
+@pytest.mark.slow
+def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, script):
+    out = {"listen.py": [], "record.py": ["out=s.csv"]}[script]
+    with open_skin(plug.port):
+        done = subprocess.run(
+            [sys.executable, ROOT / "experiments" / script, f"device.port={plug.port}", *out],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=PATIENT,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr == f"{plug.port} is in use: close the serial monitor, or whatever else reads it\n"
+    assert not list(tmp_path.glob("s.csv*"))
+
+
+def test_time_that_goes_backwards_is_a_new_start(plug):
+    with open_skin(plug.port, range(2)) as skin:
+        moments = [(number, 10_000 * number) for number in range(5)] + [(5, 100), (6, 10_100)]
+        plug.send(*(encode_line([1, number], number, t) for number, t in moments))
+        frames = skin.read(7, timeout=PATIENT)
+        assert skin.stats.resets == 1
+    assert [(frame.segment, frame.after) for frame in frames[4:]] == [(0, ""), (1, "reset"), (1, "")]
+
+
+def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
+    rng = np.random.default_rng(0)
+    values = rng.integers(400, 600, (800, 6))
+    values[:, 1] = 0  # never a change
+    values[200:, 2] = 444  # none any more
+    values[-1, 3] = 1023  # the largest count
+    with open_skin(plug.port, range(6)) as skin:
+        plug.send(encode_header(Header(n=6, bits=10)))
+        plug.send(*(encode_line(row.tolist(), n, 10_000 * n) for n, row in enumerate(values)))
+        frames = skin.read(800, timeout=PATIENT)
+        line = Session(skin, Tare(None, 0.0, 10.0), None, None).line
+    assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
+    assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in line
+
+
+def sent(cable, stop, first=0):
+    """Send frames at a hundredth of a second each, ten times as fast, from number ``first`` on."""
+    rng, number = np.random.default_rng(first), 0
+    try:
+        while not stop():
+            if number % 100 == 0:
+                cable.send(encode_header(Header(n=4, rate=100.0, unit="N")))
+            cable.send(encode_line(rng.normal(scale=0.02, size=4).round(4), number, 10_000 * number))
+            number += 1
+            sleep(0.001)
+    except OSError:
+        return
+
+
+def test_an_unplugged_skin_is_recorded_on_with_a_gap_marker(new_plug, tmp_path):
+    link, path, said = tmp_path / "skin", tmp_path / "s.csv", []
+
+    def events(what):
+        return path.read_text().count(f'"event": "{what}"') if path.exists() else 0
+
+    def life():
+        """Be plugged in until a gesture is whole; be unplugged in the middle of the next, and come back."""
+        deadline = monotonic() + PATIENT
+        for end in (lambda: events("begin") >= 2, lambda: over):
+            cable = new_plug()
+            link.unlink(missing_ok=True)
+            os.symlink(cable.port, link)
+            ready.append(True)
+            sent(cable, lambda end=end: end() or monotonic() > deadline)
+            cable.unplug()
+
+    ready, over = [], []
+    thread = Thread(target=life, daemon=True)
+    thread.start()
+    while not ready:
+        sleep(0.001)
+    settings = {"window": 10, "tare": 1.0, "timeout": PATIENT, "backoff": (0.01, 0.05)}
+    device = Serial(body=SHEET, layout=Grid(2, 2), port=str(link), **settings)
+    record(device, path, 8.0, True, said.append)
+    over.append(True)
+    thread.join(PATIENT)
+    text = path.read_text()
+    assert text.count('"event": "gap", "after": "reconnect"') == 1
+    assert events("broken") == 1
+    assert events("end") >= 3
+    takes = read(path).takes
+    assert all(np.diff([frame.t for frame in take.frames]).max() < 0.02 for take, _ in takes.values())

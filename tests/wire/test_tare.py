@@ -1,0 +1,196 @@
+"""What numbers mean, and when the skin was untouched."""
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.signal.calibration import Calibration
+from skin.signal.frame import Frame
+from skin.wire.conversion import newtons
+from skin.wire.errors import SkinTouched
+from skin.wire.tare import Tare, settle
+from skin.wire.text import Header
+
+REST = np.array([512.0, 300.0, 40.0])
+RATE = 10.0  # Hz, of the model
+
+
+def frames(values, start=0.0, rate=100.0):
+    """Return frames of counts."""
+    times = start + np.arange(len(values)) / rate
+    return [Frame(None, t, t, row, np.ones(3, bool)) for t, row in zip(times, values, strict=True)]
+
+
+def noisy(count, seed=0):
+    """Return counts of an untouched skin."""
+    return REST + np.random.default_rng(seed).integers(-1, 2, (count, 3))
+
+
+class Watch:
+    """Shows frames to a tare and returns them in N, as the live view does; None before the tare."""
+
+    def __init__(self, tare):
+        self.tare = tare
+
+    @property
+    def waiting(self):
+        return self.tare.waiting
+
+    def __call__(self, frame):
+        self.tare.add(frame)
+        known = self.tare.newtons
+        if known is None:
+            return None
+        values, valid = known(frame.values, frame.valid)
+        return frame._replace(values=values, valid=valid)
+
+
+def watched(scale=None, tare=1.0, known=None, header=None):
+    """Return what turns the frames of three sensors into N."""
+    meaning = lambda baseline, told: newtons(3, baseline, scale, known, told)  # noqa: E731
+    return Watch(Tare(meaning, tare, RATE, lambda: header))
+
+
+def test_force_is_counted_from_the_first_quiet_second():
+    watch = watched(scale=0.01)
+    touched = noisy(150)
+    touched[:, 1] += np.linspace(0, 400, 150)
+    assert all(watch(one) is None for one in frames(touched))
+    assert "touched: channel 1" in watch.waiting
+    quiet = [watch(one) for one in frames(noisy(300), start=1.5)]
+    first = next(number for number, one in enumerate(quiet) if one is not None)
+    assert 90 <= first <= 180
+    assert watch.waiting == ""
+    pressed = watch(frames([REST + 200])[0])
+    np.testing.assert_allclose(pressed.values, 2.0, atol=0.021)
+
+
+def test_the_baseline_is_that_of_maxima_over_the_intervals_of_the_model():
+    """The window shows maxima, of which an untouched skin's must be 0."""
+    watch, rows = watched(scale=1.0), noisy(400)
+    shown = [one.values for row in frames(rows) if (one := watch(row)) is not None]
+    highest = np.stack(shown)[: len(shown) // 10 * 10].reshape(-1, 10, 3).max(axis=1)
+    assert np.median(highest, axis=0).tolist() == [0, 0, 0]
+
+
+def test_a_device_that_sends_newtons_says_so():
+    watch = watched(tare=0, header=Header(unit="N"))
+    np.testing.assert_allclose(watch(frames(np.array([[1.0, 2.0, 3.0]]))[0]).values, [1, 2, 3])
+
+
+def test_a_device_may_tell_its_unit_a_little_late():
+    told = []
+    tare = Tare(
+        lambda baseline, header: newtons(3, baseline, None, None, header),
+        0.0,
+        RATE,
+        lambda: told[0] if told else None,
+    )
+    watch = Watch(tare)
+    assert watch(frames(noisy(1))[0]) is None
+    assert watch.waiting == "waiting for the device to tell its unit"
+    told.append(Header(unit="N"))
+    assert watch(frames(noisy(1), start=0.5)[0]) is not None
+
+
+def test_counts_without_a_scale_are_refused():
+    with pytest.raises(InputError, match=r"sends adc, .* device\.scale="):
+        watched(header=Header(unit="adc", bits=10))(frames(noisy(1))[0])
+    watch = watched()
+    with pytest.raises(InputError, match=r"values of no unit, .* device\.scale="):
+        list(map(watch, frames(noisy(400))))
+
+
+def test_a_tare_too_short_for_a_baseline_is_refused():
+    watch = watched(scale=1.0, tare=0.5)
+    with pytest.raises(InputError, match="10 frames, got 5: give more seconds"):
+        list(map(watch, frames(noisy(200))))
+
+
+def test_a_calibration_gives_scale_gains_and_broken_sensors():
+    known = Calibration(
+        {"gain": [0.5, 1.0, 1.0], "offset": [0.1, 0.2, 0.0]}, {"dead": [2]}, scale=0.02, zero=512
+    )
+    raw = np.array([612.0, 612.0, 0.0])
+    one = watched(tare=0, known=known)(frames([raw])[0])
+    np.testing.assert_allclose(one.values[:2], known.corrected(raw)[:2])
+    assert one.valid.tolist() == [True, True, False]
+
+
+FAST = 100.0  # Hz, of the device
+
+
+class Played:
+    """Hands out frames made before, as a skin does: ``force`` (F,) on the first of two channels."""
+
+    def __init__(self, force, rate=FAST, segments=None):
+        noise = np.random.default_rng(0).normal(scale=0.1, size=(len(force), 2))
+        values = 500 + noise + np.column_stack([force, np.zeros(len(force))])
+        segments = np.zeros(len(force), dtype=int) if segments is None else segments
+        self.frames = [
+            Frame(n, n / rate, n / rate, row, np.ones(2, dtype=bool), segment=int(segment))
+            for n, (row, segment) in enumerate(zip(values, segments, strict=True))
+        ]
+        self.taken = 0
+
+    def read(self, count):
+        self.taken += count
+        return self.frames[self.taken - count : self.taken]
+
+
+def settled(played, seconds, said=None):
+    """Return the frames that settling took, and the baseline."""
+    tare = Tare(lambda baseline, header: newtons(2, baseline, 1.0, None, header), seconds, RATE)
+    tell = (lambda _: None) if said is None else said.append
+    return settle(played, tare, RATE, seconds, tell), tare.newtons.zero
+
+
+def test_an_untouched_skin_gives_its_baseline_at_once():
+    said = []
+    frames, baseline = settled(Played(np.zeros(1000)), 2.0, said)
+    assert baseline == pytest.approx([500.0, 500.0], abs=0.3)
+    assert 2.0 <= frames[-1].t <= 2.1
+    assert len(said) == 1
+
+
+def test_it_waits_until_the_skin_is_let_go():
+    force = np.zeros(3000)
+    force[50:420] = 80 * np.sin(np.linspace(0, 3 * np.pi, 370)) ** 2
+    said = []
+    frames, baseline = settled(Played(force), 2.0, said)
+    assert baseline == pytest.approx([500.0, 500.0], abs=0.3)
+    # All frames are there, for a recording keeps them; the last two seconds of them are after the touch.
+    assert [frame.seq for frame in frames] == list(range(len(frames)))
+    assert 6.1 <= frames[-1].t <= 6.4
+    assert said[1:] == ["the skin is touched: let go"]
+
+
+def test_it_does_not_wait_for_ever():
+    force = 80 * np.sin(np.arange(9000) / 40)
+    with pytest.raises(SkinTouched, match="touched"):
+        settled(Played(force), 2.0)
+
+
+def test_a_short_tare_is_refused_at_once():
+    played = Played(np.zeros(1000))
+    with pytest.raises(InputError, match="10 frames, got 5"):
+        settled(played, 0.5)
+    assert played.taken < 150
+
+
+def test_a_device_that_starts_anew_is_listened_to_anew():
+    frames, _ = settled(Played(np.zeros(1000), segments=np.arange(1000) // 120), 1.0)
+    assert frames[0].segment == 0
+    frames, _ = settled(Played(np.zeros(1000), segments=np.arange(1000) > 70), 1.0)
+    assert {frame.segment for frame in frames} == {1}
+
+
+def test_without_tare_only_the_rate_is_read():
+    frames, baseline = settled(Played(np.full(1000, 50.0)), 0.0)
+    assert not baseline.any()
+    assert frames[-1].t <= 1.1
+
+
+def test_a_slow_device_is_refused():
+    with pytest.raises(InputError, match="rate"):
+        settled(Played(np.zeros(100), rate=4.0), 2.0)

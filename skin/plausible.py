@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from skin.body._given import positive
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 
 __all__ = ["check", "warn_of_surface"]
 

@@ -13,7 +13,7 @@ from skin.body._memory import require_memory
 from skin.body._variation import along, check_variation, factors
 
 if TYPE_CHECKING:
-    from skin.layout.base import Sensors
+    from skin.sensors import Sensors
 
 __all__ = ["AbstractBody", "Layer", "overlaps"]
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from skin.contact._unilateral import Equilibrium
-from skin.contact.base import Ground
 from skin.labels import measure
+from skin.touch.problem import ContactProblem
 
 __all__ = ["Found", "seek"]
 
@@ -41,7 +41,7 @@ def seek(
     begin: torch.Tensor,
     peak: np.ndarray,
     wanted: np.ndarray,
-    ground: Ground,
+    ground: ContactProblem,
 ) -> Found:
     """Find loads at which single frames are big or small, dangerous or safe, as wanted.
 
@@ -101,7 +101,9 @@ class _Search:
     failed: np.ndarray
 
     @classmethod
-    def of(cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, ground: Ground) -> "_Search":
+    def of(
+        cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, ground: ContactProblem
+    ) -> "_Search":
         """Begin at the drawn peaks (B,), Pa, within their ranges; the rest is as :func:`seek` has it."""
         settings, cell = ground.settings, ground.shapes.body.cell
         ends = np.where(wanted[:, 1:], settings.dangerous_peak, settings.safe_peak)
@@ -153,7 +155,7 @@ class _Search:
         return rows
 
 
-def _classes(pressure: torch.Tensor, ground: Ground) -> tuple[np.ndarray, np.ndarray]:
+def _classes(pressure: torch.Tensor, ground: ContactProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return the highest cell (b,), Pa, and the classes big and dangerous (b, 2) of frames."""
     body, thresholds = ground.shapes.body, ground.settings.thresholds
     frames = pressure.float().view(-1, *body.shape)

@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.contact.base import AbstractContact, Ground, Pressed, Strokes
+from skin.contact.base import AbstractContact
 from skin.simulator.base import AbstractSimulator
+from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
 __all__ = ["Prescribed"]
 
@@ -28,7 +29,7 @@ class Prescribed(AbstractContact):
     def __init__(self, body: AbstractBody | None = None, simulator: AbstractSimulator | None = None) -> None:
         del body, simulator
 
-    def press(self, strokes: Strokes, ground: Ground) -> Pressed:
+    def press(self, strokes: Trajectories, ground: ContactProblem) -> ContactResult:
         """Return pictures at the force at which the gesture's highest cell has the wanted pressure."""
         frames = ground.shapes.render(*strokes.poses)
         # Equation 2: the drawn peak is the largest cell of the whole movie.
@@ -38,4 +39,4 @@ class Prescribed(AbstractContact):
         owner = torch.from_numpy(strokes.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
         none = np.zeros(len(force), bool)
-        return Pressed(frames, force, strokes.peak, none, none)
+        return ContactResult(frames, force, strokes.peak, none, none)

@@ -10,9 +10,10 @@ from skin.body.base import AbstractBody
 from skin.contact._force import Found, seek
 from skin.contact._grain import with_grain
 from skin.contact._unilateral import Equilibrium, solve
-from skin.contact.base import AbstractContact, Ground, Pressed, Strokes
+from skin.contact.base import AbstractContact
 from skin.errors import InputError
 from skin.simulator.base import AbstractSimulator
+from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
 __all__ = ["Rigid"]
 
@@ -71,7 +72,7 @@ class Rigid(AbstractContact):
         self.tolerance, self.iterations = tolerance, iterations
         self.compliance = with_grain(simulator.compliance().detach().cpu().double(), body).float()
 
-    def press(self, strokes: Strokes, ground: Ground) -> Pressed:
+    def press(self, strokes: Trajectories, ground: ContactProblem) -> ContactResult:
         """Return the pressure at the force that gives the wanted classes, if there is one."""
         body = ground.shapes.body
         cell = body.cell[0] * body.cell[1]
@@ -104,9 +105,9 @@ class Rigid(AbstractContact):
         dangerous = strokes.wanted[:, 3]
         refused |= highest > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
         refused |= lost > 0
-        return Pressed(frames, force, highest, refused, found.area, lost)
+        return ContactResult(frames, force, highest, refused, found.area, lost)
 
-    def gap(self, strokes: Strokes, ground: Ground) -> Tensor:
+    def gap(self, strokes: Trajectories, ground: ContactProblem) -> Tensor:
         """Return how far the object is above each cell when its highest point touches, (U, H * W), m.
 
         Infinite where there is no object. On an arm the object comes down along the normal at its middle, and
@@ -122,7 +123,7 @@ class Rigid(AbstractContact):
         return lower - lower.amin(1, keepdim=True)
 
     def _sought(
-        self, strokes: Strokes, gap: Tensor, telling: np.ndarray, ground: Ground
+        self, strokes: Trajectories, gap: Tensor, telling: np.ndarray, ground: ContactProblem
     ) -> tuple[Found, np.ndarray]:
         """Return the loads of each gesture's telling frame, and how many of these were not found."""
         own = gap[torch.from_numpy(telling)]
@@ -155,7 +156,7 @@ def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
     return torch.from_numpy(below).float()
 
 
-def _telling(strokes: Strokes, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
+def _telling(strokes: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
     """Return the frame of each gesture that covers a sensor best, of those under its largest force, (B,)."""
     cover = (gap.isfinite().float() @ footprints.T).amax(1).double().numpy()
     strongest = strokes.share >= full[strokes.owner] * (1 - 1e-9)

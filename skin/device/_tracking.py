@@ -78,13 +78,13 @@ def _estimated(device: "Simulated") -> Tracker:
     body = replace(device.body, variation=0.0)
     model = device.simulator(body, device.sensors)
     # Not the device's own sampler: its labels know where the sensors truly are.
-    contact = device.contact and device.contact(body, model)
-    sampler = TouchSampler(body, body.footprints(device.sensors), device.touch, device.padded, contact)
+    contact = device.contact(body, model)
+    sampler = TouchSampler(body, body.footprints(device.sensors), contact, device.touch, device.padded)
     randomness = generator(Stream.TRACKING, device.data_seed)
     with torch.no_grad():
         movie = sampler.sample(_GESTURES, randomness)
         motion = _motion(model, movie)
-        force = movie.respond(model, displacement=False).readings
+        force = model.respond(movie, displacement=False).readings
     constants = device.imperfection.constants(len(device.sensors), randomness, len(movie))
     readings, *_ = device.imperfection.apply(force, constants, randomness)
     ridge = RidgeCV(_PENALTIES, fit_intercept=False, alpha_per_target=True)

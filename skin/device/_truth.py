@@ -8,9 +8,9 @@ import torch
 
 from skin.errors import InputError
 from skin.labels import TOUCH
-from skin.layout.base import Sensors
 from skin.recording import Recording, Touches
 from skin.rng import Stream, generator
+from skin.sensors import Sensors
 from skin.simulator._relaxation import Relaxing, relaxes
 from skin.simulator.base import AbstractSimulator
 from skin.touch.sampler import Movie
@@ -54,7 +54,7 @@ def true_readings(device: "Simulated", movie: Movie, complete: bool) -> Recordin
         movie: of the gestures.
         complete: with the displacements and, where mechanics tell it, each gesture's largest ``strain``.
     """
-    readings, displacement = movie.respond(device.model, displacement=complete)
+    readings, displacement = device.model.respond(movie, displacement=complete)
     positions = torch.from_numpy(device.sensors.positions).float()
     valid = torch.ones_like(readings, dtype=torch.bool)
     labels = torch.cat([movie.labels, movie.slides], dim=1) if device.direction else movie.labels

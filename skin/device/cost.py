@@ -14,9 +14,10 @@ from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import Task
 from skin.layout._grid import grid
-from skin.layout.base import AbstractLayout, Sensors
+from skin.layout.base import AbstractLayout
 from skin.recording import Touches
 from skin.rng import Stream, generator
+from skin.sensors import Sensors
 
 __all__ = ["GESTURES", "VARIANTS", "Cost"]
 

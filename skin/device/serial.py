@@ -19,12 +19,12 @@ from skin.recording import Recording, Touches
 from skin.signal.calibration import read
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.signal.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.wire.conversion import Newtons, newtons
 from skin.wire.detect import Format
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.listener import Tap
 from skin.wire.open import open_skin
+from skin.wire.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare, settle
 from skin.wire.text import Header

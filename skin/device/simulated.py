@@ -11,15 +11,17 @@ from torch import Tensor
 from skin import __version__
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
+from skin.contact.prescribed import Prescribed
 from skin.device._threads import in_threads
 from skin.device._tracking import tracker
 from skin.device._truth import true_model, true_readings, true_sensors
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
-from skin.layout.base import AbstractLayout, Sensors
+from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches, join
 from skin.rng import Stream, generator
+from skin.sensors import Sensors
 from skin.signal.imperfection import Imperfection
 from skin.simulator.base import AbstractSimulator
 from skin.summary import summarise
@@ -40,13 +42,11 @@ class Simulated(AbstractDevice):
     of randomness that no training seed can draw, and are the same for all of them.
 
     Args:
-        body: the sheet.
-        layout: where the sensors are.
+        body, layout: the sheet, and where its sensors are.
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
-        contact: ``contact(body, simulator)`` makes pressure of them; None: their pictures are it.
+        contact: ``contact(body, simulator)`` makes pressure of them.
         touch: difficulty of the gestures (``conf/touch.yaml``).
-        gestures: the budget.
-        test_gestures: how many gestures ``test`` has.
+        gestures, test_gestures: how many the budget and ``test`` have.
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
         stream: touches are windows of streams of gestures with idle gaps between them: a window shows part
@@ -69,7 +69,7 @@ class Simulated(AbstractDevice):
     body: AbstractBody
     layout: AbstractLayout
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
-    contact: Callable[[AbstractBody, AbstractSimulator], AbstractContact] | None = None
+    contact: Callable[[AbstractBody, AbstractSimulator], AbstractContact] = Prescribed
     touch: Mapping[str, Any] | GestureSettings | None = None
     gestures: int = 4038
     test_gestures: int = 4000
@@ -107,8 +107,8 @@ class Simulated(AbstractDevice):
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         true = true_sensors(self)
         self.model = true_model(self, true)
-        contact = self.contact and self.contact(self.body, self.model)
-        self.sampler = TouchSampler(self.body, self.body.footprints(true), self.touch, self.padded, contact)
+        contact = self.contact(self.body, self.model)
+        self.sampler = TouchSampler(self.body, self.body.footprints(true), contact, self.touch, self.padded)
         self.window = self.sampler.settings.window
         if self.sampler.settings.shear:
             self.model.refuse_drag()
@@ -170,8 +170,9 @@ class Simulated(AbstractDevice):
         counts["holdout"] = self.gestures - training - middle
         if split is None:
             return join([self._streams(name, complete) for name in counts])
-        key = self.data_seed, list(counts).index(split)
-        return self._keep(split, complete, Stream.BUDGET, counts[split], *key)
+        return self._keep(
+            split, complete, Stream.BUDGET, counts[split], self.data_seed, [*counts].index(split)
+        )
 
     def _keep(self, name: str, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
         if complete:
@@ -237,10 +238,8 @@ class Simulated(AbstractDevice):
         return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
-        return {
-            "source": "simulated",
-            "simulator": type(self.model).__name__,
-            "split": split or "budget",
+        about = {"source": "simulated", "simulator": type(self.model).__name__, "split": split or "budget"}
+        return about | {
             "epoch": epoch,
             "device_seed": self.seed,
             "data_seed": self.data_seed,

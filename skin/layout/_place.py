@@ -7,7 +7,7 @@ import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 
 __all__ = ["place"]
 

@@ -1,42 +1,11 @@
 """What a sensor layout is."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
-
-import numpy as np
 
 from skin.body.base import AbstractBody
+from skin.sensors import Sensors
 
-__all__ = ["AbstractLayout", "Sensors"]
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """Sensors placed in a body.
-
-    Attributes:
-        positions: (S, 3), m: x to the right and y downwards from the body's upper left corner, z the depth
-            below the surface. The order of the sensors is the order of the readings everywhere.
-        footprint: extent (x, y) of the area over which one sensor feels, m.
-        normals: (S, 3), unit vectors n, in the local frame (x, y, into the skin), along which each sensor
-            feels: it reads n . sigma . n. One (3,) holds for all; by default they face the surface.
-    """
-
-    positions: np.ndarray
-    footprint: tuple[float, float]
-    normals: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-
-    def __post_init__(self) -> None:
-        normals = np.broadcast_to(np.asarray(self.normals, dtype=float), self.positions.shape)
-        object.__setattr__(self, "normals", normals.copy())
-
-    @property
-    def tilted(self) -> np.ndarray:
-        """Which sensors do not face the surface, (S,), bool; up or down reads the same."""
-        return (self.normals[:, :2] != 0).any(axis=1)
-
-    def __len__(self) -> int:
-        return len(self.positions)
+__all__ = ["AbstractLayout"]
 
 
 class AbstractLayout(ABC):

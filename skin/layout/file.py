@@ -10,7 +10,8 @@ import numpy as np
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout._place import place
-from skin.layout.base import AbstractLayout, Sensors
+from skin.layout.base import AbstractLayout
+from skin.sensors import Sensors
 
 __all__ = ["File"]
 

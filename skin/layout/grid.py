@@ -8,7 +8,8 @@ from skin.body.base import AbstractBody
 from skin.layout._facing import rosette
 from skin.layout._grid import grid
 from skin.layout._place import place
-from skin.layout.base import AbstractLayout, Sensors
+from skin.layout.base import AbstractLayout
+from skin.sensors import Sensors
 
 __all__ = ["Grid"]
 

@@ -9,7 +9,8 @@ from skin.errors import InputError
 from skin.layout._facing import rosette
 from skin.layout._grid import grid
 from skin.layout._place import place
-from skin.layout.base import AbstractLayout, Sensors
+from skin.layout.base import AbstractLayout
+from skin.sensors import Sensors
 
 __all__ = ["Scattered"]
 

@@ -8,8 +8,8 @@ import torch
 
 from skin.contact._grain import with_grain
 from skin.contact._unilateral import solve
-from skin.layout.base import Sensors
 from skin.proof.basics import skin
+from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator.solid import Solid, hexahedra, readings
 

@@ -8,10 +8,10 @@ import numpy as np
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
-from skin.layout.base import Sensors
 from skin.proof.blocks import WALLS, block, held, solve
 from skin.proof.finding import Finding, Outcome, compared
 from skin.proof.layered import Slab
+from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import hexahedra, readings

@@ -5,12 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import scipy.sparse as sp
 
-from skin.layout.base import Sensors
 from skin.proof.basics import SLABS, stack
 from skin.proof.blocks import WALLS, block, held, row_means, solve
 from skin.proof.direct import locking
 from skin.proof.finding import Curve, Finding, Outcome, Picture, compared
 from skin.proof.layered import Slab, bonded_layer, patch
+from skin.sensors import Sensors
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import readings
 

@@ -15,10 +15,10 @@ from scipy.sparse.linalg import spsolve
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.layout.base import Sensors
 from skin.proof.basics import skin
 from skin.proof.direct import solve_frame
 from skin.proof.finding import Finding, Outcome, compared
+from skin.sensors import Sensors
 from skin.simulator import _pynite
 from skin.simulator._assembly import Structure
 from skin.simulator._elastic import Elastic

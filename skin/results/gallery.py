@@ -62,7 +62,7 @@ def draw_skin(device: Simulated, folder: Path, name: str = "fem") -> list[Path]:
     movie = device.sampler.sample(64, np.random.default_rng(0))
     chosen = int((movie.labels[:, 1:].all(1) & (movie.labels[:, 0] == 0)).nonzero()[0])
     simulators = {"naive": Naive(device.body, device.sensors), name: device.model}
-    readings = {name: movie.respond(model).readings[chosen] for name, model in simulators.items()}
+    readings = {name: model.respond(movie).readings[chosen] for name, model in simulators.items()}
 
     blurred = drawn["shape"] == device.sampler.shapes.names.index("blurred_disc")
     presses = (blurred & ~labels["dynamic"] & labels["press"]).nonzero()[:, 0]
@@ -107,7 +107,7 @@ def _press(device: Simulated, labels: Sequence[bool]) -> tuple[Movie, int]:
 def _overview(device: Simulated, folder: Path) -> Path:
     """Draw a big, sliding, dangerous press of the hand, or of whatever presses where there is no hand."""
     movie, chosen = _press(device, [True] * 4)
-    readings = movie.respond(device.model).readings[chosen]
+    readings = device.model.respond(movie).readings[chosen]
     frame = int(readings.sum(1).argmax())
     positions = torch.from_numpy(device.sensors.positions).float()
     picture = _pictures(readings[None], positions, device.size)["cubic"]

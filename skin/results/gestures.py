@@ -17,7 +17,7 @@ from skin.hardware.record import log
 from skin.labels import TOUCH
 from skin.recording import Touches
 from skin.rng import Stream, generator
-from skin.signal.segmentation import sentence
+from skin.wire.segmentation import sentence
 
 __all__ = ["Gestures", "Pair", "marked", "read", "touches"]
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from skin.results.compare import Verdicts, agreement
 from skin.results.figures import COLOURS, save
 from skin.results.gestures import Gestures
-from skin.signal.segmentation import sentence
+from skin.wire.segmentation import sentence
 
 __all__ = ["figure", "page"]
 

@@ -40,7 +40,7 @@ def simulated(device: Simulated, labels: Sequence[str], shape: str | None, seed:
     generator = np.random.default_rng(seed)
     wanted = np.array([[name in labels for name in TOUCH.names]])
     movie = device.sampler.sample(1, generator, wanted)
-    true = movie.respond(device.model, displacement=False).readings
+    true = device.model.respond(movie, displacement=False).readings
     readings, *_ = device.imperfection.apply(true, device.constants, generator)
     pressure = movie.pressure()[0]
     moved = None

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from skin.errors import InputError
+from skin.lag import lagged, rounded, unloading
 from skin.signal.calibration import Calibration, read
-from skin.signal.lag import lagged, rounded, unloading
 
 __all__ = ["Constants", "Imperfection"]
 

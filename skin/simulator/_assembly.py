@@ -14,7 +14,7 @@ from scipy import sparse
 
 from skin.body.base import AbstractBody, overlaps
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator import _beam, _plate
 
 __all__ = ["Constraint", "Structure"]

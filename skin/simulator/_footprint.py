@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 
 __all__ = ["quadrature"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from skin.body._memory import require_memory
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator import _store
 from skin.simulator._assembly import Structure
 from skin.simulator._factors import factorised

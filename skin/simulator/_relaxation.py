@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from skin.body.base import AbstractBody
-from skin.layout.base import Sensors
-from skin.signal.lag import lagged
+from skin.lag import lagged
+from skin.sensors import Sensors
 from skin.simulator.base import AbstractSimulator, Response
 
 __all__ = ["Relaxing", "elastic", "relaxes", "speeds", "times"]

@@ -6,7 +6,8 @@ from typing import ClassVar, NamedTuple
 from torch import Tensor, nn
 
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
+from skin.touch.movie import Movie
 
 __all__ = ["AbstractSimulator", "Response"]
 
@@ -86,6 +87,16 @@ class AbstractSimulator(nn.Module, ABC):
         if moves is None or not displacement:
             return Response(shown, None)
         return Response(shown, moves[index] * scale[..., None, None])
+
+    def respond(self, movie: Movie, displacement: bool = True) -> Response:
+        """Return the readings (B, T, S), N, of gestures, and the displacement (B, T, S, 2), m.
+
+        The displacement is None if the simulator knows none, or if it is not asked for.
+        """
+        home = next(self.buffers(), movie.frames).device
+        drag = None if movie.drag is None else movie.drag.to(home)
+        index, scale = movie.index.to(home), movie.scale.to(home)
+        return self.play(movie.frames.to(home), index, scale, drag, displacement)
 
     def refuse_drag(self) -> None:
         """Raise an InputError that says which simulator feels friction, unless this one does."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator._assembly import Constraint, Structure
 from skin.simulator._frames import flatten
 from skin.simulator._operator import Operator, cached

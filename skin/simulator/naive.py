@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from skin.body.base import AbstractBody
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator._frames import flatten
 from skin.simulator.base import AbstractSimulator, Response
 

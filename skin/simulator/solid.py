@@ -12,8 +12,8 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout.base import Sensors
 from skin.material import MATERIALS
+from skin.sensors import Sensors
 from skin.simulator import _store
 from skin.simulator._elastic import Elastic
 from skin.simulator._footprint import quadrature

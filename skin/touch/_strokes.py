@@ -5,14 +5,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from skin.contact.base import Strokes
 from skin.touch.gesture import Draws, GestureSettings, fold
+from skin.touch.problem import Trajectories
 
 __all__ = ["Course", "course"]
 
 
 class Course(NamedTuple):
-    """Strokes and the way that they take.
+    """Trajectories and the way that they take.
 
     Attributes:
         strokes: the frames (U,) of gestures (B,).
@@ -22,7 +22,7 @@ class Course(NamedTuple):
         travel: (B,), how far it gets from its first place, m.
     """
 
-    strokes: Strokes
+    strokes: Trajectories
     way: np.ndarray
     first: np.ndarray
     net: np.ndarray
@@ -59,7 +59,7 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
 
     share = np.zeros(len(owner))
     np.maximum.at(share, index, scale)
-    strokes = Strokes(
+    strokes = Trajectories(
         owner,
         gestures["shape"][owner],
         gestures["angle"][owner],

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from skin.labels import sliding
-from skin.simulator.base import AbstractSimulator, Response
 
 __all__ = ["Movie", "join"]
 
@@ -72,16 +71,6 @@ class Movie:
     def pressure(self) -> Tensor:
         """Return the dense movie, (B, T, H, W), Pa."""
         return self.frames[self.index] * self.scale[..., None, None]
-
-    def respond(self, simulator: AbstractSimulator, displacement: bool = True) -> Response:
-        """Return a simulator's readings (B, T, S), N, and displacement (B, T, S, 2), m.
-
-        The displacement is None if the simulator knows none, or if it is not asked for.
-        """
-        home = next(simulator.buffers(), self.frames).device
-        drag = None if self.drag is None else self.drag.to(home)
-        index, scale = self.index.to(home), self.scale.to(home)
-        return simulator.play(self.frames.to(home), index, scale, drag, displacement)
 
 
 def join(movies: Sequence[Movie]) -> Movie:

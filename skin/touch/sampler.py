@@ -8,8 +8,6 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.contact.base import AbstractContact, Ground, Pressed
-from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
 from skin.labels import TOUCH, measure
 from skin.touch._bodies import Fit
@@ -17,6 +15,7 @@ from skin.touch._strokes import course
 from skin.touch._tally import Tally
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
 from skin.touch.movie import Movie, join
+from skin.touch.problem import Contact, ContactProblem, ContactResult
 from skin.touch.shapes import Shapes
 
 __all__ = ["Movie", "TouchSampler", "balanced", "join"]
@@ -45,9 +44,9 @@ class TouchSampler:
     Args:
         body: the sheet.
         footprints: (S, H * W), area weights of each sensor that sum to 1 (``AbstractBody.footprints``).
+        contact: what pressure gestures make.
         settings: the difficulty, as ``conf/touch.yaml`` gives it.
         padded: gestures begin at a random frame of the window, not at its first.
-        contact: what pressure they make; None: their pictures are it.
 
     Raises:
         InputError: settings or pictures that cannot be used.
@@ -57,16 +56,16 @@ class TouchSampler:
         self,
         body: AbstractBody,
         footprints: np.ndarray,
+        contact: Contact,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
-        contact: AbstractContact | None = None,
     ) -> None:
         self.body = body
         self.settings = GestureSettings.of(settings)
         self.padded = padded
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
         self.shapes = Shapes(self.settings.shapes, body, self.settings.thresholds.contact)
-        self.contact = contact or Prescribed()
+        self.contact = contact
 
     @cached_property
     def fit(self) -> Fit | None:
@@ -147,11 +146,11 @@ class TouchSampler:
         given_up = pressed.hopeless.reshape(-1, ahead).any(axis=1) & ~chosen
         return chosen, given_up, movie[torch.from_numpy(first[chosen])]
 
-    def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, Pressed]:
+    def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
         """Return the movie of gestures (B,), with the labels that it gives."""
         settings = self.settings
         taken = course(gestures, wanted, settings, self.contact.proportional)
-        pressed = self.contact.press(taken.strokes, Ground(self.shapes, self.footprints, settings))
+        pressed = self.contact.press(taken.strokes, ContactProblem(self.shapes, self.footprints, settings))
         shown, shares = taken.strokes.index, taken.strokes.profile
         measures = measure(
             pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact

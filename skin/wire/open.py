@@ -1,11 +1,11 @@
 """The door: a serial port, a socket, a recording or the simulator, all behind one skin."""
 
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from math import inf
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 import numpy as np
 
@@ -19,12 +19,20 @@ from skin.wire.skin import Skin
 from skin.wire.transport import ByteStream, open_wire
 
 if TYPE_CHECKING:
-    from skin.device.simulated import Simulated
     from skin.recording import Touches
 
-__all__ = ["Settings", "open_skin"]
+__all__ = ["Settings", "Streamed", "open_skin"]
 
 _STRIP = 600.0  # s of simulated touches in one piece
+
+
+class Streamed(Protocol):
+    """A device whose touches come in streams, such as :class:`skin.device.simulated.Simulated`."""
+
+    rate: float
+
+    def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Any:
+        """Return a stream in one piece; ``whole.touches`` are its touches."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +86,7 @@ def open_skin(
     layout: Sized | None = None,
     *,
     opener: Callable[[], ByteStream] | None = None,
-    device: "Simulated | None" = None,
+    device: "Streamed | None" = None,
     baseline: np.ndarray | None = None,
     **settings: Any,
 ) -> Skin:
@@ -151,13 +159,13 @@ def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
     return Player(_pieces(touches), touches.rate, realtime)
 
 
-def _simulated(device: "Simulated | None", realtime: bool) -> Player:
+def _simulated(device: "Streamed | None", realtime: bool) -> Player:
     if device is None:
         raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
     return Player(_strips(device), device.rate, realtime)
 
 
-def _strips(device: "Simulated") -> Iterator[Piece]:
+def _strips(device: "Streamed") -> Iterator[Piece]:
     for number in count():
         yield from _pieces(device.strip(max(1, round(_STRIP * device.rate)), number=number).whole.touches)
 

@@ -5,7 +5,7 @@ import pytest
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -6,7 +6,6 @@ import torch
 
 from skin.body.arm import Arm
 from skin.body.sheet import Sheet
-from skin.contact.base import Ground, Strokes
 from skin.contact.prescribed import Prescribed
 from skin.contact.rigid import Rigid
 from skin.device._threads import in_threads
@@ -16,6 +15,7 @@ from skin.layout.grid import Grid
 from skin.simulator.base import AbstractSimulator, Response
 from skin.simulator.naive import Naive
 from skin.touch.gesture import GestureSettings
+from skin.touch.problem import ContactProblem, Trajectories
 from skin.touch.sampler import TouchSampler
 from skin.touch.shapes import Shapes
 
@@ -45,21 +45,21 @@ def rigid(**settings) -> Rigid:
 
 
 def sampler(contact=None, **settings) -> TouchSampler:
-    return TouchSampler(BODY, BODY.footprints(SENSORS), settings, True, contact)
+    return TouchSampler(BODY, BODY.footprints(SENSORS), contact or Prescribed(), settings, True)
 
 
-def ground(**settings) -> Ground:
+def ground(**settings) -> ContactProblem:
     given = GestureSettings.of(settings)
     shapes = Shapes(given.shapes, BODY, given.thresholds.contact)
-    return Ground(shapes, torch.from_numpy(BODY.footprints(SENSORS)).float(), given)
+    return ContactProblem(shapes, torch.from_numpy(BODY.footprints(SENSORS)).float(), given)
 
 
 def still(
     scale: float, place=(0.08, 0.08), peak: float = 50e3, shares=(1.0,), wanted=(0, 0, 0, 0)
-) -> Strokes:
+) -> Trajectories:
     """Return one gesture of the first shape that stands still, at several shares of its force."""
     count = len(shares)
-    return Strokes(
+    return Trajectories(
         np.zeros(count, int),
         np.zeros(count, int),
         np.zeros(count),

@@ -10,8 +10,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from skin.errors import InputError
-from skin.layout.base import AbstractLayout, Sensors
+from skin.layout.base import AbstractLayout
 from skin.layout.grid import Grid
+from skin.sensors import Sensors
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
 

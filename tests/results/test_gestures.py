@@ -17,9 +17,9 @@ from skin.results import gestures as compared
 from skin.results.compare import Verdicts
 from skin.results.gestures_page import figure, page
 from skin.signal.frame import Frame
-from skin.signal.segmentation import Take
 from skin.simulator.naive import Naive
 from skin.wire.conversion import Newtons
+from skin.wire.segmentation import Take
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8

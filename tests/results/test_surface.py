@@ -8,10 +8,10 @@ from PIL import Image
 from skin.body.arm import Arm
 from skin.body.sheet import Sheet
 from skin.build import build_device
-from skin.layout.base import Sensors
 from skin.layout.grid import Grid
 from skin.results.gallery import draw_skin
 from skin.results.surface import deflection, surface, surface_motion
+from skin.sensors import Sensors
 from skin.simulator._assembly import Structure
 from skin.simulator._operator import build
 from skin.simulator.naive import Naive

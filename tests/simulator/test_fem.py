@@ -10,9 +10,9 @@ from scipy.special import erf
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.layout.base import Sensors
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
+from skin.sensors import Sensors
 from skin.simulator._assembly import Structure
 from skin.simulator._operator import build
 from skin.simulator.fem import PlatesAndBeams

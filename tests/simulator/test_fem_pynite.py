@@ -7,7 +7,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
 from skin.body.sheet import Sheet
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator import _pynite
 from skin.simulator._assembly import Structure
 from skin.simulator.fem import PlatesAndBeams

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator.naive import Naive
 
 BODY = Sheet([0.04, 0.03], [4, 3], [{"material": "EcoFlex 00-30", "thickness": 0.005}])

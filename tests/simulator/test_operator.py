@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from skin.body.sheet import Sheet
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator import _operator
 from skin.simulator._assembly import Structure
 from skin.simulator._operator import build, cached

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.layout.base import Sensors
 from skin.layout.grid import Grid
+from skin.sensors import Sensors
 from skin.simulator._assembly import Structure
 from skin.simulator._relaxation import Relaxing, speeds, times
 from skin.simulator.fem import PlatesAndBeams

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import spsolve
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import Solid, hexahedra, readings

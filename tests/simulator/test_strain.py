@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.layout.base import Sensors
+from skin.sensors import Sensors
 from skin.simulator._strain import largest
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive

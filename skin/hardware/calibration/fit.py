@@ -10,8 +10,8 @@ from skin.errors import InputError
 from skin.hardware.calibration import _channel
 from skin.hardware.calibration._channel import Idle
 from skin.hardware.calibration.bench import Bench
+from skin.lag import lagged, peaks
 from skin.signal.calibration import Calibration
-from skin.signal.lag import lagged, peaks
 
 __all__ = ["fit"]
 

@@ -9,9 +9,9 @@ import torch
 from skin.errors import InputError
 from skin.hardware.calibration.bench import Bench
 from skin.hardware.calibration.fit import fit
+from skin.lag import lagged
 from skin.signal.calibration import Calibration
 from skin.signal.imperfection import Imperfection
-from skin.signal.lag import lagged
 
 __all__ = ["Outcome", "estimate", "hold_out", "judge", "predicted"]
 

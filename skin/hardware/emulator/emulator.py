@@ -17,9 +17,9 @@ from skin.hardware.emulator.gestures import Converter, Gesture, gestures, in_tim
 from skin.hardware.emulator.outlet import AbstractOutlet
 from skin.rng import Stream, generator
 from skin.signal.frame import Check
-from skin.signal.segmentation import sentence
 from skin.wire.announcement import Announcement, encode
 from skin.wire.binary import encode_comment, encode_frame
+from skin.wire.segmentation import sentence
 from skin.wire.text import Header, encode_header, encode_line
 
 __all__ = ["Emulator", "Settings"]

@@ -85,7 +85,7 @@ def _batch(device: Simulated, seed: int, number: int) -> list[Gesture]:
 @torch.no_grad()
 def _drawn(device: Simulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
     movie = device.sampler.sample(len(labels), draw, labels)
-    readings = movie.respond(device.model, displacement=False).readings.double().numpy()
+    readings = device.model.respond(movie, displacement=False).readings.double().numpy()
     names, found, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
     return [
         Gesture(dict(zip(names, row, strict=True)), one, applied)

@@ -18,7 +18,7 @@ from rich.text import Text
 from skin.hardware.live.board import Board, Look
 from skin.hardware.live.picture import Picture
 from skin.hardware.live.verdict import Verdict
-from skin.signal.segmentation import typed
+from skin.wire.segmentation import typed
 
 __all__ = ["lines", "screen", "shown", "since"]
 

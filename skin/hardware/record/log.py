@@ -24,8 +24,8 @@ from skin.hardware.record.lines import Lines, sealed, write_whole
 from skin.hardware.record.reading import read
 from skin.hardware.record.stored import Stored
 from skin.signal.frame import Frame
-from skin.signal.segmentation import Take
 from skin.wire.conversion import Newtons
+from skin.wire.segmentation import Take
 
 __all__ = ["Log", "Stored", "check", "read"]
 

@@ -14,8 +14,8 @@ from skin.hardware.record.lines import opened
 from skin.hardware.record.stored import Stored
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.signal.segmentation import Take
 from skin.wire.conversion import Newtons
+from skin.wire.segmentation import Take
 
 __all__ = ["read"]
 

@@ -12,10 +12,10 @@ from skin.errors import InputError
 from skin.hardware.record.lines import locked
 from skin.hardware.record.log import Log, Stored, check, read
 from skin.recording import join
-from skin.signal.segmentation import Continuous, Take
 from skin.storage import write
 from skin.wire.conversion import Newtons
 from skin.wire.errors import SkinDisconnected, SkinTimeout
+from skin.wire.segmentation import Continuous, Take
 from skin.wire.text import Header
 
 __all__ = ["finish", "record"]

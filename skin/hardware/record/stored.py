@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from skin.signal.segmentation import Take
 from skin.wire.conversion import Newtons
+from skin.wire.segmentation import Take
 
 __all__ = ["Stored"]
 

@@ -16,8 +16,8 @@ from skin.errors import InputError
 from skin.hardware.record.lines import Lines, locked, opened, sealed
 from skin.hardware.record.log import Log, read
 from skin.signal.frame import Frame
-from skin.signal.segmentation import Take
 from skin.wire.conversion import Newtons
+from skin.wire.segmentation import Take
 
 ABOUT = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc"}
 

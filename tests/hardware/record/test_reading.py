@@ -11,8 +11,8 @@ import pytest
 from skin.errors import InputError
 from skin.hardware.record.log import Log, read
 from skin.signal.frame import Frame
-from skin.signal.segmentation import Take
 from skin.wire.conversion import Newtons
+from skin.wire.segmentation import Take
 
 ABOUT = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc", "window": 5, "rate": 50.0}
 MEANING = Newtons(np.array([0.1, 0.2]), np.array([512.0, 500.0]), np.array([False, False]))

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from skin.signal.lag import lagged, peaks, rounded, unloading
+from skin.lag import lagged, peaks, rounded, unloading
 
 
 def test_a_step_is_answered_by_an_exponential():

@@ -10,8 +10,9 @@ TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist load
 # Each rounds sums of floating-point numbers in its own way; the first is the suite's default.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
-NUMERICAL := $(addprefix tests/,body calibration contact embedding evaluation fusion layout learner model proof \
-	representation session signal simulator test_classifier.py test_labels.py test_material.py touch)
+NUMERICAL := $(addprefix tests/,body contact evaluation fusion hardware/calibration hardware/record layout learner model \
+	representation signal simulator studies/embedding test_classifier.py test_labels.py test_material.py touch \
+	validation wire/test_segmentation.py wire/test_tare.py)
 
 # Hundreds of tests start a command of this project: without bytecode each would compile it anew.
 unexport PYTHONDONTWRITEBYTECODE

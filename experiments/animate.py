@@ -21,8 +21,8 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.device.simulated import Simulated
-    from skin.results.animation import still, write
-    from skin.results.scene import recorded, simulated
+    from skin.plot.animation import still, write
+    from skin.plot.touches import recorded, simulated
 
     device = build_device(config)
     if isinstance(device, Simulated):

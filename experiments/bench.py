@@ -7,9 +7,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.setting import ROWS, machine, seconds, versions
 from rich.console import Console
 
+from benchmarks.setting import ROWS, machine, seconds, versions
 from skin.config import ROOT
 
 HERE = Path(__file__).parent
@@ -26,7 +26,6 @@ def main() -> None:
 
     from benchmarks import training
     from benchmarks.wire import decode_core_share
-
     from skin.files import write
 
     repeats, say = arguments.repeats, Console(stderr=True).print

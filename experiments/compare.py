@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from skin.device.simulated import Simulated
+    from skin.plot.press_comparison import Verdicts
     from skin.recording import Touches
-    from skin.results.compare import Verdicts
 
 
 @command("compare")
@@ -28,7 +28,7 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.device.simulated import Simulated
     from skin.files import write
-    from skin.results import compare, gestures, gestures_page
+    from skin.plot import gesture_comparison, gesture_page, press_comparison
 
     quiet()
     settings = plain(config)["compare"]
@@ -39,16 +39,18 @@ def main(config: DictConfig) -> None:
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )
-    if config.presses is None and gestures.marked(config.session):
-        pairs = gestures.read(device, config.session, settings["seed"])
+    if config.presses is None and gesture_comparison.marked(config.session):
+        pairs = gesture_comparison.read(device, config.session, settings["seed"])
         truth = [[bool(pair.labels[name]) for name in device.task.names] for pair in pairs.pairs]
-        text = gestures_page.page(pairs, _verdicts(config, device, gestures.touches(pairs), truth), about)
-        picture = gestures_page.figure(pairs, settings["shown"], folder / "compare.png")
+        text = gesture_page.page(
+            pairs, _verdicts(config, device, gesture_comparison.touches(pairs), truth), about
+        )
+        picture = gesture_page.figure(pairs, settings["shown"], folder / "compare.png")
     else:
-        presses = compare.read(device, config.session, config.presses, settings)
-        both = compare.touches(presses, device.sensors.positions, device.rate, device.window)
-        text = compare.page(presses, _verdicts(config, device, both), about)
-        picture = compare.figure(presses, settings["shown"], folder / "compare.png")
+        presses = press_comparison.read(device, config.session, config.presses, settings)
+        both = press_comparison.touches(presses, device.sensors.positions, device.rate, device.window)
+        text = press_comparison.page(presses, _verdicts(config, device, both), about)
+        picture = press_comparison.figure(presses, settings["shown"], folder / "compare.png")
     print(text, write(text, folder / "compare.md"), picture, sep="\n")
 
 
@@ -63,8 +65,8 @@ def _verdicts(
 
     from skin.build import build_data, build_learner
     from skin.device._blank import Blank
+    from skin.plot.press_comparison import Verdicts
     from skin.reload import configuration, find, restore
-    from skin.results.compare import Verdicts
     from skin.tracking import Store
 
     store = Store.open(config.tracking)

@@ -9,10 +9,10 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-import train
-from chosen import configuration, refusing
 from omegaconf import DictConfig
 
+import train
+from chosen import configuration, refusing
 from skin.config import ROOT
 
 SAME = ("data=fem", "evaluation.devices=0", "evaluation.layouts=0", "tracking.experiment=mechanics")
@@ -35,8 +35,8 @@ def main() -> None:
 
 def run(rows: list[str], seeds: range, overrides: list[str], folder: Path) -> int:
     """Train what is missing and try all of it; return how many runs failed."""
-    from skin.results.crosscheck import MECHANICS, found, publish, tests, try_run
     from skin.tracking import Store
+    from studies.crosscheck import MECHANICS, found, publish, tests, try_run
 
     def composed(row: str, name: str, seed: int = 0) -> DictConfig:
         return configuration(f"experiment={row}", *MECHANICS[name], *overrides, f"seed={seed}")

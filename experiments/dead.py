@@ -8,7 +8,7 @@ python experiments/train.py -m experiment=temporal_graph row=dead representation
 
 from skin.config import DictConfig, command, plain
 from skin.files import results
-from skin.results.asked import DeadSettings
+from studies.settings import DeadSettings
 
 
 @command("dead")
@@ -20,8 +20,8 @@ def main(config: DictConfig) -> None:
     from rich.progress import track
 
     from skin.console import quiet
-    from skin.results.dead import newest, publish, try_run
     from skin.tracking import Store
+    from studies.dead import newest, publish, try_run
 
     quiet()
     store = Store.open(config.tracking)

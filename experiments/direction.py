@@ -6,7 +6,7 @@ with it. Overrides of the training follow: trainer.max_epochs=30 direction.rows=
 
 from skin.config import DictConfig, command, overrides, plain
 from skin.files import results
-from skin.results.asked import DirectionSettings
+from studies.settings import DirectionSettings
 
 
 @command("direction")
@@ -15,7 +15,7 @@ def main(config: DictConfig) -> None:
     settings = DirectionSettings(**plain(config)["direction"])
 
     from skin.console import quiet
-    from skin.results.direction import comparison, publish, train_lines
+    from studies.direction import comparison, publish, train_lines
 
     quiet()
     lines = train_lines(overrides(), settings)

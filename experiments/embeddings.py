@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING
 
 from skin.config import DictConfig, command, overrides, plain
-from skin.embedding.asked import Probing
 from skin.errors import InputError
 from skin.files import results
+from studies.embedding.settings import Probing
 
 if TYPE_CHECKING:
     from skin.learner.network import Network
@@ -31,11 +31,11 @@ def main(config: DictConfig) -> None:
 
     from skin.balance import announce
     from skin.build import build_device
-    from skin.embedding.probe import probe
     from skin.files import write
-    from skin.results.figures import save
-    from skin.results.space import lines, spaces, statements
-    from skin.results.table import markdown
+    from skin.plot.figures import save
+    from studies.embedding.probe import probe
+    from studies.embedding_spaces import lines, spaces, statements
+    from studies.table import markdown
 
     folder = results(config.out)
     if config.run is not None:

@@ -4,9 +4,9 @@ By voting (the probability is the share of votes) and by averaged probabilities.
 becomes two runs, ensemble_vote and ensemble_average; with --rows their names tell of which rows.
 """
 
-from chosen import configuration, jobs, names, parser, refusing
 from omegaconf import DictConfig
 
+from chosen import configuration, jobs, names, parser, refusing
 from skin.config import CONF
 from skin.errors import InputError
 
@@ -29,8 +29,8 @@ def main() -> None:
     from rich.progress import Progress
 
     from skin.console import quiet
-    from skin.results.ensemble import combine, show
     from skin.tracking import Store
+    from studies.ensemble import combine, show
 
     quiet()
     with Progress(transient=True) as progress:

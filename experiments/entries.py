@@ -2,11 +2,11 @@
 
 from contextlib import suppress
 
+from omegaconf import DictConfig, OmegaConf
+
 import ensemble
 import peers
 from chosen import configuration
-from omegaconf import DictConfig, OmegaConf
-
 from skin.config import CONF
 from skin.errors import InputError
 from skin.sweep import jobs
@@ -40,7 +40,7 @@ class Entries:
 
     def vote(self, store: Store) -> None:
         """Let the report's networks decide together, wherever two of them have finished."""
-        from skin.results.ensemble import combine
+        from studies.ensemble import combine
 
         for job in self._touches:
             members, ways = ensemble.configurations(list(job))

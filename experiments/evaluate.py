@@ -15,9 +15,9 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.device.serial import Serial
     from skin.evaluation.report import evaluate
+    from skin.evaluation.show import report
+    from skin.plot.evaluation_page import publish, verdicts
     from skin.reload import changed, configuration, find, operating_point, restore
-    from skin.results.show import report
-    from skin.results.verdicts import publish, verdicts
     from skin.run import conclude
     from skin.tracking import Store
 

@@ -22,8 +22,8 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.evaluation.margins import margins
     from skin.reload import changed, configuration, find, operating_point, restore
-    from skin.results.margins import line, publish
     from skin.tracking import Store
+    from studies.margins import line, publish
 
     quiet()
     store, folder = Store.open(config.tracking), results(config.out)

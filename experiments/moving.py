@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 from skin.config import command, plain
 from skin.errors import InputError
 from skin.files import results
-from skin.results.asked import MovingSettings
+from studies.settings import MovingSettings
 
 if TYPE_CHECKING:
-    from skin.results.moving_runs import Trial
+    from studies.moving_runs import Trial
 
 
 @command("moving")
@@ -27,9 +27,9 @@ def main(config: DictConfig) -> None:
     from skin.build import build_device
     from skin.console import quiet
     from skin.device.simulated import Simulated
-    from skin.results.moving import change
-    from skin.results.moving_runs import train_lines
-    from skin.results.moving_table import comparison, publish
+    from studies.moving import change
+    from studies.moving_runs import train_lines
+    from studies.moving_table import comparison, publish
 
     quiet()
     device = build_device(_free(config))
@@ -58,8 +58,8 @@ def _tried(config: DictConfig, settings: MovingSettings) -> Iterator["Trial"]:
     from rich.console import Console
     from rich.progress import track
 
-    from skin.results.moving_runs import latest, try_run
     from skin.tracking import Store
+    from studies.moving_runs import latest, try_run
 
     store = Store.open(config.tracking)
     runs = latest(store, config.data.name, settings.rows)

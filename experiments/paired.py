@@ -9,11 +9,11 @@ import sys
 from collections.abc import Sequence
 from statistics import fmean
 
-from chosen import refusing
 from hydra import compose, initialize_config_dir
 
+from chosen import refusing
 from skin.config import CONF, checked, fingerprint
-from skin.results.study import FEWEST, paired
+from studies.study import FEWEST, paired
 
 
 @refusing

@@ -12,9 +12,9 @@ from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
-from chosen import configuration, jobs, names, parser, refusing
 from omegaconf import DictConfig
 
+from chosen import configuration, jobs, names, parser, refusing
 from skin.config import ROOT
 from skin.errors import InputError
 
@@ -63,7 +63,7 @@ def main() -> None:
 
 def _compare(config: DictConfig, chosen: Namespace, say: Callable[[str], None]) -> str:
     """Train one peer unless a finished run holds its results already; return what came out."""
-    from skin.peers.runs import learn
+    from peers.runs import learn
     from skin.run import tags
     from skin.tracking import Store
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import train
 from chosen import refusing
-
 from skin.config import ROOT
 
 BUDGETS = {"full": "table", "smoke": "smoke"}
@@ -32,13 +31,11 @@ def main() -> None:
 def report(overrides: list[str], budget: str) -> int:
     """Write and print what finished runs say, with their budget; return how many are missing."""
     from entries import Entries
-
     from skin.build import build_device
     from skin.files import write
-    from skin.results.gallery import draw_runs, draw_skin
-    from skin.results.show import results
-    from skin.results.table import as_csv, collect, grid, markdown, report_values, rows
     from skin.tracking import Store
+    from studies.report_figures import draw_runs, draw_skin
+    from studies.table import as_csv, collect, grid, markdown, report_values, rows, show
 
     entries = Entries(overrides)
     store = Store.open(entries.rows[0].tracking)
@@ -55,7 +52,7 @@ def report(overrides: list[str], budget: str) -> int:
     skin = {config.data.name: config for config in reversed(entries.rows)}
     name = "fem" if "fem" in skin else simulators[-1]
     pictures = [*draw_runs(cells, store, folder), *draw_skin(build_device(skin[name]), folder, name)]
-    results(lines, title)
+    show(lines, title)
     print(f"{folder / 'table.md'}, {folder / 'table.csv'} and {len(pictures)} figures beside them")
     return sum(cell.missing for cell in cells)
 

@@ -16,8 +16,8 @@ def main(config: DictConfig) -> None:
 
     from skin.console import quiet
     from skin.reload import find
-    from skin.results.sliding_runs import newest, try_run
     from skin.tracking import Store
+    from studies.sliding_runs import newest, try_run
 
     quiet()
     store = Store.open(config.tracking)

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import train
 from chosen import refusing
-
 from skin.config import ROOT
-from skin.results.study import SMOKE, Study, Variant, choose, read
+from studies.study import SMOKE, Study, Variant, choose, read
 
 
 @refusing
@@ -36,9 +35,9 @@ def main() -> None:
 
 def run(study: Study, variants: Sequence[Variant], overrides: list[str], folder: Path) -> int:
     """Train what a study lacks, then write and print what it found; return how many runs are missing."""
-    from skin.results.findings import collect, conclusions
-    from skin.results.study_table import publish
     from skin.tracking import Store
+    from studies.findings import collect, conclusions
+    from studies.study_table import publish
 
     store = Store.open(next(iter(variants[0].configs.values())).tracking)
     if any(finding.missing for finding in collect(store, variants)):

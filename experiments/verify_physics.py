@@ -15,8 +15,8 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
     from rich.progress import track
 
-    from skin.proof.index import chosen
-    from skin.proof.page import publish
+    from validation.index import chosen
+    from validation.page import publish
 
     settings = plain(config)["physics"]
     laws = chosen(settings["laws"])

@@ -1,5 +1,6 @@
 """Touches, the type that every device yields, and Recording, its stored form."""
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from skin.labels import Task
 
-__all__ = ["Recording", "Touches", "join"]
+__all__ = ["Recording", "Touches", "digest", "join"]
 
 
 @dataclass(frozen=True)
@@ -161,3 +162,11 @@ def join(parts: Sequence[Recording]) -> Recording:
         displacement=together(part.displacement for part in parts),
         parameters={name: torch.cat([part.parameters[name] for part in parts]) for name in first.parameters},
     )
+
+
+def digest(touches: Touches) -> str:
+    """Return a hash of readings and labels."""
+    content = hashlib.sha256(touches.readings.contiguous().numpy().tobytes())
+    if touches.labels is not None:
+        content.update(touches.labels.contiguous().numpy().tobytes())
+    return content.hexdigest()[:16]

@@ -18,12 +18,11 @@ from skin.config import fingerprint, plain
 from skin.console import quiet
 from skin.evaluation.operating_point import check, choose
 from skin.evaluation.report import Report, evaluate
+from skin.evaluation.show import report as show
 from skin.labels import Task
-from skin.peers.exchange import digest
-from skin.recording import Touches
+from skin.plot.figures import confusions, save
+from skin.recording import Touches, digest
 from skin.reload import TAG
-from skin.results.figures import confusions, save
-from skin.results.show import report as show
 from skin.tracking import Store
 
 __all__ = ["PARENT", "conclude", "describe", "tags", "train"]

@@ -29,7 +29,7 @@ WARM = (
     "skfem",
     "skin.learner.features",
     "skin.learner.network",
-    "skin.results.show",
+    "skin.evaluation.show",
     "skin.run",
 )
 

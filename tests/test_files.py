@@ -13,10 +13,10 @@ from skin.files import write
 from skin.hardware.calibration.bench_session import Session
 from skin.hardware.calibration.bench_session import write as write_session
 from skin.labels import TOUCH
+from skin.plot import animation, evaluation_page, figures
+from skin.plot.touches import simulated
 from skin.recording import Recording
 from skin.refusal import refusal
-from skin.results import animation, figures, verdicts
-from skin.results.scene import simulated
 from skin.signal import calibration
 from skin.simulator import _elastic, _store
 from skin.storage import write as write_recording
@@ -53,7 +53,7 @@ WRITERS = {
     "page.md": lambda path, device: write(200 * "a", path),
     "figure.png": lambda path, device: figures.save(figures.traces({"a": torch.ones(9, 3)}, 10.0), path),
     "gains.yaml": lambda path, device: calibration.write(calibration.Calibration({"gain": 99 * [1.0]}), path),
-    "verdicts.csv": lambda path, device: verdicts.verdicts(torch.ones(9, 4), TOUCH, None, path),
+    "verdicts.csv": lambda path, device: evaluation_page.verdicts(torch.ones(9, 4), TOUCH, None, path),
 }
 
 

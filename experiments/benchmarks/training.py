@@ -1,9 +1,9 @@
 """Seconds per epoch of each row, beside the same network as one would write it first."""
 
 import torch
-from plain import PLAIN, train_epoch
 
 from benchmarks.setting import configuration, seconds
+from plain import PLAIN, train_epoch
 from skin.build import build_data, build_device, build_learner
 from skin.console import quiet
 from skin.datamodule import TouchData

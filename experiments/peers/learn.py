@@ -170,7 +170,7 @@ def platt(score: np.ndarray, truth: np.ndarray) -> LogisticRegression:
     return LogisticRegression(C=np.inf).fit(twice, sides, sample_weight=np.concatenate([target, 1 - target]))
 
 
-PEERS = {
+PEERS: dict[str, Callable] = {
     "lightgbm": lightgbm,
     "minirocket": partial(ridge, minirocket),
     "multirocket_hydra": partial(ridge, multirocket_hydra),

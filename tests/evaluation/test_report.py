@@ -12,9 +12,9 @@ from skin.config import Evaluation
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import columns, evaluate
+from skin.evaluation.show import report as show
 from skin.labels import TOUCH
-from skin.results.show import report as show
-from skin.results.verdicts import page
+from skin.plot.evaluation_page import page
 
 SETTINGS = Evaluation(devices=2, layouts=2, gestures=32, false_alarm_rate=0.02)
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)

@@ -7,8 +7,8 @@ import torch
 from skin.body.arm import Arm
 from skin.build import build_data, build_device
 from skin.errors import InputError
-from skin.results.moving import change
 from skin.storage import read, write
+from studies.moving import change
 
 SOLID = (
     "simulator=solid",

@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from skin.results.dead import publish
-from skin.results.moving_runs import Trial
+from studies.dead import publish
+from studies.moving_runs import Trial
 
 SMALL = ["data.gestures=80", "trainer.max_epochs=1", "device.test_gestures=48", "evaluation.devices=0"]
 SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64", "layout=grid"]

@@ -7,8 +7,8 @@ import pytest
 
 from skin.config import Tracking
 from skin.errors import InputError
-from skin.results.moving_runs import latest
 from skin.tracking import Store
+from studies.moving_runs import latest
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")

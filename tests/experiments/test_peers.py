@@ -12,9 +12,9 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
+from peers.exchange import export
 from skin.build import build_device
 from skin.config import ROOT, Evaluation, Tracking, checked, fingerprint
-from skin.peers.exchange import export
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from skin.config import ROOT, checked, fingerprint
-from skin.results.study import SMOKE
 from skin.tracking import Store
+from studies.study import SMOKE
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")

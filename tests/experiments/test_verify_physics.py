@@ -5,7 +5,7 @@ import json
 import pytest
 
 from skin.config import ROOT
-from skin.proof.index import LAWS
+from validation.index import LAWS
 
 
 @pytest.mark.slow

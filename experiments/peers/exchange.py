@@ -1,0 +1,108 @@
+"""Touches to, and answers from, a learner that lives in another environment: by files alone."""
+
+import json
+import shutil
+from itertools import count
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet
+import torch
+from torch import Tensor
+
+from skin.config import Evaluation
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.evaluation.operating_point import gestures
+from skin.evaluation.report import columns
+from skin.files import whole
+from skin.files import write as write_text
+from skin.labels import Task
+from skin.recording import Recording, Touches, digest
+from skin.signal.features import measurements
+from skin.storage import write
+
+__all__ = ["Foreign", "export"]
+
+SETS = "sets.json"
+ABOUT = "about.json"
+
+
+def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
+    """Write every set of touches that learning and evaluating needs, unless they lie there already.
+
+    ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
+    engineered measurements, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
+    alarm's threshold is chosen), then ``<column>_<number>`` for the sets of
+    :func:`skin.evaluation.report.columns`. ``sets.json``, written last, names the content of each set: set ->
+    digest. A folder with other touches is emptied, answers and all.
+
+    Args:
+        device: whose touches.
+        settings: of the evaluation.
+        folder: made if it is missing.
+    """
+    if (folder / SETS).is_file():
+        known = json.loads((folder / SETS).read_text())
+        if known["train"] == digest(device.touches("train")) and "alarm" in known:
+            return
+        shutil.rmtree(folder)
+    learnt = {name: device.touches(name) for name in ("train", "validation")}
+    first = learnt | {"alarm": gestures(device, settings)}
+    known = {name: _export(touches, device, folder, name) for name, touches in first.items()}
+    for column, sets in columns(device, settings).items():
+        numbers = count()
+        try:
+            for touches in sets:
+                name = f"{column}_{next(numbers)}"
+                known[name] = _export(touches, device, folder, name)
+        except InputError:  # sensors that make no grid: the evaluation will say so
+            continue
+    write_text(json.dumps(known, indent=1) + "\n", folder / SETS)
+
+
+class Foreign:
+    """Answers to touches with the probabilities that another environment wrote for them.
+
+    It knows touches by their content alone, so an answer can never meet other touches than it was given for.
+
+    Args:
+        folder: that :func:`export` filled.
+        peer: name of the folder in it with ``about.json`` (what the peer tells of itself) and, per set, a
+            ``<set>.parquet`` with one column per label.
+        task: what the labels mean.
+
+    Attributes:
+        about: seconds (of training), parameters, versions.
+    """
+
+    def __init__(self, folder: Path, peer: str, task: Task) -> None:
+        self._names, self._folder = list(task.names), folder / peer
+        known = json.loads((folder / SETS).read_text())
+        self._sets = {content: name for name, content in known.items()}
+        self.about = json.loads((self._folder / ABOUT).read_text())
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L).
+
+        Raises:
+            LookupError: touches that were not exported.
+        """
+        content = digest(touches)
+        if content not in self._sets:
+            raise LookupError(f"{self._folder.parent} holds other touches than these: remove it")
+        path = self._folder / f"{self._sets[content]}.parquet"
+        table = pa.parquet.read_table(path, columns=self._names, memory_map=False)
+        columns = [torch.from_numpy(table[name].to_numpy().copy()) for name in self._names]
+        return torch.stack(columns, dim=1).to(torch.float32)
+
+
+def _export(touches: Touches, device: Simulated, folder: Path, name: str) -> str:
+    """Write one set and return its digest."""
+    recording = Recording(touches, device.task, device.size, device.sensors.footprint)
+    write(recording, folder / "touches" / f"{name}.parquet")
+    table = {key: values.to(torch.float32).numpy() for key, values in measurements(touches).items()}
+    path = folder / "measurements" / f"{name}.parquet"
+    with whole(path) as partial:
+        pa.parquet.write_table(pa.table(table), partial, compression="zstd")
+    return digest(touches)

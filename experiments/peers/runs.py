@@ -1,0 +1,83 @@
+"""A run of a peer: touches out, its own environment learns, answers in, figures logged as for any row."""
+
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from peers.exchange import ABOUT, Foreign, export
+from skin.balance import announce
+from skin.build import build_device
+from skin.config import fingerprint, plain
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.evaluation.operating_point import choose
+from skin.evaluation.report import evaluate
+from skin.run import conclude, describe, tags
+from skin.tracking import Store
+
+__all__ = ["learn"]
+
+_SOURCES = ("seed", "touch", "body", "layout", "simulator", "device", "data", "evaluation")
+
+
+def learn(
+    store: Store, config: DictConfig, folder: Path, command: Sequence[str], say: Callable[[str], None]
+) -> dict[str, float]:
+    """Let the peer ``config.row`` learn and log its run; return its overall accuracy in every column.
+
+    Args:
+        store: where to log.
+        config: its ``row`` names the peer; seed, device, data and evaluation hold, the rest means nothing.
+        folder: where files are exchanged, each configuration of touches in a folder of its own.
+        command: that runs the peers' script; the peer's name, the folder, ``--seed`` and ``--jobs`` follow.
+        say: is told what happens.
+
+    Raises:
+        InputError: the device has no unseen devices and layouts: it is not simulated.
+        subprocess.CalledProcessError: the peer failed.
+    """
+    device, source = build_device(config), _source(config)
+    announce(device)
+    where = folder / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
+    if not isinstance(device, Simulated):
+        raise InputError("peers are compared on simulated touches: leave device=simulated")
+    with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config)) as run:
+        describe(
+            store, run.info.run_id, OmegaConf.create({"row": config.row, **source}), device.touches("train")
+        )
+        say("writing touches")
+        export(device, config.evaluation, where)
+        if not (config.tracking.resume and (where / config.row / ABOUT).is_file()):
+            jobs = ["--seed", str(config.seed), "--jobs", str(torch.get_num_threads())]
+            _follow([*command, config.row, str(where), *jobs], say)
+        say("evaluating")
+        peer = Foreign(where, config.row, device.task)
+        point = choose(peer, device, config.evaluation)
+        report = evaluate(peer, device, config.evaluation, point)
+        values = {"seconds_per_epoch": peer.about["seconds"], "parameters": peer.about["parameters"]}
+        conclude(store, run, report, device.task, values)
+        store.client.log_dict(run.info.run_id, peer.about, ABOUT)
+    suffix = "/overall/accuracy"
+    return {name.removesuffix(suffix): x for name, x in report.metrics.items() if name.endswith(suffix)}
+
+
+def _source(config: DictConfig) -> DictConfig:
+    """Return the part of a configuration that touches depend on, every value final."""
+    whole = plain(config)
+    return OmegaConf.create({key: whole[key] for key in _SOURCES})
+
+
+def _follow(command: list[str], say: Callable[[str], None]) -> None:
+    """Run a command to its end and pass on what it says."""
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            for line in process.stdout or ():
+                say(line.strip())
+        except BaseException:
+            process.terminate()
+            raise
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)

@@ -1,0 +1,215 @@
+"""What embeddings tell of touches: what an SVM reads in them, and on what they spend their variance."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+
+from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.layout.scattered import Scattered
+from skin.learner.network import Network
+from skin.recording import Touches
+from skin.representation.graph import adjacency, neighbours
+from studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
+from studies.embedding.settings import Probing
+
+__all__ = [
+    "FRAME",
+    "Found",
+    "Space",
+    "accuracy",
+    "explained",
+    "probe",
+    "strongest",
+]
+
+FRAME = "readings, one frame"
+
+# No training draws from these, and no layout of data/layouts is among the scattered ones.
+_FIRST_SEED, _FIRST_LAYOUT = 1_000_000, 101
+_COSTS = (0.1, 1, 10, 100)
+_FOLDS = 3
+
+
+class Space(NamedTuple):
+    """Touches in an embedding's space.
+
+    Attributes:
+        vectors: (B, E), the SVM's training touches first.
+        labels: (B, L), 0 or 1, int.
+        train: how many of them the SVM is trained on.
+        mixed: (B', E), touches on several layouts; None where the device has one layout.
+        layouts: (B',), which layout, int.
+        mixed_labels: (B', L), of the same touches.
+    """
+
+    vectors: np.ndarray
+    labels: np.ndarray
+    train: int
+    mixed: np.ndarray | None
+    layouts: np.ndarray
+    mixed_labels: np.ndarray
+
+
+class Found(NamedTuple):
+    """What one embedding told with one seed.
+
+    Attributes:
+        attribute: degree, reading, or nothing where the input is no graph embedding.
+        name: of the input.
+        seed: which draw of touches.
+        accuracy: label -> share of the held-out touches that the SVM labels rightly, nan where it had no
+            choice; ``layout`` of the touches on several layouts.
+        explained: label or ``layout`` -> share of the variance on several layouts that it explains.
+        space: where the touches lie.
+    """
+
+    attribute: str
+    name: str
+    seed: int
+    accuracy: dict[str, float]
+    explained: dict[str, float]
+    space: Space
+
+
+def probe(device: AbstractDevice, settings: Probing, learner: Network | None) -> Iterator[Found]:
+    """Yield what every input tells, seed by seed: graph embeddings, a trained encoder's, plain readings.
+
+    A simulated device draws new touches for every seed, of which no training has any; of another device the
+    train and test splits are taken, once. Embeddings see the readings of all touches, but no label.
+    """
+    if device.task.direction:
+        raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
+    for seed in settings.seeds if isinstance(device, Simulated) else settings.seeds[:1]:
+        touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
+        for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):
+            yield _found(attribute, name, seed, _space(vectors, touches, mixed), device.task.names)
+
+
+def strongest(touches: Touches) -> np.ndarray:
+    """Return the readings (B, S), N, of each touch's strongest frame, 0 where not valid."""
+    readings = touches.readings.where(touches.valid, 0).numpy()
+    return readings[np.arange(len(readings)), readings.sum(axis=2).argmax(axis=1)]
+
+
+def accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
+    """Return the share of ``vectors[train:]`` that an SVM trained on the others puts into its class (B,).
+
+    Radial basis functions on standardised vectors, the cost chosen by cross-validation among the training
+    ones only (report, 2.2.2). nan where some class is too rare to learn.
+    """
+    if np.unique(classes[:train], return_counts=True)[1].min() < _FOLDS or np.ptp(classes[:train]) == 0:
+        return float("nan")
+    machine = make_pipeline(StandardScaler(), SVC())
+    search = GridSearchCV(machine, {"svc__C": _COSTS}, cv=_FOLDS)
+    return float(search.fit(vectors[:train], classes[:train]).score(vectors[train:], classes[train:]))
+
+
+def explained(vectors: np.ndarray, classes: np.ndarray) -> float:
+    """Return the share of the variance of vectors (B, E) that lies between classes (B,); 0 if all are one."""
+    centred = vectors - vectors.mean(axis=0)
+    means = [(classes == one, centred[classes == one].mean(axis=0)) for one in np.unique(classes)]
+    between = sum(which.sum() * (mean**2).sum() for which, mean in means)
+    # Where nothing but the last bit differs there is no variance to explain.
+    whole = (centred**2).sum()
+    return float(between / whole) if whole > 1e-12 * (vectors**2).sum() else 0.0
+
+
+def _graph_vectors(
+    sets: Sequence[Touches], attribute: str, settings: Probing, seed: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield each graph embedding (B, E) of the strongest frames of touches, one layout per set.
+
+    GL2Vec gives half its width to the graph and half to its line graph.
+    """
+    if any(touches.positions.ndim > 2 for touches in sets):
+        raise InputError("graph embeddings need sensors that stay in place: set device.track=none")
+    frames = [strongest(touches) for touches in sets]
+    places = [touches.positions.double().numpy() for touches in sets]
+    edges, count, weight = (settings.graph[name] for name in ("edges", "count", "weight"))
+    weights = [adjacency(one, neighbours(one, edges, count), weight) for one in places]
+    if attribute == "degree":
+        labels = [np.tile((one > 0).sum(0), (len(f), 1)) for one, f in zip(weights, frames, strict=True)]
+    else:
+        ends = np.cumsum([len(frame) for frame in frames])[:-1]
+        labels = np.split(levels(np.concatenate(frames), settings.levels), ends)
+    pairs = list(zip(labels, weights, strict=True))
+    words = [row for label, one in pairs for row in subtrees(label, one > 0, settings.depth)]
+    yield "Graph2Vec", doc2vec(words, settings.width, settings.epochs, seed)
+    lines = [row for pair in pairs for row in subtrees(*line_graph(*pair), settings.depth)]
+    half = [doc2vec(each, settings.width // 2, settings.epochs, seed) for each in (words, lines)]
+    yield "GL2Vec", np.concatenate(half, axis=1)
+    kinds = 1 + max(int(label.max()) for label in labels)
+    yield "IGE", np.concatenate([invariant(label, one, kinds) for label, one in pairs])
+
+
+def _inputs(
+    sets: Sequence[Touches], settings: Probing, seed: int, learner: Network | None
+) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+    for attribute in settings.attributes:
+        for name, vectors in _graph_vectors(sets, attribute, settings, seed):
+            yield (attribute, name), vectors
+    if learner is not None:
+        yield ("", "trained encoder"), np.concatenate([learner.embeddings(one).numpy() for one in sets])
+    yield ("", FRAME), np.concatenate([strongest(one) for one in sets])
+    windows = [one.readings.where(one.valid, 0).flatten(1).numpy() for one in sets]
+    yield ("", "readings, window"), np.concatenate(windows)
+
+
+def _space(vectors: np.ndarray, touches: Sequence[Touches], mixed: Sequence[Touches]) -> Space:
+    here = sum(map(len, touches))
+    layouts = np.repeat(np.arange(len(mixed)), [len(one) for one in mixed])
+    known = _labels(touches)
+    other = _labels(mixed) if mixed else known[:0]
+    return Space(vectors[:here], known, len(touches[0]), vectors[here:] if mixed else None, layouts, other)
+
+
+def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> Found:
+    each = zip(names, space.labels.T, strict=True)
+    right = {label: accuracy(space.vectors, classes, space.train) for label, classes in each}
+    shares: dict[str, float] = {}
+    if space.mixed is not None:
+        shares = {"layout": explained(space.mixed, space.layouts)}
+        each = zip(names, space.mixed_labels.T, strict=True)
+        shares |= {label: explained(space.mixed, classes) for label, classes in each}
+        order = np.random.default_rng(seed).permutation(len(space.mixed))
+        right["layout"] = accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
+    return Found(attribute, name, seed, right, shares, space)
+
+
+def _touches(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
+    """Return the touches of one layout, those to train the SVM on first."""
+    count = settings.train + settings.test
+    if isinstance(device, Simulated):
+        drawn = device.replace(data_seed=_FIRST_SEED + seed, gestures=count).recording().touches
+        return [drawn[: settings.train], drawn[settings.train :]]
+    return [device.touches("train")[: settings.train], device.touches("test")[: settings.test]]
+
+
+def _layouts(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
+    """Return as many other touches on each of some scattered layouts; none where that cannot be."""
+    if not isinstance(device, Simulated) or settings.layouts < 2:
+        return []
+    count = len(device.sensors)
+    rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
+    if count // rows > 3 * rows:
+        return []  # no grid of so many sensors could be scattered
+    footprint, depth, found = device.sensors.footprint, device.sensors.positions[:, 2], []
+    for number in range(settings.layouts):
+        seed_of = _FIRST_LAYOUT + number
+        layout = Scattered(rows, count // rows, seed=seed_of, footprint=footprint, depth=depth)
+        draw = _FIRST_SEED * (2 + number) + seed
+        found.append(device.replace(layout=layout, data_seed=draw, gestures=settings.test))
+    return [one.recording().touches for one in found]
+
+
+def _labels(sets: Sequence[Touches]) -> np.ndarray:
+    if any(touches.labels is None for touches in sets):
+        raise InputError("touches without labels cannot be probed: record them with labels")
+    return np.concatenate([one.labels.numpy() for one in sets if one.labels is not None]).astype(int)

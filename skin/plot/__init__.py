@@ -1,0 +1,1 @@
+"""Pictures and pages: touches, skins, evaluations, recordings beside their simulation."""

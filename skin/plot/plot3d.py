@@ -1,0 +1,175 @@
+"""Touches on a body that is not flat, drawn in space (report, figure 9)."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+from skin.plot.view import FORCE, Draw, Scene, clear, norm, space_and_traces, traces
+
+__all__ = ["sensors_in_space", "skin_in_space"]
+
+_ELEVATION, _AZIMUTH = 38.0, -62.0  # degrees, of the eye
+# Towards the eye; y is drawn upside down, so that the chart is seen from outside as it is in flat pictures.
+_EYE = np.array(
+    [
+        np.cos(np.radians(_ELEVATION)) * np.cos(np.radians(_AZIMUTH)),
+        -np.cos(np.radians(_ELEVATION)) * np.sin(np.radians(_AZIMUTH)),
+        np.sin(np.radians(_ELEVATION)),
+    ]
+)
+_LIGHT, _SHADE = np.array([-0.3, 0.4, 0.87]), 0.45  # towards it; what it takes away where it does not shine
+_SKIN = (0.91, 0.81, 0.75, 1.0)
+_LAYERS = ("#B98F76", "#DDBBA6")  # of the rim, by turns from the core outwards
+_LONGEST = 0.4  # longest bar, of the body's smaller extent
+
+
+@dataclass(frozen=True)
+class _Shell:
+    """A body's surface in space, mm.
+
+    Attributes:
+        body: whose.
+        lines: (ny + 1, nx + 1) nodes, in the chart, m: x and y.
+    """
+
+    body: AbstractBody
+    lines: tuple[np.ndarray, np.ndarray]
+
+    @classmethod
+    def of(cls, body: AbstractBody) -> "_Shell":
+        """Return the surface of a body."""
+        x, y = (np.linspace(0, body.size[axis], body.cells[axis] + 1) for axis in (0, 1))
+        grid_x, grid_y = np.meshgrid(x, y)
+        return cls(body, (grid_x, grid_y))
+
+    def surface(self, depth: np.ndarray) -> np.ndarray:
+        """Return where the surface is, (ny + 1, nx + 1, 3), mm, pushed in by a depth (ny + 1, nx + 1), m."""
+        return 1e3 * self.body.place(np.stack([*self.lines, depth], axis=-1))
+
+    def rims(self) -> list[np.ndarray]:
+        """Return the layers' faces where y ends, from the core outwards, (2, nx + 1, 3) each, mm."""
+        depths = (self.body.thickness, *self.body.interfaces)
+        x, y = (line[-1] for line in self.lines)
+        return [
+            1e3 * self.body.place(np.stack([np.stack([x, y, 0 * x + depth], axis=-1) for depth in pair]))
+            for pair in pairwise(depths)
+        ]
+
+
+def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
+    """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
+    known = scene.moved if scene.moved is not None else scene.pressure
+    if known is None:
+        raise InputError(
+            "view=skin3d needs the pressure on the skin, which only device=simulated knows: "
+            "give view=flat or view=sensors3d"
+        )
+    axis, right = space_and_traces(figure)
+    now, shell, most = traces(right, scene), _Shell.of(body), max(float(known.max()), 1e-9)
+    stretch = 1.0
+    if scene.moved is None:
+        scale, what = Normalize(0, most / 1e3), "pressure, kPa"
+    else:
+        stretch = max(1.0, float(round(0.5 * body.thickness / most)))
+        scale, what = Normalize(0, 1e3 * most), f"into the skin, mm (drawn {stretch:g} times)"
+    figure.colorbar(ScalarMappable(scale, FORCE), ax=axis, label=what, shrink=0.6, pad=0.02)
+    _stand(axis, shell)
+
+    def draw(frame: int) -> None:
+        clear(axis)
+        if scene.moved is None:
+            _skin(axis, shell.surface(np.zeros_like(shell.lines[0])), colormaps[FORCE](known[frame] / most))
+        else:
+            moved = scene.moved[frame]
+            _skin(axis, shell.surface(stretch * moved), colormaps[FORCE](_mean(moved) / most))
+        _rims(axis, shell)
+        _dots(axis, body, scene.positions[frame])
+        now(frame)
+
+    return draw
+
+
+def sensors_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
+    """Show each sensor's reading as a bar that stands out of the surface over its place."""
+    axis, right = space_and_traces(figure)
+    now, colour, shell = traces(right, scene), norm(scene), _Shell.of(body)
+    bare = np.broadcast_to(_SKIN, (*body.shape, 4))
+    surface = shell.surface(np.zeros_like(shell.lines[0]))
+    figure.colorbar(ScalarMappable(colour, FORCE), ax=axis, label="reading, N", shrink=0.6, pad=0.02)
+    longest = _LONGEST * min(body.size)
+    _stand(axis, shell, longest)
+
+    def draw(frame: int) -> None:
+        clear(axis)
+        _skin(axis, surface, bare)
+        height = np.maximum(scene.readings[frame], 0)
+        foot = scene.positions[frame] * [1.0, 1.0, 0.0]
+        tip = foot - np.outer(longest * height / scene.strongest, [0.0, 0.0, 1.0])
+        ends = 1e3 * np.stack([body.place(foot), body.place(tip)], axis=1)
+        _rims(axis, shell)
+        _dots(axis, body, foot)
+        seen, colours = _faces_eye(body, foot), colormaps[FORCE](colour(height))
+        for side, order in ((~seen, 0), (seen, 4)):
+            bars = Line3DCollection(list(ends[side]), colors=colours[side], linewidths=4, zorder=order)
+            axis.add_collection(bars)
+        now(frame)
+
+    return draw
+
+
+def _stand(axis: Axes3D, shell: _Shell, above: float = 0.0) -> None:
+    """Set the axes around a body out of which something may stand, m."""
+    # Matplotlib would order whole surfaces by their middles, and hide the sensors below.
+    axis.computed_zorder = False
+    flat = np.zeros_like(shell.lines[0])
+    reached = np.concatenate(
+        [shell.surface(flat - above).reshape(-1, 3), *(rim.reshape(-1, 3) for rim in shell.rims())]
+    )
+    low, high = reached.min(axis=0), reached.max(axis=0)
+    axis.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), zlim=(low[2], high[2]))
+    axis.set_box_aspect(tuple(high - low), zoom=1.15)
+    axis.view_init(elev=_ELEVATION, azim=_AZIMUTH)
+    axis.set_axis_off()
+
+
+def _skin(axis: Axes3D, places: np.ndarray, colours: np.ndarray) -> None:
+    """Draw a surface (ny + 1, nx + 1, 3), mm, with the colours (ny, nx, 4) of its faces, lit from above."""
+    across = places[1:, 1:] - places[:-1, :-1], places[1:, :-1] - places[:-1, 1:]
+    outwards = np.cross(*across)
+    outwards /= np.linalg.norm(outwards, axis=-1, keepdims=True)
+    light = 1 - _SHADE + _SHADE * np.clip(outwards @ _LIGHT, 0, 1)[..., None]
+    lit = np.concatenate([colours[..., :3] * light, colours[..., 3:]], axis=-1)
+    x, y, z = np.moveaxis(places, -1, 0)
+    axis.plot_surface(x, y, z, facecolors=lit, rcount=200, ccount=200, shade=False, zorder=1)
+
+
+def _rims(axis: Axes3D, shell: _Shell) -> None:
+    """Draw the layers where the body ends towards the eye."""
+    for number, rim in enumerate(shell.rims()):
+        faces = np.stack([rim[0, :-1], rim[0, 1:], rim[1, 1:], rim[1, :-1]], axis=1)
+        colour = _LAYERS[number % 2]
+        axis.add_collection(Poly3DCollection(list(faces), facecolors=colour, edgecolors=colour, zorder=2))
+
+
+def _dots(axis: Axes3D, body: AbstractBody, positions: np.ndarray) -> None:
+    """Draw the sensors (S, 3), m, that lie on the side of the eye."""
+    x, y, z = 1e3 * body.place(positions[_faces_eye(body, positions)]).T
+    axis.scatter(x, y, z, s=9, c="black", depthshade=False, zorder=3)
+
+
+def _faces_eye(body: AbstractBody, positions: np.ndarray) -> np.ndarray:
+    return body.frame(positions)[:, 2] @ _EYE < 0
+
+
+def _mean(nodes: np.ndarray) -> np.ndarray:
+    """Return the means (ny, nx) over each face of values (ny + 1, nx + 1) at nodes."""
+    return (nodes[1:, 1:] + nodes[:-1, 1:] + nodes[1:, :-1] + nodes[:-1, :-1]) / 4

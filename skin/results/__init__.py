@@ -1,1 +1,0 @@
-"""What comes out of runs: tables and figures."""

@@ -1,0 +1,100 @@
+"""The field of the whole skin against the operator of its sensors, and what the gallery makes of it."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from skin.body.arm import Arm
+from skin.body.sheet import Sheet
+from skin.build import build_device
+from skin.layout.grid import Grid
+from skin.plot.surface import deflection, surface, surface_motion
+from skin.sensors import Sensors
+from skin.simulator._assembly import Structure
+from skin.simulator._operator import build
+from skin.simulator.naive import Naive
+from skin.simulator.solid import Solid
+from studies.report_figures import draw_skin
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+
+
+@pytest.mark.parametrize("constraint", ["vertical", "free"])
+def test_nodes_move_as_sensors_on_them_do(constraint):
+    body = Sheet((0.08, 0.06), (8, 6), LAYERS)
+    pressure = torch.zeros(2, 6, 8)
+    pressure[0, 1:3, 5:7] = 40e3
+    pressure[1, 4, 1] = 90e3
+    moved = deflection(body, pressure, constraint)
+    assert moved.shape == (2, 2, 7, 9)
+    # the operator's way is the adjoint one: a solve per sensor, not per frame
+    nodes = np.array([[0.05, 0.02, 0.005], [0.02, 0.05, 0.005], [0.06, 0.01, 0.005]])
+    seen = build(Structure(body, constraint), Sensors(nodes, (0.01, 0.01)))
+    loads = pressure.flatten(1).double().numpy().T
+    column, row = np.round(nodes[:, :2] * 100).astype(int).T
+    top, bottom = (seen.surface @ loads).T, (seen.sensor @ loads).T
+    assert moved[:, 1, row, column] == pytest.approx(top, rel=1e-9)
+    assert moved[:, 0, row, column] == pytest.approx(bottom, rel=1e-9)
+    assert moved[0].reshape(2, -1).argmax(axis=1) == pytest.approx(2 * 9 + 6)  # under the first touch
+
+
+def test_a_single_layer_has_one_face():
+    moved = deflection(Sheet((0.04, 0.04), (4, 4), LAYERS[1:]), torch.full((1, 4, 4), 17e3))
+    assert moved.shape == (1, 1, 5, 5)
+    # strain p / E of 5 mm of 170 kPa
+    assert moved.mean() == pytest.approx(0.1 * 0.005, rel=0.1)
+
+
+def test_the_surface_of_a_solid_moves_as_sensors_on_it_do(tmp_path):
+    """A node takes the mean of four cells and a cell that of four nodes: 1 2 1 along x and y, of sensors."""
+    body = Sheet((0.16, 0.08), (16, 8), LAYERS)
+    pressure = torch.zeros(2, 8, 16)
+    pressure[0, 3:5, 10:12] = 40e3
+    steps = np.arange(-1, 2) * 0.01
+    places = np.stack([*np.meshgrid(0.11 + steps, 0.04 + steps), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
+    nu = {"Dragon Skin 10 Medium": 0.45, "EcoFlex 00-30": 0.45}
+    solid = Solid(body, Sensors(places, (0.01, 0.01)), 1, nu, tmp_path)
+    moved = surface_motion(solid, body, pressure)
+    assert moved.shape == (2, 9, 17)
+    assert (moved[1] == 0).all()
+    weights = np.outer([1, 2, 1], [1, 2, 1]).ravel() / 16
+    true = weights @ solid(pressure[0]).displacement[:, 1].numpy()
+    assert moved[0, 4, 11] == pytest.approx(true, rel=1e-4)
+    assert np.unravel_index(moved[0].argmax(), (9, 17)) == (4, 11)
+
+
+def test_without_a_compliance_plates_and_beams_tell_how_a_flat_skin_moves():
+    body, pressure = Sheet((0.04, 0.04), (4, 4), LAYERS[1:]), torch.full((1, 4, 4), 17e3)
+    moved = surface_motion(Naive(body, Grid(2, 2).sensors(body)), body, pressure)
+    np.testing.assert_array_equal(moved, deflection(body, pressure)[:, -1])
+    arm = Arm(radius=0.05, length=0.1, angle=2.0, cells=[4, 4], layers=LAYERS)
+    assert surface_motion(Naive(arm, Grid(2, 2).sensors(arm)), arm, pressure) is None
+
+
+def test_the_map_shows_millimetres():
+    moved = np.zeros((5, 7))
+    moved[1, 2] = 0.002
+    figure = surface(moved, 0.0, (0.06, 0.04), "a press")
+    shown = figure.axes[1].images[0]
+    assert np.asarray(shown.get_array()).max() == 2
+    assert shown.get_extent() == pytest.approx((0, 60, 40, 0))
+
+
+@pytest.mark.slow
+def test_the_gallery_draws_the_skin(configured, tmp_path):
+    paths = draw_skin(build_device(configured("device.test_gestures=400")), tmp_path)
+    assert {path.name for path in paths} == {
+        "overview.png",
+        "figure02_hand_top.png",
+        "figure03_hand_bottom.png",
+        "figure04_interpolations.png",
+        "figure10_naive_fem.png",
+        "figure11_force_reading.png",
+    }
+    for path in paths:
+        with Image.open(path) as picture:
+            assert min(picture.size) > 200

@@ -1,0 +1,85 @@
+"""What is read in an embedding is what was put there."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.build import build_device
+from skin.errors import InputError
+from skin.recording import Touches
+from studies.embedding.probe import FRAME, accuracy, explained, probe, strongest
+from studies.embedding.settings import Probing
+
+SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "layouts": 2}
+
+
+@pytest.fixture(scope="module")
+def found(configured):
+    """Everything that a small probe of the naive skin finds."""
+    device = build_device(configured("simulator=naive"))
+    return {(one.attribute, one.name): one for one in probe(device, Probing(**SMALL), None)}
+
+
+def test_an_svm_reads_what_is_there_and_no_more():
+    generator = np.random.default_rng(0)
+    vectors, chance = generator.standard_normal((400, 4)), generator.integers(0, 2, 400)
+    assert accuracy(vectors, (vectors[:, 0] ** 2 + vectors[:, 1] ** 2 > 1.4).astype(int), 300) > 0.85
+    assert abs(accuracy(vectors, chance, 300) - 0.5) < 0.15  # three standard errors
+    assert np.isnan(accuracy(vectors, np.zeros(400, dtype=int), 300))
+
+
+def test_explained_variance_of_known_vectors():
+    classes = np.repeat([0, 1], 50)
+    spread = np.tile([-1.0, 1.0], 50)
+    # 1 within classes and 4 between them
+    assert explained(np.stack([spread, 4 * classes - 2], axis=1), classes) == pytest.approx(4 / 5)
+    assert explained(np.stack([spread, np.zeros(100)], axis=1), classes) == pytest.approx(0)
+    assert explained(np.full((100, 3), 0.1), classes) == 0
+
+
+def test_the_strongest_frame_leaves_out_what_is_not_valid():
+    readings = torch.zeros(1, 3, 2)
+    readings[0, 0] = torch.tensor([1.0, 99.0])
+    readings[0, 2] = torch.tensor([3.0, 1.0])
+    valid = torch.ones_like(readings, dtype=torch.bool)
+    valid[0, 0, 1] = False
+    touches = Touches(readings, valid, torch.zeros(2, 3), None, 10.0)
+    assert strongest(touches).tolist() == [[3, 1]]
+
+
+def test_degrees_tell_the_layout_and_nothing_else(found):
+    for name in ("Graph2Vec", "GL2Vec", "IGE"):
+        one = found["degree", name]
+        assert one.explained["layout"] > 0.9
+        assert one.accuracy["layout"] == 1
+        assert all(
+            abs(one.accuracy[label] - 0.5) < 0.17 for label in ("big", "dynamic", "press", "dangerous")
+        )
+    assert np.ptp(found["degree", "IGE"].space.vectors, axis=0).max() == 0
+
+
+def test_readings_tell_what_presses_but_one_frame_no_duration(found):
+    for key in (("reading", "IGE"), ("reading", "Graph2Vec"), ("", FRAME)):
+        assert found[key].accuracy["dangerous"] > 0.8
+        assert found[key].accuracy["press"] < 0.7
+    assert found["", "readings, window"].space.vectors.shape == (240, 750)
+
+
+def test_touches_of_another_seed_are_others(configured, found):
+    device = build_device(configured("simulator=naive"))
+    other = next(probe(device, Probing(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
+    assert other.space.labels.shape == (240, 4)
+    assert (other.space.labels != found["degree", "Graph2Vec"].space.labels).any()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"attributes": ["colour"]}, "set embeddings.attributes"),
+        ({"train": 5}, "embeddings.train must be at least 20"),
+        ({"seeds": []}, "embeddings.seeds is empty"),
+    ],
+)
+def test_settings_of_no_use_are_refused(given, words):
+    with pytest.raises(InputError, match=words.replace("[", r"\[")):
+        Probing(**given)

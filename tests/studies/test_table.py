@@ -1,0 +1,144 @@
+"""The table says what the runs say: means, deviations, failures, the report's numbers beside ours."""
+
+import csv
+import io
+from importlib import import_module
+from types import SimpleNamespace
+
+import pytest
+
+from skin.config import CONF, ROOT
+from skin.files import write
+from studies.table import COLUMNS, LABELS, Cell, as_csv, grid, markdown, report_values, rows
+
+REPORT = {("temporal_graph", "fem", "overall"): 0.732, ("temporal_graph", "fem", "big"): 0.646}
+
+
+def run(same, shifted=None, recall=0.5):
+    """Return what the table reads of an MLflow run whose four labels are equally good."""
+    labels = ("overall", "big", "dynamic", "press", "dangerous")
+    metrics = {f"same/{label}/accuracy": same for label in labels}
+    metrics |= {
+        "same/dangerous/alarm_recall": recall,
+        "same/dangerous/false_alarm_rate": 0.021,
+        "seconds_per_epoch": 2.0,
+        "parameters": 145774.0,
+    }
+    if shifted is not None:
+        metrics["device_shift/overall/accuracy"] = shifted
+    return SimpleNamespace(data=SimpleNamespace(metrics=metrics, tags={}))
+
+
+@pytest.fixture
+def lines():
+    cells = [
+        Cell("temporal_graph", "fem", (run(0.8, 0.7), run(0.9, 0.5)), 0),
+        Cell("linked_graph", "naive", (), 2),
+    ]
+    return {(line["row"], line["label"]): line for line in rows(cells, REPORT)}
+
+
+def test_ours_is_mean_and_deviation_over_seeds(lines):
+    line = lines["temporal_graph", "overall"]
+    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt(2)
+    assert (line["ours"], line["ours_sd"], line["device_shift"]) == ("0.8500", "0.0707", "0.6000")
+
+
+def test_one_seed_has_no_deviation():
+    (line, *_) = rows([Cell("rules", "fem", (run(0.8),), 0)], {})
+    assert (line["ours"], line["ours_sd"], line["report"]) == ("0.8000", "", "")
+
+
+def test_the_reports_number_stands_where_it_has_one(lines):
+    assert lines["temporal_graph", "overall"]["report"] == "0.732"
+    assert lines["temporal_graph", "press"]["report"] == ""
+
+
+def test_a_row_without_a_finished_run_shows_as_failed(lines):
+    assert {lines["linked_graph", label]["ours"] for label in LABELS} == {"failed"}
+    assert "failed" in markdown(grid(list(lines.values())), "x").splitlines()[-1]
+
+
+def test_a_row_that_misses_a_seed_says_so():
+    lines = rows([Cell("rules", "fem", (run(0.8), run(0.9)), 1)], {})
+    assert {line["failed"] for line in lines} == {"1"}
+    assert grid(lines)[1][0] == "rules (1 failed)"
+
+
+def test_a_row_that_takes_no_other_layout_says_so():
+    fixed = run(0.8, 0.7)
+    fixed.data.tags["cannot_unseen_layout"] = "readings are of 25 sensors in this order"
+    (line, *_) = rows([Cell("mlp", "fem", (fixed,), 0)], {})
+    assert (line["device_shift"], line["unseen_layout"]) == ("0.7000", "cannot")
+
+
+def test_the_alarm_has_its_recall_and_its_false_alarms_side_by_side(lines):
+    assert lines["temporal_graph", "dangerous_recall"]["ours"] == "0.5000"
+    assert lines["temporal_graph", "false_alarms"]["ours"] == "0.0210"
+    head, first, _ = grid(list(lines.values()))
+    place = head.index("recall")
+    assert head[place + 1] == "false alarms"
+    assert first[place : place + 2] == ["50.0 ± 0.0", "2.1 ± 0.0"]
+
+
+def test_other_devices_have_their_own_recall_and_false_alarms():
+    one = run(0.8, 0.7)
+    one.data.metrics |= {
+        "device_shift/dangerous/alarm_recall": 0.4,
+        "device_shift/dangerous/false_alarm_rate": 0.048,
+    }
+    head, first = grid(rows([Cell("features", "fem", (one,), 0)], {}))
+    place = head.index("device shift")
+    assert head[place : place + 3] == ["device shift", "its recall", "its false alarms"]
+    assert first[place : place + 3] == ["70.0", "40.0", "4.8"]
+
+
+def test_what_is_undefined_is_no_number():
+    """A run without dangerous test gestures has no recall; it did not fail either."""
+    one = run(0.8)
+    del one.data.metrics["same/dangerous/alarm_recall"]
+    lines = rows([Cell("features", "fem", (one,), 0)], {})
+    assert next(line["ours"] for line in lines if line["label"] == "dangerous_recall") == ""
+    head, first = grid(lines)
+    assert first[head.index("recall")] == "-"
+
+
+def test_a_person_reads_ours_with_the_reports_in_brackets(lines):
+    head, first, _ = grid(list(lines.values()))
+    assert dict(zip(head, first, strict=True))["overall"] == "85.0 ± 7.1 (73.2)"
+
+
+def test_csv_has_the_columns_and_reads_back(lines):
+    read = list(csv.DictReader(io.StringIO(as_csv(list(lines.values())))))
+    assert tuple(read[0]) == COLUMNS
+    assert read == list(lines.values())
+
+
+def test_a_file_is_written_whole_and_leaves_nothing_beside_it(tmp_path):
+    write("old", tmp_path / "new" / "table.md")
+    write("new", tmp_path / "new" / "table.md")
+    assert [path.read_text() for path in (tmp_path / "new").iterdir()] == ["new"]
+
+
+def test_the_reports_numbers_belong_to_rows_of_the_table():
+    known = report_values(ROOT / "data" / "report_table.csv")
+    rows_of_table = {path.stem for path in (CONF / "experiment").glob("*.yaml")}
+    assert {row for row, _, _ in known} <= rows_of_table
+    assert known["sequence_image", "fem", "overall"] == 0.771
+    assert all(0 <= value <= 1 for (_, _, label), value in known.items() if label in LABELS)
+
+
+@pytest.mark.parametrize("row", ["temporal_graph", "sequence_graph", "sequence_image"])
+def test_the_reports_overall_is_the_mean_of_its_labels(row):
+    known = report_values(ROOT / "data" / "report_table.csv")
+    each = [known[row, "fem", label] for label in ("big", "dynamic", "press", "dangerous")]
+    assert known[row, "fem", "overall"] == pytest.approx(sum(each) / 4, abs=2e-3)
+
+
+def test_a_table_tells_its_budget(monkeypatch):
+    cell = Cell("rules", "fem", (run(0.8),), 0)
+    assert {line["budget"] for line in rows([cell], {}, "smoke")} == {"smoke"}
+    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
+    titles = import_module("reproduce_table").TITLES
+    assert "SMOKE" in titles["smoke"]
+    assert "SMOKE" not in titles["full"]

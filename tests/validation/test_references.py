@@ -1,0 +1,136 @@
+"""The independent answers are right themselves: against other formulas, and against numerical integration."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from validation.halfspace import SQUARE_PUNCH, HalfSpace, Hertz, square_punch
+from validation.layered import Slab, bonded_layer, patch, patch_mean, waves
+
+SOFT, HARD = Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 0.45, 0.499, 0.4999])
+@pytest.mark.parametrize("number", [5.0, 100.0, 3000.0])
+def test_one_layer_is_the_closed_form(ratio, number):
+    slab = Slab(0.01, 2e5, ratio)
+    motion, stress = waves(np.array([number]), [slab], 0.0)[0]
+    assert motion == pytest.approx(bonded_layer(number, slab), rel=1e-10)
+    assert stress == pytest.approx(-1, rel=1e-12)
+
+
+def test_a_layer_cut_in_two_is_one_layer():
+    whole, halves = [Slab(0.015, 1e5, 0.4)], [Slab(0.005, 1e5, 0.4), Slab(0.01, 1e5, 0.4)]
+    numbers = np.array([0.0, 10.0, 200.0])
+    for depth in (0.0, 0.003, 0.009):
+        assert waves(numbers, halves, depth) == pytest.approx(waves(numbers, whole, depth), rel=1e-10)
+
+
+def test_two_layers_integrated_step_by_step():
+    """Shoot from the surface through both layers: the base does not move, and the joint says the same."""
+    number = 150.0
+    state = np.zeros(4)
+    state[1] = waves(np.array([number]), [SOFT, HARD], 0.0)[0, 0]
+    state[2] = -1.0
+
+    def fall(slab, begin):
+        mu = slab.shear
+        lam = slab.confined - 2 * mu
+
+        def rate(_, y):
+            along, down, normal, shear = y
+            sinks = (normal + lam * number * along) / (lam + 2 * mu)
+            grows = -lam * number * sinks + (lam + 2 * mu) * number**2 * along
+            return [shear / mu - number * down, sinks, number * shear, grows]
+
+        return solve_ivp(rate, (0, slab.thickness), begin, rtol=1e-11, atol=1e-18, method="LSODA").y[:, -1]
+
+    # The motion along the wave at the surface is what leaves the base at rest.
+    ends = [fall(HARD, fall(SOFT, state + move * np.eye(4)[0])) for move in (0.0, 1e-8)]
+    along = -ends[0][0] / (ends[1][0] - ends[0][0]) * 1e-8
+    joint = fall(SOFT, state + along * np.eye(4)[0])
+    base = fall(HARD, joint)
+    assert abs(base[:2]).max() < 1e-6 * state[1]
+    assert joint[1:3] == pytest.approx(waves(np.array([number]), [SOFT, HARD], 0.005)[0], rel=1e-6)
+
+
+def test_an_even_pressure_is_carried_to_the_base():
+    everywhere = (0.0, 0.16, 0.0, 0.16)
+    motion, stress = patch([SOFT, HARD], (0.16, 0.16), everywhere, (0.05, 0.06, 0.02, 0.03), 0.005, 40)
+    assert stress == pytest.approx(-1, rel=1e-12)
+    assert motion == pytest.approx(0.010 / HARD.confined, rel=1e-12)
+
+
+def test_stress_under_a_patch_sums_to_its_force():
+    loaded, everywhere = (0.06, 0.10, 0.03, 0.07), (0.0, 0.16, 0.0, 0.16)
+    mean = patch([SOFT, HARD], (0.16, 0.16), loaded, everywhere, 0.009, 60)[1]
+    assert mean == pytest.approx(-(0.04 * 0.04) / 0.16**2, rel=1e-9)
+
+
+def test_means_of_waves():
+    orders = np.arange(5)
+    x = 0.02 + (np.arange(20000) + 0.5) * 0.03 / 20000
+    expected = np.cos(orders[:, None] * np.pi * x / 0.2).mean(axis=1)
+    assert patch_mean(orders, 0.2, 0.02, 0.05) == pytest.approx(expected, rel=1e-8)
+
+
+def test_below_the_middle_of_a_square_boussinesq_is_steinbrenner():
+    """sigma_zz under the corner of a rectangle (Newmark): four squares meet in the middle."""
+    m = n = 0.01 / 0.007
+    root = np.sqrt(m**2 + n**2 + 1)
+    first = m * n * (m**2 + n**2 + 2) / (root * (m**2 + 1) * (n**2 + 1))
+    corner = (first + np.arcsin(m * n / np.sqrt((m**2 + 1) * (n**2 + 1)))) / (2 * np.pi)
+    stress = HalfSpace(1e5, 0.4, 0.01).pressed(np.array([[0, 0, 0.007]]))[1]
+    assert stress[0, 0] == pytest.approx(-4 * corner, rel=1e-6)
+
+
+def test_love_in_the_middle_of_a_square():
+    """Love (1929): 8 a ln(1 + sqrt 2) (1 - nu^2) / (pi E) in the middle of a square of side 2 a."""
+    down, along = HalfSpace(1e5, 0.4, 0.01).middle()
+    assert down == pytest.approx(8 * 0.01 * np.log(1 + np.sqrt(2)) * (1 - 0.16) / (np.pi * 1e5), rel=1e-6)
+    # A traction moves the surface by the same with 1 - nu + nu x^2 / r^2, whose mean over a square is 1/2.
+    assert along == pytest.approx(down * (1 - 0.4 / 2) / (1 - 0.4), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["pressed", "dragged"])
+def test_half_spaces_are_in_equilibrium(kind):
+    """The stress on a deep wide plane carries the load, and motion and stress obey Hooke's law."""
+    space = HalfSpace(1e5, 0.3, 0.01)
+    part = 0 if kind == "pressed" else 1
+    points, weights = np.polynomial.legendre.leggauss(80)
+    turn = np.pi / 2 * points
+    x = 0.02 * np.tan(turn)  # the whole plane
+    dx = 0.02 * np.pi / 2 * weights / np.cos(turn) ** 2
+    plane = np.stack([*np.meshgrid(x, x), np.full((80, 80), 0.02)], axis=-1).reshape(-1, 3)
+    force = np.outer(dx, dx).ravel() @ getattr(space, kind)(plane)[1][:, part]
+    assert force == pytest.approx(-4e-4, rel=1e-3)
+    place, step = np.array([0.013, 0.004, 0.009]), 1e-6
+    around = np.concatenate([place + step * np.eye(3), place - step * np.eye(3)])
+    motion = getattr(space, kind)(around)[0]
+    gradient = (motion[:3] - motion[3:]).T / (2 * step)
+    lam = 2 * space.shear * 0.3 / 0.4
+    zz = lam * np.trace(gradient) + 2 * space.shear * gradient[2, 2]
+    xz, yz = (space.shear * (gradient[axis, 2] + gradient[2, axis]) for axis in (0, 1))
+    stress = getattr(space, kind)(place[None])[1][0]
+    assert stress == pytest.approx(np.array([zz, xz, yz]), rel=1e-5)
+
+
+def test_hertz_agrees_with_itself():
+    sphere, approach = Hertz(0.05, 2e5), 1e-3
+    force = sphere.force(approach)
+    assert sphere.contact(force) == pytest.approx(np.sqrt(0.05 * approach), rel=1e-12)
+    assert sphere.peak(force) == pytest.approx(2 * 2e5 / np.pi * np.sqrt(approach / 0.05), rel=1e-12)
+
+
+def test_a_square_punch_is_a_charged_plate():
+    """Even cells of charge on a square plate: their capacitance rises to the square's from below."""
+    count = 24
+    cell = 1 / count
+    x, y = (np.indices((count, count)).reshape(2, -1) + 0.5) * cell
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)
+    np.fill_diagonal(distance, 1)
+    potential = np.where(np.eye(len(x), dtype=bool), 4 * cell * np.log(1 + np.sqrt(2)), cell**2 / distance)
+    capacity = np.linalg.solve(potential, np.ones(len(x))).sum() * cell**2
+    assert np.pi * capacity == pytest.approx(SQUARE_PUNCH, rel=0.015)
+    assert np.pi * capacity < SQUARE_PUNCH
+    assert square_punch(2e5, 0.02, 1e-3) == pytest.approx(SQUARE_PUNCH * 4)

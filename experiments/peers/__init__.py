@@ -1,1 +1,1 @@
-"""What others built, on the same touches: files to them, answers back."""
+"""Other libraries on the same touches; data go to their environment and back as files."""

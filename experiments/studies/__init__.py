@@ -1,1 +1,1 @@
-"""Comparisons: what is varied, on what it is tried, and what follows; their tables and figures."""
+"""Comparisons of configurations: variants, trials, paired differences, tables and figures."""

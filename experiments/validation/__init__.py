@@ -1,1 +1,1 @@
-"""The laws of mechanics that the simulators must obey, each held against an answer that is not theirs."""
+"""The laws of mechanics, each checked against an independent solution."""

@@ -1,1 +1,1 @@
-"""The real skin and its stand-in: recording, calibration, the emulator, the live view."""
+"""Working with a real skin: recording, calibration, the emulator, the live view."""

@@ -1,1 +1,1 @@
-"""Pictures and pages: touches, skins, evaluations, recordings beside their simulation."""
+"""Pictures and pages of touches, skins, evaluations, and recordings beside their simulation."""

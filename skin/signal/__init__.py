@@ -1,1 +1,1 @@
-"""Readings as signals: what a device does to them, and what is measured on them."""
+"""Readings as signals: device imperfections, resampling, contact detection, features."""

@@ -1,1 +1,1 @@
-"""What is between a wire and its frames: protocol, decoder, reader. No options (docs/adr/0006)."""
+"""Reading a skin at a port: protocol, decoder, reader, tare, conversion to newtons, segmentation into gestures."""

@@ -1,1 +1,1 @@
-"""From a bench session to the constants of a simulated device."""
+"""Calibration: from presses of known force to the constants of a simulated device."""

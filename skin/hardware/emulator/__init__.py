@@ -1,1 +1,1 @@
-"""A skin without hardware: gestures in real time behind a port. No options (docs/adr/0006)."""
+"""The emulator: a simulated skin behind a pseudo-terminal or a TCP port, in real time."""

@@ -1,1 +1,1 @@
-"""What happens to a stream between the port and a person: window, verdict, terminal, page. No options."""
+"""The live view: verdicts on the stream of a skin, in the terminal and on a web page."""

@@ -1,1 +1,1 @@
-"""Between an open skin and a set of touches: windows, labels, their file. No options (docs/adr/0006)."""
+"""Sessions: raw frames and gestures of a real skin, recorded to disk and read back."""

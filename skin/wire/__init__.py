@@ -1,1 +1,1 @@
-"""Reading a skin at a port: protocol, decoder, reader, tare, conversion to newtons, segmentation into gestures."""
+"""Reading a skin at a port: protocol, decoder, reader, tare, conversion to newtons, segmentation."""

@@ -1,7 +1,7 @@
 """Try finished runs on windows that slide over streams of touches: python experiments/stream.py run=latest
 
 rows=all takes the newest finished runs of every row on simulator=, on whole touches and on windows of streams
-(train.py data.stream=true) each. What was tried before is brought back from MLflow.
+(train.py data.stream=true) each. Earlier results are read from MLflow.
 """
 
 from skin.config import DictConfig, command, overrides, plain

@@ -64,9 +64,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("what", nargs="*", help="studies, or all (but the costly); overrides of the training")
     parser.add_argument("--list", action="store_true", help="list the studies and what they check")
     parser.add_argument("--seeds", type=int, default=3, help="runs per variant: seeds 0, 1, ...")
-    parser.add_argument(
-        "--smoke", action="store_true", help="little data, one epoch: the figures mean nothing"
-    )
+    parser.add_argument("--smoke", action="store_true", help="little data, one epoch: ignore the scores")
     parser.add_argument("--out", type=Path, help="folder of the results; default: results/")
     parser.add_argument("--config-dir", type=Path, help="folder of configuration of your own, as of train.py")
     arguments = parser.parse_intermixed_args()

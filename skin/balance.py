@@ -1,4 +1,4 @@
-"""Whether the classes of a data set differ in more than their label, and what the shape tells of it."""
+"""Class balance of a data set: shape, area, force and position per class; what shape tells of the labels."""
 
 import sys
 import warnings

@@ -1,4 +1,4 @@
-"""From a configuration to the objects it names, group by group."""
+"""Build the objects that a configuration names, group by group."""
 
 from dataclasses import fields
 from typing import TYPE_CHECKING

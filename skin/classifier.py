@@ -1,4 +1,4 @@
-"""The one training step of every network."""
+"""The LightningModule of every network: loss, metrics, optimizer."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
@@ -151,7 +151,7 @@ class TouchClassifier(pl.LightningModule):
 
 
 def _dropped(share: float) -> list[nn.Module]:
-    """Return a dropout as a list; none where nothing is dropped, so that weights of old keep their names."""
+    """Return a dropout as a list; none where nothing is dropped, so that older weights keep their names."""
     return [nn.Dropout(share)] if share else []
 
 

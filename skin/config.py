@@ -1,6 +1,6 @@
-"""The configuration: its schema, its fingerprint, and the door that every command comes through.
+"""The configuration: its schema, its fingerprint, and the entry point of every command.
 
-Only Hydra is imported here: ``--help`` and a mistyped key must not pay for torch.
+Only Hydra is imported here: ``--help`` and a mistyped key must not import torch.
 """
 
 from skin import interrupt  # isort: skip
@@ -51,7 +51,7 @@ class Data:
     padded: bool
     fresh: bool
     batch_size: int
-    # Runs of old have none of these.
+    # Older runs have none of these.
     stream: bool = False
     direction: bool = False
     augment: dict[str, Any] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class Evaluation:
     layouts: int
     gestures: int
     false_alarm_rate: float
-    safe_gestures: int = 5000  # runs of old have none
+    safe_gestures: int = 5000  # older runs have none
 
 
 @dataclass
@@ -100,7 +100,7 @@ class Config:
     trainer: dict[str, Any]
     evaluation: Evaluation
     tracking: Tracking
-    contact: dict[str, Any] | None = None  # runs of old have none
+    contact: dict[str, Any] | None = None  # older runs have none
     # What a command other than training adds.
     run: str | None = None
     trust: bool = False

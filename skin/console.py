@@ -1,4 +1,4 @@
-"""Silence for messages that a user of the command line cannot act on."""
+"""Silence library messages that a user of the command line cannot act on."""
 
 import logging
 import warnings

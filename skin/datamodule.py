@@ -1,4 +1,4 @@
-"""Touches as batches of frames."""
+"""The LightningDataModule: touches as batches of frames."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,4 +1,4 @@
-"""What stands beside the rows of a recording, as JSON, is checked before anything is allocated for it."""
+"""Check the JSON metadata of a recording before memory is allocated for its rows."""
 
 import math
 from collections.abc import Callable, Mapping

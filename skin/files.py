@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and a disk that refuses costs one sentence."""
+"""Atomic file writing; a full or read-only disk raises InputError."""
 
 import errno
 import os

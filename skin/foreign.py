@@ -1,4 +1,4 @@
-"""Files that somebody else may have written: read without running code or taking memory without bound."""
+"""Read files from unknown sources without running code and in bounded memory."""
 
 import math
 import zipfile

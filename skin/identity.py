@@ -1,4 +1,4 @@
-"""A hash of what a result depends on: its configuration, the files that this names, and the version."""
+"""A hash of what a result depends on: its configuration, the files it names, and the version."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Ctrl-C, from a command's first import on: the command ends as a signal ends it, without a traceback."""
+"""Handle Ctrl-C from the first import on: the command ends as by the signal, without a traceback."""
 
 import sys
 from types import TracebackType

@@ -1,4 +1,4 @@
-"""What the labels of a touch mean, and the ground truth of them: the pressure movie."""
+"""Labels of a touch, and how they follow from its pressure movie."""
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple

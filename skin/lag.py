@@ -1,4 +1,4 @@
-"""What a soft material and a converter do to forces in time: hysteresis, a lag, steps."""
+"""First-order lag, hysteresis and rounding of readings in time."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Refuse values that are off by a unit, and warn of skins whose mechanics do nothing.
+"""Refuse values with the wrong unit; warn of skins whose mechanics have no effect.
 
 Classes take any value that has a meaning, however large a sheet or stiff a layer a proof needs; a
 configuration describes a skin that somebody could hold, and 12 in place of 0.012 m is a mistake there.

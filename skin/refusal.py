@@ -1,4 +1,4 @@
-"""What a person is told where a command or one job of a multirun cannot go on."""
+"""Error messages for a command, or one job of a multirun, that cannot continue."""
 
 import errno
 import os

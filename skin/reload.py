@@ -1,4 +1,4 @@
-"""A finished run, brought back: its configuration with changes, and what it learned."""
+"""Restore a finished run: its configuration with changes, and its weights."""
 
 import pickle
 import sys

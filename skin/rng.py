@@ -1,4 +1,4 @@
-"""Independent streams of randomness: one per purpose, none of which can meet another."""
+"""Independent random generators, one per purpose."""
 
 from enum import IntEnum
 

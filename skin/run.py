@@ -1,4 +1,4 @@
-"""One run: build, learn, evaluate, log."""
+"""One run: build, train, evaluate, log."""
 
 import math
 import os

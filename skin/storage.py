@@ -1,4 +1,4 @@
-"""Recordings in Parquet and CSV files: one row per frame, as the report's data set has them (2.1.1).
+"""Recordings as Parquet and CSV files: one row per frame, as in the report (2.1.1).
 
 Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
 (N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
@@ -102,11 +102,11 @@ def _columns(about: dict[str, Any]) -> dict[str, pa.DataType]:
     task, sensors = about["task"], len(about["positions"])
     columns = {"simulation": pa.int32(), "frame": pa.int32()}
     if about["labelled"]:
-        cosines = 2 if task.get("direction") else 0  # recordings of old do not say
+        cosines = 2 if task.get("direction") else 0  # older recordings do not say
         kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
         columns |= dict(zip(task["names"], kinds, strict=True))
     names = _numbered("reading", sensors) + ["force"] * about["force"]
-    limits = _numbered("saturated", sensors) if about.get("saturated") else []  # recordings of old do not say
+    limits = _numbered("saturated", sensors) if about.get("saturated") else []  # older recordings do not say
     if about["displacement"]:
         names += _numbered("D_s", sensors) + _numbered("D_t", sensors)
     names += [f"gesture_{name}" for name in about["parameters"]]
@@ -175,7 +175,7 @@ def _read_about(path: Path) -> dict[str, Any]:
     stored = pa.parquet.read_schema(path).metadata or {}
     if b"skin" not in stored:
         raise InputError(f"{path} is no recording: its schema has no units, layout and rate under 'skin'")
-    # Files of old have no sum.
+    # Older files have no checksum.
     if stored.get(b"skin_sha256", _sha256(stored[b"skin"]).encode()) != _sha256(stored[b"skin"]).encode():
         raise InputError(f"{path} is damaged: its units, layout and rate are not those that were written")
     return json.loads(stored[b"skin"])

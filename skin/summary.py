@@ -1,4 +1,4 @@
-"""What a data set is like: forces, strains, clipped readings, accepted draws, in one line."""
+"""Summary of a data set in one line: forces, strains, clipped readings, accepted draws."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Runs in MLflow: one SQLite file, one experiment, and a status that can be trusted."""
+"""Runs in MLflow: one SQLite file, one experiment, and a status that is true after a crash."""
 
 import os
 

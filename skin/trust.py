@@ -1,4 +1,4 @@
-"""What the configuration of a stored run may build: a stranger's run must not execute code."""
+"""Restrict what a stored run's configuration may build: it must not execute code."""
 
 import inspect
 from collections.abc import Iterator

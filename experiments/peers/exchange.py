@@ -1,4 +1,4 @@
-"""Touches to, and answers from, a learner that lives in another environment: by files alone."""
+"""Exchange touches and predictions with a learner in another environment, as files."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""A run of a peer: touches out, its own environment learns, answers in, figures logged as for any row."""
+"""A peer's run: export touches, train in its own environment, log its metrics as for any row."""
 
 import subprocess
 from collections.abc import Callable, Sequence

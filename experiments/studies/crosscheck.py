@@ -1,4 +1,4 @@
-"""How much the mechanics matter: trained on one simulator, tested on another."""
+"""How much the mechanics matter: train on one simulator, test on another."""
 
 import csv
 import io

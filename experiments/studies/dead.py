@@ -1,4 +1,4 @@
-"""What dead sensors cost finished runs, and whether a mask that was there in training helps."""
+"""The cost of dead sensors, and whether a mask in training helps."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""What friction and sensors that lean are worth for the direction of sliding: trainings, compared."""
+"""What friction and tilted sensors add to the direction of sliding."""
 
 import csv
 import io

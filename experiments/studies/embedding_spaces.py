@@ -1,4 +1,4 @@
-"""Embedding spaces for a person: the report's figure 5, the table of what they tell, and the verdicts."""
+"""Figure 5 of the report, the table of what embeddings tell, and the verdicts."""
 
 from collections.abc import Callable, Iterable, Sequence
 from statistics import fmean, stdev

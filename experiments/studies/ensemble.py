@@ -1,4 +1,4 @@
-"""Do several rows together know more than the best of them? By votes, and by averaged probabilities."""
+"""Ensembles of several rows: votes and averaged probabilities."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a study found: the runs of each variant, and each statement of the report with its verdict."""
+"""What a study found: the runs of each variant, and a verdict on each statement of the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Where a learner errs, as files a person can open and as one line."""
+"""Files and one line on the errors of a learner by margin."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""How far touches move the sensors of a skin in which they can, and how well readings tell it."""
+"""How far touches move the sensors of a skin, and how well readings tell it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Finished runs on misplaced sensors and uneven skins, and trainings that follow sensors that move."""
+"""Finished runs on misplaced sensors and uneven skins; trainings that track moving sensors."""
 
 import hashlib
 import json

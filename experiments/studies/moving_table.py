@@ -1,4 +1,4 @@
-"""What moving and misplaced sensors cost, for a person."""
+"""The table of moving and misplaced sensors."""
 
 import csv
 import io

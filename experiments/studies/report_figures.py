@@ -1,4 +1,4 @@
-"""What the report's figures are drawn from: finished runs, and the simulated skin itself."""
+"""The figures of the report from finished runs and the simulated skin."""
 
 from collections.abc import Sequence
 from pathlib import Path

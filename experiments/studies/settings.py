@@ -1,4 +1,4 @@
-"""What is asked of commands that compare runs; here, because a mistake in it must not pay for torch."""
+"""Settings of commands that compare runs; free of heavy imports, so that a mistake is reported at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What was found on streams, as files a person can open and as one line."""
+"""Files and one line on an evaluation on streams."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Finished runs, each tried on streams once and for all."""
+"""Finished runs, each evaluated on streams once."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Studies: what the report says about variants, the runs that test it, and the verdict."""
+"""Studies: the report's statements about variants, and the runs that test them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ SMOKE = (
     "evaluation.safe_gestures=48",
     "tracking.experiment=smoke",
 )
-"""Overrides that shrink every run to a second; its figures mean nothing."""
+"""Overrides that shrink every run to a second; its scores are to be ignored."""
 FEWEST = 3
 """Paired seeds below which every verdict is ``undecided``."""
 

@@ -1,4 +1,4 @@
-"""A study for a person: a table of its variants, and one of the report's statements beside what was found."""
+"""A study as a table of variants, and one of the report's statements with verdicts."""
 
 import csv
 import io

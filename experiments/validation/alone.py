@@ -1,4 +1,4 @@
-"""What one process computes with a given number of threads: python -m validation.alone 2 16 out.npz"""
+"""Compute with a given number of threads in one process: python -m validation.alone 2 16 out.npz"""
 
 import sys
 import tempfile

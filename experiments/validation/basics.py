@@ -1,4 +1,4 @@
-"""Laws of any elastic body: the patch test, confined compression, balance, reciprocity."""
+"""Laws of any elastic body: patch test, confined compression, balance, reciprocity."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Laws of layers bonded to a hard base, against sums of waves that need no elements."""
+"""Laws of layers bonded to a rigid base, against exact sums of waves."""
 
 from collections.abc import Callable
 

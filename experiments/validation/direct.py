@@ -1,4 +1,4 @@
-"""scikit-fem alone: its forms, its boundaries, its condensation; only the mesh's points are ours."""
+"""scikit-fem alone: its forms, boundaries and condensation; only the mesh is ours."""
 
 from dataclasses import dataclass
 

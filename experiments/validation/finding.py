@@ -1,4 +1,4 @@
-"""What a law finds: our number, the independent one, and how far they may be apart."""
+"""The result of a law: our number, the independent one, and the tolerance."""
 
 import math
 from collections.abc import Callable, Sequence

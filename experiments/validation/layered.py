@@ -1,4 +1,4 @@
-"""Layers on a rigid base under waves of pressure, solved exactly: an answer without elements.
+"""Exact solution for layers on a rigid base under waves of pressure.
 
 Under a pressure p cos(k x) every quantity is a wave of the same length times a function of depth, which obeys
 four ordinary differential equations (Vlasov's method of initial functions). A pressure on a rectangle within

@@ -1,4 +1,4 @@
-"""Laws whose referee is another program, another number of threads, or the report's own words."""
+"""Laws checked against another program, another number of threads, or the report."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""What the laws found, as a page, pictures and a file for programs."""
+"""The results of the laws as a page, pictures and JSON."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Laws of a thick soft block, whose middle knows nothing of its ends: forces and rigid objects on it."""
+"""Laws of a thick soft block: forces and rigid objects far from its ends."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property

@@ -1,4 +1,4 @@
-"""What a configuration gives of a body, checked: lengths, cells and layers."""
+"""Check the lengths, cells and layers that a configuration gives of a body."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Refuse what would not fit into memory before any of it is allocated."""
+"""Refuse what does not fit into memory before it is allocated."""
 
 import psutil
 

@@ -1,4 +1,4 @@
-"""A modulus that differs from cell to cell."""
+"""A modulus that varies from cell to cell."""
 
 import math
 

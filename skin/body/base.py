@@ -1,4 +1,4 @@
-"""What a body is: layers of silicone on something hard, and a chart of their surface."""
+"""The interface of a body: layers of silicone on a rigid support, and a chart of their surface."""
 
 import math
 from abc import ABC, abstractmethod

@@ -1,1 +1,1 @@
-"""What pressure an object makes where it touches the skin."""
+"""The pressure that an object makes where it touches the skin."""

@@ -1,4 +1,4 @@
-"""The force at which a touch has its wanted classes, gesture by gesture, by halving towards the limit."""
+"""Search for the force at which a touch has its wanted labels, gesture by gesture, by bisection."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

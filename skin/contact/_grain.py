@@ -1,4 +1,4 @@
-"""The dent that a single cell makes, which a mesh as coarse as the cells cannot show."""
+"""The local dent under a single loaded cell, which a mesh as coarse as the cells cannot resolve."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Contacts: what presses where and how hard, and the pressure that this makes."""
+"""The interface of a contact: from an object and a force to pressure."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar

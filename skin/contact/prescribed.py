@@ -1,4 +1,4 @@
-"""Pressure as the report has it: the picture of an object is its pressure."""
+"""Pressure as in the report: the picture of an object is its pressure."""
 
 from typing import final
 

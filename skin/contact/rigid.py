@@ -1,4 +1,4 @@
-"""Rigid objects: the picture is their height, and the skin decides on the pressure."""
+"""Rigid objects: the picture is their height, and contact mechanics gives the pressure."""
 
 from typing import final
 

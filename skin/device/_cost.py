@@ -1,4 +1,4 @@
-"""The captures in CoST.csv: read in bounded memory, checked, resampled."""
+"""Captures of CoST.csv: read in bounded memory, checked, resampled."""
 
 import re
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Captures of CoST.csv, read once and kept on disk."""
+"""Captures of CoST.csv, cached on disk."""
 
 import hashlib
 import warnings

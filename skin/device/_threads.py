@@ -1,4 +1,4 @@
-"""Work in batches, on as many threads as torch has."""
+"""Process batches on as many threads as torch has."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""How far sensors have moved: told by the simulator, or estimated from what they read."""
+"""How far sensors have moved: known from the simulator, or estimated from readings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What is true of a simulated device, before any imperfection: where its sensors are and what they read."""
+"""The true sensors and true readings of a simulated device, before imperfections."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""What a device is: a source of touches."""
+"""The interface of a device: a source of touches."""
 
 from abc import ABC, abstractmethod
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Touches from a real skin, or an emulated one, gesture by gesture."""
+"""Touches from a real or emulated skin, gesture by gesture."""
 
 import sys
 from collections.abc import Collection, Iterator, Sequence
@@ -114,7 +114,7 @@ class Serial(AbstractDevice):
         return self.recording.touches
 
     def blank(self) -> AbstractDevice:
-        """Return a device of the same shapes whose touches are 0: a run is brought back without a touch."""
+        """Return a device of the same shapes whose touches are 0: a run is restored without a touch."""
         assert self.rate is not None
         empty = torch.zeros(1, self.window, len(self.sensors))
         touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)

@@ -1,4 +1,4 @@
-"""A simulated skin: sampled gestures, a simulator, and the imperfections of a device."""
+"""A simulated skin: sampled gestures, a simulator, and device imperfections."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,1 +1,1 @@
-"""How a trained learner is judged: on devices, layouts and streams, in figures that mean something."""
+"""Evaluation of trained learners: metrics, operating point, devices, layouts, streams."""

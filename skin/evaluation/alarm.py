@@ -1,4 +1,4 @@
-"""What comes of saying "dangerous" at every moment: touches found, and false alarms."""
+"""The alarm "dangerous" on a stream: touches found, and false alarms."""
 
 import math
 from dataclasses import dataclass

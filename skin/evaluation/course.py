@@ -1,4 +1,4 @@
-"""What is asked of a learner on streams; here, because a mistake in it must not pay for torch."""
+"""Settings of an evaluation on streams; free of heavy imports, so that a mistake is reported at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Where a learner errs: how near to the line between two classes, and at how faint a touch."""
+"""Errors of a learner by distance from the class boundary and by faintness of the touch."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""How good probabilities are: per label, and overall as the report counts it."""
+"""Metrics of probabilities: per label, and overall as the report counts it."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Where the alarm "dangerous" is raised: a threshold with a known rate of false alarms."""
+"""The threshold of the alarm "dangerous", chosen for a given false-alarm rate."""
 
 import json
 import math

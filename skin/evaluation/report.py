@@ -1,4 +1,4 @@
-"""On what a trained learner is tried: its own device, unseen devices, unseen layouts."""
+"""Evaluation of a learner on its own device, unseen devices and unseen layouts."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Evaluations for a person at the terminal."""
+"""Print an evaluation as a table."""
 
 from math import isnan
 

@@ -1,4 +1,4 @@
-"""How good a learner is on windows that slide over a stream: part of a touch, a whole one, or none."""
+"""Evaluation on windows that slide over a stream: part of a touch, a whole one, or none."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,1 +1,1 @@
-"""Where the sensors are: each module is one choice of ``layout=``."""
+"""Sensor layouts: each module is one choice of ``layout=``."""

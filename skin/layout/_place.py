@@ -1,4 +1,4 @@
-"""Check that sensors can be where a layout puts them."""
+"""Check that sensors fit where a layout puts them."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a sensor layout is."""
+"""The interface of a sensor layout."""
 
 from abc import ABC, abstractmethod
 

@@ -92,7 +92,7 @@ class Network(AbstractLearner):
                 default_root_dir=folder,
             )
             with warnings.catch_warnings():
-                # Lightning 2.6 asks torch 2.13 for a class of old
+                # Lightning 2.6 asks torch 2.13 for a deprecated class
                 warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
                 trainer.fit(classifier, datamodule=data)
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")

@@ -1,4 +1,4 @@
-"""Touches as animated pictures: from above, as bars over sensors, as the deformed skin (report, 2.1.1)."""
+"""Animations of touches: from above, as bars over sensors, as the deformed skin (report, 2.1.1)."""
 
 import math
 from collections.abc import Sequence

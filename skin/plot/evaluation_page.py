@@ -1,4 +1,4 @@
-"""What an evaluation found, as a page and its matrices; verdicts where nobody knows the truth."""
+"""An evaluation as a page with confusion matrices; verdicts of touches without labels."""
 
 import math
 from collections.abc import Sequence

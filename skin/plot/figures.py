@@ -1,4 +1,4 @@
-"""The report's figures 4, 7, 8, 10 and 11 from our own data, each written whole."""
+"""Figures 4, 7, 8, 10 and 11 of the report from our own data."""
 
 from collections.abc import Mapping
 from itertools import product

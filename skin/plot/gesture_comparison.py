@@ -1,4 +1,4 @@
-"""The gestures of a session beside their simulation (report, figures 11 and 12)."""
+"""Gestures of a session beside their simulation (report, figures 11 and 12)."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A session's gestures beside their simulation, as a page and a picture (report, figures 11 and 12)."""
+"""Gestures of a session beside their simulation, as a page and a picture (report, figures 11 and 12)."""
 
 from pathlib import Path
 

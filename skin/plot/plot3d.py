@@ -1,4 +1,4 @@
-"""Touches on a body that is not flat, drawn in space (report, figure 9)."""
+"""Touches on a curved body, drawn in three dimensions (report, figure 9)."""
 
 from dataclasses import dataclass
 from itertools import pairwise

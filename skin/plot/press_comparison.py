@@ -1,4 +1,4 @@
-"""The same presses, simulated and recorded, side by side (report, figures 11 and 12)."""
+"""Presses of a bench session beside their simulation (report, figures 11 and 12)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

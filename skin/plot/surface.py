@@ -1,4 +1,4 @@
-"""How the whole skin moves under a pressure, and the report's figures 2 and 3 of it."""
+"""Displacement of the whole skin under a pressure (report, figures 2 and 3)."""
 
 import numpy as np
 from matplotlib import colormaps

@@ -1,4 +1,4 @@
-"""The touches that animations show: one drawn for it, or one of a device's own."""
+"""The touches that animations show: drawn on request, or taken from a device."""
 
 from collections.abc import Sequence
 from dataclasses import replace

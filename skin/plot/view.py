@@ -1,4 +1,4 @@
-"""What every animated view stands on: the touch that is shown, and its readings over time."""
+"""The base of every animated view: the touch that is shown, and its readings over time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""More touches from the same ones: changes of a recorded touch that leave its labels true."""
+"""Data augmentation: changes of a touch that leave its labels true."""
 
 from dataclasses import dataclass, replace
 

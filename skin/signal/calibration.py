@@ -1,4 +1,4 @@
-"""What was found of a real device: a value per sensor, ranges to draw others from, and its YAML file."""
+"""Constants of a real device, one per sensor, and ranges to draw others from; their YAML file."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Since when does something touch the skin? Readings against the tared baseline, in time."""
+"""When does something touch the skin? Readings against the tared baseline, over time."""
 
 from math import ceil
 

@@ -1,4 +1,4 @@
-"""Is the skin touched at all? The simple threshold of the report's section 4.2."""
+"""Is the skin touched? The simple threshold of the report's section 4.2."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What one would measure on a touch: numbers that do not depend on the number or order of sensors."""
+"""Hand-made features of a touch that do not depend on the number or order of sensors."""
 
 import torch
 from torch import Tensor

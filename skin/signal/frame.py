@@ -1,4 +1,4 @@
-"""One frame of a skin, and what was counted on the way to it."""
+"""One frame of a skin, and the counters of its connection."""
 
 from collections import Counter
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What a real device does to true readings: lag, gain, clip, noise, offset, rounding, dead sensors, tare."""
+"""Imperfections of a real device: lag, gain, clip, noise, offset, rounding, dead sensors, tare."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

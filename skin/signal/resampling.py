@@ -1,4 +1,4 @@
-"""From the frames of a device to those of a model: the one resampler of live and recorded touches."""
+"""From the frames of a device to those of a model: one resampler for live and recorded touches."""
 
 from typing import TYPE_CHECKING, NamedTuple
 

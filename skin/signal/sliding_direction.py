@@ -1,4 +1,4 @@
-"""What one would measure to tell where a touch slides: numbers with a sign, along x and along y."""
+"""Signed features that tell the direction of sliding, along x and along y."""
 
 import torch
 from torch import Tensor

@@ -1,1 +1,1 @@
-"""What touches the skin: shapes, gestures drawn from a seed, and their pressure movies."""
+"""Touches: shapes, gestures drawn from a seed, and their pressure movies."""

@@ -1,4 +1,4 @@
-"""Which bodies press: shape, angle, stretch and size, drawn so that they fit on the sheet."""
+"""Draw the object that presses: shape, angle, stretch and size, so that it fits on the sheet."""
 
 from __future__ import annotations
 

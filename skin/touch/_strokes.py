@@ -1,4 +1,4 @@
-"""From drawn gestures to the frames that they show: where, and under what part of their force."""
+"""From drawn gestures to the frames they show: where, and at what share of full force."""
 
 from typing import NamedTuple
 

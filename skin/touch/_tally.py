@@ -1,4 +1,4 @@
-"""What it costs to find gestures."""
+"""Count the rejected draws of gestures."""
 
 import warnings
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a gesture is drawn from: its settings, and the draws of its body (shape, time) and of its path."""
+"""Gesture settings, and the draws of shape, time and path."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields

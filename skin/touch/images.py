@@ -1,4 +1,4 @@
-"""Grey-scale images of what touches the skin: found by name, checked, and made ready for sampling."""
+"""Grey-scale images of objects: found by name, checked, prepared for sampling."""
 
 from collections.abc import Sequence
 from pathlib import Path

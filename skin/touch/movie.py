@@ -1,4 +1,4 @@
-"""Pressure movies of gestures, each distinct frame kept once."""
+"""Pressure movies of gestures; each distinct frame is kept once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

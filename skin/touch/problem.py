@@ -1,4 +1,4 @@
-"""What a contact is given and what it gives: objects on their ways, and the pressure that they make."""
+"""The data of a contact: objects on their paths, and the pressure that they make."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol

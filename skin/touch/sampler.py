@@ -1,4 +1,4 @@
-"""Draws gestures of wanted labels and renders their movies, each frame once."""
+"""Draw gestures with wanted labels and render their movies."""
 
 from collections.abc import Mapping
 from functools import cached_property

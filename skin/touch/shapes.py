@@ -1,4 +1,4 @@
-"""Shapes pressed on a sheet: their outline, their contact area, and their frames on the sheet's cells."""
+"""Shapes pressed on a sheet: outline, contact area, frames on the cells."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy

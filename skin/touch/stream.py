@@ -1,4 +1,4 @@
-"""Streams: touches one after another with idle gaps between them, and the windows that are cut from them."""
+"""Streams: touches with idle gaps between them, and the windows cut from them."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What an emulated skin tells of a gesture before it plays it: a comment of the text protocol."""
+"""Announcements: comments of the text protocol in which an emulated skin tells the next gesture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

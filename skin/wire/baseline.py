@@ -1,4 +1,4 @@
-"""What an untouched skin reads, and whether it was untouched."""
+"""The baseline of an untouched skin, and a test that it was untouched."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What a device's values mean in N."""
+"""Conversion of a device's values to newtons."""
 
 from dataclasses import dataclass
 

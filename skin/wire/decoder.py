@@ -1,4 +1,4 @@
-"""From bytes to frames, without any input or output."""
+"""From bytes to frames, without input or output."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What does the device speak? Two binary frames or three lines of one field count tell."""
+"""Detect the protocol of a device: two binary frames or three lines of one field count decide."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -147,7 +147,7 @@ def detect(data: bytes, sensors: int | None, wanted: Format) -> Found:
 
 
 def refusal(data: bytes, found: Found, sensors: int | None) -> InputError:
-    """Return why nothing can be read, with what mends it."""
+    """Return why nothing can be read, and what to change."""
     if _still(run := _lines(data)):
         return clock_stands_still(len(run), run[0].fields[1])
     if found.sensors is not None and sensors is not None:

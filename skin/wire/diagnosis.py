@@ -1,4 +1,4 @@
-"""What one wants to know of a skin at first: does it send, how fast, how soundly, which channels live?"""
+"""A first look at a skin: does it send, how fast, with how many errors, which channels work?"""
 
 from collections import deque
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What may happen to a skin that was open."""
+"""Errors of an open skin."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Where frames come from, as the reader's thread asks for them: a wire or a recording."""
+"""Sources of frames for the reader thread: a byte stream or a recording."""
 
 import logging
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Which channels can be used: none that is stuck or dead; one at its limit feels at least that."""
+"""Which channels are usable: neither stuck nor dead; one at its limit is valid and saturated."""
 
 from typing import Literal
 

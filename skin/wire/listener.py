@@ -1,4 +1,4 @@
-"""Listens to the bytes of a skin for what an emulated one announces."""
+"""Listen to the bytes of a skin for announcements."""
 
 from collections import deque
 from collections.abc import Callable

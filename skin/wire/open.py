@@ -1,4 +1,4 @@
-"""The door: a serial port, a socket, a recording or the simulator, all behind one skin."""
+"""Open a skin: a serial port, a socket, a recording or the simulator."""
 
 from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Are most frames bad? Then the wire is set wrongly, and a person must be told."""
+"""Detect that most frames are bad, so that the baud rate or format must be wrong."""
 
 from skin.signal.frame import FrameError
 

@@ -1,4 +1,4 @@
-"""The one thread that reads, and the queue between it and whoever takes the frames."""
+"""The reader thread, and the queue from which frames are taken."""
 
 import logging
 from collections import deque

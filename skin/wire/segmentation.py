@@ -1,4 +1,4 @@
-"""Which frames are a gesture, and what its labels are: announced, prompted, or unknown."""
+"""Segment a stream into gestures, with labels announced, prompted or unknown."""
 
 import os
 import sys

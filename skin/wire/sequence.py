@@ -1,4 +1,4 @@
-"""Frames in order: what is missing, what started anew, and what the device's clock says."""
+"""Sequence numbers and device time: missing frames, restarts, segments."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""A skin that is open: ``with open_skin("/dev/ttyACM0", layout=sensors) as skin: ...``"""
+"""An open skin: ``with open_skin("/dev/ttyACM0", layout=sensors) as skin: ...``"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a device's values mean while it is read: its unit, and what the untouched skin reads."""
+"""The tare: the baseline of an untouched skin, taken and kept while it is read."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Serial ports and TCP sockets as streams of bytes."""
+"""Serial ports and TCP sockets as byte streams."""
 
 import errno
 import socket

@@ -1,1 +1,1 @@
-"""Pretrained embeddings of sensor graphs, and what they know of a touch."""
+"""Graph embeddings without training, and what they tell of a touch."""

@@ -1,4 +1,4 @@
-"""What embeddings tell of touches: what an SVM reads in them, and on what they spend their variance."""
+"""What an SVM reads in graph embeddings, and on what they spend their variance."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

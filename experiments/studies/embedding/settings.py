@@ -1,4 +1,4 @@
-"""What is asked of a probe of embeddings; here, because a mistake in it must not pay for torch."""
+"""Settings of the embeddings study; free of heavy imports."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

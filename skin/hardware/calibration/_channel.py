@@ -1,4 +1,4 @@
-"""One channel of a session: robust statistics of its idle frames and of its answer to presses."""
+"""One channel of a session: robust statistics of its idle frames and of its response to presses."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Tables of a bench: CSV or Parquet with a header, whatever wrote them."""
+"""Read tables of a bench: CSV or Parquet with a header."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""A session beside the simulated true readings of its presses: which frames are idle, loading, released."""
+"""A bench session beside the simulated true readings of its presses."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Bench:
     """What was said and what presses it, frame by frame.
 
     Attributes:
-        session: what the skin said.
+        session: the raw readings.
         gauge: what pressed it.
         each: true readings per N of every press, (P, S).
     """

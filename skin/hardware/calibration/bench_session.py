@@ -1,4 +1,4 @@
-"""A bench session: raw readings at the device's own rate, with the gauge's rows in it or beside it."""
+"""A bench session: raw readings at the device's own rate, and the force gauge's rows."""
 
 from dataclasses import dataclass
 from pathlib import Path

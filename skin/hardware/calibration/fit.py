@@ -1,4 +1,4 @@
-"""From a bench session to a calibration: the simulation's constants that make it say what the skin said."""
+"""Fit the constants of a simulated device to a bench session."""
 
 from collections.abc import Collection
 from dataclasses import dataclass

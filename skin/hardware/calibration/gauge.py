@@ -1,4 +1,4 @@
-"""What a force gauge tells: when what pressed where, and how hard."""
+"""Force-gauge data: when what pressed where, and how hard."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Whether a calibration helps: held-out presses, and the force behind a reading."""
+"""Test a calibration on held-out presses; estimate force from readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The press protocol of a bench, and what an emulated device says to it."""
+"""The press protocol of a bench, and an emulated device's response to it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

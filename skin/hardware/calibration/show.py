@@ -1,4 +1,4 @@
-"""What a calibration found, for a person."""
+"""Print what a calibration found."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What goes wrong with an emulated skin, on request."""
+"""Faults of an emulated skin, injected on request."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

@@ -1,4 +1,4 @@
-"""Gestures as the converter of an emulated skin says them, one after another, without end."""
+"""Endless gestures as the counts of an emulated skin's converter."""
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor

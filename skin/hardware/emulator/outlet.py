@@ -1,4 +1,4 @@
-"""Where an emulated skin can be plugged in: a pseudo-terminal or a TCP port."""
+"""Ports of an emulated skin: a pseudo-terminal or a TCP server."""
 
 import os
 import select

@@ -1,4 +1,4 @@
-"""What the views show: written by the one who classifies, read by the terminal and the page."""
+"""State shared by the classifying loop and the views."""
 
 from collections import deque
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""From frames to verdicts, without any input or output."""
+"""From frames to verdicts, without input or output."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Taps, held presses and slow ramps before an engine, in the time of the device: when is the alarm raised?"""
+"""Time to alarm of simulated taps, held presses and slow ramps, in device time."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

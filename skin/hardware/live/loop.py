@@ -1,4 +1,4 @@
-"""The loop between an open skin and the board: read, classify, say."""
+"""The live loop: read frames, classify, update the views."""
 
 from collections import deque
 from time import monotonic

@@ -1,4 +1,4 @@
-"""The skin as a picture: what lies between the sensors, guessed."""
+"""The skin as a picture: readings interpolated between the sensors."""
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay

@@ -1,4 +1,4 @@
-"""From a finished run to an engine that knows what it learned."""
+"""Make an engine from a finished run."""
 
 from dataclasses import dataclass, replace
 

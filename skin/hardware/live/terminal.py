@@ -1,4 +1,4 @@
-"""The skin in a terminal; where output is no terminal, a line for each change of the verdict."""
+"""The skin in a terminal; if output is no terminal, one line per change of the verdict."""
 
 import signal
 import sys

@@ -1,4 +1,4 @@
-"""What is said of a window, and for how long it must hold before it is said."""
+"""The verdict on a window, and how long it must persist before it is shown."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""The skin on a page of this machine: one file, and pictures as server-sent events."""
+"""The skin on a local web page; pictures are sent as server-sent events."""
 
 import asyncio
 import base64

@@ -123,7 +123,7 @@ def sealed(event: str, **what: Any) -> tuple[str, str]:
 
 
 def opened(line: str) -> tuple[dict[str, Any], str]:
-    """Return what :func:`sealed` was given and the checksum, empty in a session of old that has none.
+    """Return what :func:`sealed` was given and the checksum, empty in an older session that has none.
 
     Raises:
         ValueError: no JSON, or another checksum.

@@ -1,4 +1,4 @@
-"""A session on disk: raw frames as they come, and what happened between them.
+"""A session on disk: raw frames as they arrive, and the events between them.
 
 A CSV that experiments/calibrate.py reads too: ``time`` (s since the start), ``seq`` and a column of raw
 values per sensor. Lines that start with # are JSON: what values mean, where a gesture begins and ends, gaps,

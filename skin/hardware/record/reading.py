@@ -1,4 +1,4 @@
-"""Reads a session from disk, though some of its lines be damaged."""
+"""Read a session from disk, also when some of its lines are damaged."""
 
 import json
 import logging
@@ -91,7 +91,7 @@ class _Reading:
         self.stored, self.first = Stored(about), ""
         self._sensors = len(about["positions"])
         self._length = about["window"] / about["rate"] if {"window", "rate"} <= set(about) else inf
-        # Sessions of old called a channel at its limit invalid.
+        # Older sessions called a channel at its limit invalid.
         old = about.get("format") == 1 and about.get("bits")
         self._limit = 2 ** min(int(about["bits"]), 64) - 1 if old else None
         self._take: Take | None = None
@@ -209,7 +209,7 @@ class _Reading:
         if not isfinite(said["time"]) or not set((labels or {}).values()) <= {0, 1}:
             raise ValueError("no gesture")
         self._take, self._spoilt = Take(number, labels, float(said["time"]), 0), 0
-        # Sessions of old do not say which baseline is meant.
+        # Older sessions do not say which baseline is meant.
         meant = said.get("meaning")
         if self._meaning is None or (self._doubtful if meant is None else meant != self._meaning[0]):
             self._leave_out("the line that says what its values mean is damaged")

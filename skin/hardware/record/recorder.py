@@ -1,4 +1,4 @@
-"""Records a session gesture by gesture, and makes a recording of it."""
+"""Record a session gesture by gesture, and convert it to a recording."""
 
 import logging
 from collections.abc import Callable, Sequence

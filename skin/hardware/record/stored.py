@@ -1,4 +1,4 @@
-"""What a session on disk holds."""
+"""The content of a session on disk."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -50,7 +50,7 @@ check: $(READY)  ## lint, format and types
 bench: $(READY)  ## speed and memory, into results/bench.json
 	$(BIN)/python experiments/bench.py
 
-physics: $(READY)  ## hold every law of mechanics against its independent answer
+physics: $(READY)  ## check every law of mechanics against an independent solution
 	$(BIN)/python experiments/verify_physics.py
 
 $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt

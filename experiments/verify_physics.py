@@ -1,4 +1,4 @@
-"""Hold every law of mechanics against its independent answer: python experiments/verify_physics.py
+"""Check every law of mechanics against an independent solution: python experiments/verify_physics.py
 
 physics.quick=true takes seconds; physics.laws=[hertz,punch] checks some. Exit code 1 if a law does not hold.
 """

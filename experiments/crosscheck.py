@@ -12,8 +12,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 import train
-from chosen import configuration, refusing
 from skin.config import ROOT
+from studies.cli import configuration, refusing
 
 SAME = ("data=fem", "evaluation.devices=0", "evaluation.layouts=0", "tracking.experiment=mechanics")
 

@@ -6,9 +6,9 @@ becomes two runs, ensemble_vote and ensemble_average; with --rows their names te
 
 from omegaconf import DictConfig
 
-from chosen import configuration, jobs, names, parser, refusing
 from skin.config import CONF
 from skin.errors import InputError
+from studies.cli import configuration, jobs, names, parser, refusing
 
 ROWS = ("linked_graph", "temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
 WAYS = ("ensemble_vote", "ensemble_average")

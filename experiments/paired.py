@@ -11,8 +11,8 @@ from statistics import fmean
 
 from hydra import compose, initialize_config_dir
 
-from chosen import refusing
 from skin.config import CONF, checked, fingerprint
+from studies.cli import refusing
 from studies.study import FEWEST, paired
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from chosen import configuration, jobs, names, parser, refusing
+from peers import PEERS
 from skin.config import ROOT
 from skin.errors import InputError
+from studies.cli import configuration, jobs, names, parser, refusing
 
-PEERS = ("lightgbm", "minirocket", "multirocket_hydra", "ridge")
 SCRIPT = Path(__file__).parent / "peers" / "learn.py"
 PYTHON = ROOT / ".venv-peers" / "bin" / "python"
 

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 import train
-from chosen import refusing
 from skin.config import ROOT
+from studies.cli import refusing
 
 BUDGETS = {"full": "table", "smoke": "smoke"}
 _TITLE = "Accuracy on the test gestures in per cent (the report's in brackets)"
@@ -30,12 +30,12 @@ def main() -> None:
 
 def report(overrides: list[str], budget: str) -> int:
     """Write and print what finished runs say, with their budget; return how many are missing."""
-    from entries import Entries
     from skin.build import build_device
     from skin.files import write
     from skin.tracking import Store
     from studies.report_figures import draw_runs, draw_skin
     from studies.table import as_csv, collect, grid, markdown, report_values, rows, show
+    from studies.table_rows import Entries
 
     entries = Entries(overrides)
     store = Store.open(entries.rows[0].tracking)

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import train
-from chosen import refusing
 from skin.config import ROOT
+from studies.cli import refusing
 from studies.study import SMOKE, Study, Variant, choose, read
 
 

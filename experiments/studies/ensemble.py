@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from peers.exchange import digest
 from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.device.base import AbstractDevice
@@ -18,7 +17,7 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import choose, gestures
 from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
-from skin.recording import Touches
+from skin.recording import Touches, digest
 from skin.reload import restore
 from skin.run import conclude, describe, tags
 from skin.tracking import Store

@@ -7,10 +7,11 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from peers.exchange import Foreign, digest, export
+from peers.exchange import Foreign, export
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.evaluation.report import columns
+from skin.recording import digest
 from skin.storage import read
 
 SETTINGS = Evaluation(devices=2, layouts=1, gestures=24, false_alarm_rate=0.02, safe_gestures=16)

@@ -1,4 +1,4 @@
-"""The four fast rows as one would write them first: the peers of the benchmark and of a test.
+"""The four fast rows written the usual way with PyTorch Geometric, as reference for benchmarks and a test.
 
 Same networks, same numbers; but a PyTorch Geometric ``Data`` object per graph, and a dense image of three
 equal channels per frame, convolved frame by frame. Weights are interchangeable with

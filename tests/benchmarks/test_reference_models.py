@@ -18,7 +18,9 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def plain():
-    specification = importlib.util.spec_from_file_location("plain", ROOT / "experiments" / "plain.py")
+    specification = importlib.util.spec_from_file_location(
+        "plain", ROOT / "experiments/benchmarks/reference_models.py"
+    )
     module = importlib.util.module_from_spec(specification)
     with warnings.catch_warnings():
         # PyTorch Geometric compiles with torch.jit.script while it is imported

@@ -1,4 +1,4 @@
-"""What commands share that work on many runs at once: which simulators, seeds and overrides, and refusals."""
+"""Arguments that commands over many runs share: simulators, seeds, overrides; and their error messages."""
 
 import argparse
 import sys

@@ -1,21 +1,21 @@
-"""Which runs stand in the results table: the sweep's rows, and those that other commands make."""
+"""The runs in the results table: the rows of the sweep, and those that other commands make."""
 
 from contextlib import suppress
 
 from omegaconf import DictConfig, OmegaConf
 
 import ensemble
-import peers
-from chosen import configuration
+from peers import PEERS
 from skin.config import CONF
 from skin.errors import InputError
 from skin.sweep import jobs
 from skin.tracking import Store
+from studies.cli import configuration
 
 __all__ = ["Entries"]
 
 # They stand in the table as soon as a run of theirs has finished.
-OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in (*ensemble.WAYS, *peers.PEERS)))
+OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in (*ensemble.WAYS, *PEERS)))
 
 
 class Entries:

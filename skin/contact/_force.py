@@ -41,7 +41,7 @@ def seek(
     begin: torch.Tensor,
     peak: np.ndarray,
     wanted: np.ndarray,
-    ground: ContactProblem,
+    problem: ContactProblem,
 ) -> Found:
     """Find loads at which single frames are big or small, dangerous or safe, as wanted.
 
@@ -55,15 +55,15 @@ def seek(
         begin: (B, N), first pressures.
         peak: (B,), drawn highest cell pressure, Pa.
         wanted: (B, 2), bool: big, dangerous.
-        ground: what is touched; ranges and thresholds.
+        problem: what is touched; ranges and thresholds.
     """
-    search = _Search.of(begin, peak, wanted, ground)
+    search = _Search.of(begin, peak, wanted, problem)
     rows = np.arange(len(peak))
     for _ in range(_STEPS):
         here = torch.from_numpy(rows)
         equilibrium, lost = solve(rows, search.load[rows], search.pressure[here])
         search.pressure[here] = equilibrium.pressure.to(search.pressure)
-        highest, classes = _classes(equilibrium.pressure, ground)
+        highest, classes = _classes(equilibrium.pressure, problem)
         rows = search.move(rows, search.judge(rows, highest, classes != wanted[rows], lost), highest)
         if not len(rows):
             break
@@ -102,10 +102,10 @@ class _Search:
 
     @classmethod
     def of(
-        cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, ground: ContactProblem
+        cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, problem: ContactProblem
     ) -> "_Search":
         """Begin at the drawn peaks (B,), Pa, within their ranges; the rest is as :func:`seek` has it."""
-        settings, cell = ground.settings, ground.shapes.body.cell
+        settings, cell = problem.settings, problem.shapes.body.cell
         ends = np.where(wanted[:, 1:], settings.dangerous_peak, settings.safe_peak)
         least, most = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
         target = np.clip(peak, least, most)
@@ -155,12 +155,12 @@ class _Search:
         return rows
 
 
-def _classes(pressure: torch.Tensor, ground: ContactProblem) -> tuple[np.ndarray, np.ndarray]:
+def _classes(pressure: torch.Tensor, problem: ContactProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return the highest cell (b,), Pa, and the classes big and dangerous (b, 2) of frames."""
-    body, thresholds = ground.shapes.body, ground.settings.thresholds
+    body, thresholds = problem.shapes.body, problem.settings.thresholds
     frames = pressure.float().view(-1, *body.shape)
     index, once = torch.arange(len(frames))[:, None], torch.ones(len(frames), 1)
-    measures = measure(frames, index, once, ground.footprints, body.cell, thresholds.contact)
+    measures = measure(frames, index, once, problem.footprints, body.cell, thresholds.contact)
     labels = measures.labels(thresholds)[:, [0, 3]].bool()
     return frames.flatten(1).amax(1).double().numpy(), labels.numpy()
 

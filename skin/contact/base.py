@@ -21,5 +21,5 @@ class AbstractContact(ABC):
     advice: ClassVar[str] = ""
 
     @abstractmethod
-    def press(self, strokes: Trajectories, ground: ContactProblem) -> ContactResult:
+    def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the pressure of gestures, with the force that gives the wanted labels if there is one."""

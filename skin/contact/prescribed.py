@@ -29,14 +29,16 @@ class Prescribed(AbstractContact):
     def __init__(self, body: AbstractBody | None = None, simulator: AbstractSimulator | None = None) -> None:
         del body, simulator
 
-    def press(self, strokes: Trajectories, ground: ContactProblem) -> ContactResult:
+    def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return pictures at the force at which the gesture's highest cell has the wanted pressure."""
-        frames = ground.shapes.render(*strokes.poses)
+        frames = problem.shapes.render(*trajectories.poses)
         # Equation 2: the drawn peak is the largest cell of the whole movie.
-        highest = (frames.flatten(1).amax(1)[strokes.index] * strokes.profile).amax(1).double().numpy()
-        width, height = ground.shapes.body.cell
-        force = strokes.peak * (width * height) / highest
-        owner = torch.from_numpy(strokes.owner)
+        highest = (
+            (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
+        )
+        width, height = problem.shapes.body.cell
+        force = trajectories.peak * (width * height) / highest
+        owner = torch.from_numpy(trajectories.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
         none = np.zeros(len(force), bool)
-        return ContactResult(frames, force, strokes.peak, none, none)
+        return ContactResult(frames, force, trajectories.peak, none, none)

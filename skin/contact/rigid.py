@@ -72,62 +72,64 @@ class Rigid(AbstractContact):
         self.tolerance, self.iterations = tolerance, iterations
         self.compliance = with_grain(simulator.compliance().detach().cpu().double(), body).float()
 
-    def press(self, strokes: Trajectories, ground: ContactProblem) -> ContactResult:
+    def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the pressure at the force that gives the wanted classes, if there is one."""
-        body = ground.shapes.body
+        body = problem.shapes.body
         cell = body.cell[0] * body.cell[1]
-        gap = self.gap(strokes, ground)
-        full = np.zeros(len(strokes.peak))
-        np.maximum.at(full, strokes.owner, strokes.share)
-        telling = _telling(strokes, full, gap, ground.footprints)
-        found, lost = self._sought(strokes, gap, telling, ground)
+        gap = self.gap(trajectories, problem)
+        full = np.zeros(len(trajectories.peak))
+        np.maximum.at(full, trajectories.owner, trajectories.share)
+        telling = _telling(trajectories, full, gap, problem.footprints)
+        found, lost = self._sought(trajectories, gap, telling, problem)
         force = found.load / full
         refused = np.isnan(force)
 
-        solved = np.flatnonzero(~refused[strokes.owner])
-        rows, owner = torch.from_numpy(solved), torch.from_numpy(strokes.owner[solved])
-        totals = torch.from_numpy(force[strokes.owner[solved]] * strokes.share[solved] / cell)
+        solved = np.flatnonzero(~refused[trajectories.owner])
+        rows, owner = torch.from_numpy(solved), torch.from_numpy(trajectories.owner[solved])
+        totals = torch.from_numpy(force[trajectories.owner[solved]] * trajectories.share[solved] / cell)
         # A touch that stands still begins with what it was at its strongest.
-        stands = (strokes.place[solved] == strokes.place[telling][strokes.owner[solved]]).all(axis=1)
+        stands = (trajectories.place[solved] == trajectories.place[telling][trajectories.owner[solved]]).all(
+            axis=1
+        )
         start = found.pressure[owner] * torch.from_numpy(stands)[:, None]
         states = solve(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
-        missed = strokes.owner[solved][(~(states.residual <= self.tolerance)).numpy()]
+        missed = trajectories.owner[solved][(~(states.residual <= self.tolerance)).numpy()]
         lost += np.bincount(missed, minlength=len(force))
 
         frames = gap.isfinite().float()
-        shares = torch.from_numpy(strokes.share).float()[:, None]
+        shares = torch.from_numpy(trajectories.share).float()[:, None]
         frames[rows] = states.pressure
         highest = np.zeros(len(force))
-        np.maximum.at(highest, strokes.owner[solved], states.pressure.amax(1).double().numpy())
+        np.maximum.at(highest, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
         frames = (frames / shares).view(-1, *body.shape)
         # Other places of a path, or the mesh under a small object, may raise the peak beyond its range.
-        settings = ground.settings
-        dangerous = strokes.wanted[:, 3]
+        settings = problem.settings
+        dangerous = trajectories.wanted[:, 3]
         refused |= highest > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
         refused |= lost > 0
         return ContactResult(frames, force, highest, refused, found.area, lost)
 
-    def gap(self, strokes: Trajectories, ground: ContactProblem) -> Tensor:
+    def gap(self, trajectories: Trajectories, problem: ContactProblem) -> Tensor:
         """Return how far the object is above each cell when its highest point touches, (U, H * W), m.
 
         Infinite where there is no object. On an arm the object comes down along the normal at its middle, and
         the skin falls away to its sides.
         """
-        solids = ground.shapes.solids(*strokes.poses)
+        solids = problem.shapes.solids(*trajectories.poses)
         lower = self.relief * (1 - solids.grey)
         inward = (self.fillet - solids.rim).clamp(min=0, max=self.fillet)
         lower += self.fillet - (self.fillet**2 - inward**2).clamp(min=0).sqrt()
-        lower = (lower.flatten(1) + _sag(ground.shapes.body, solids.inside.flatten(1))).where(
+        lower = (lower.flatten(1) + _sag(problem.shapes.body, solids.inside.flatten(1))).where(
             solids.inside.flatten(1), torch.inf
         )
         return lower - lower.amin(1, keepdim=True)
 
     def _sought(
-        self, strokes: Trajectories, gap: Tensor, telling: np.ndarray, ground: ContactProblem
+        self, trajectories: Trajectories, gap: Tensor, telling: np.ndarray, problem: ContactProblem
     ) -> tuple[Found, np.ndarray]:
         """Return the loads of each gesture's telling frame, and how many of these were not found."""
         own = gap[torch.from_numpy(telling)]
-        cell = ground.shapes.body.cell[0] * ground.shapes.body.cell[1]
+        cell = problem.shapes.body.cell[0] * problem.shapes.body.cell[1]
 
         def solved(rows: np.ndarray, load: np.ndarray, start: Tensor) -> tuple[Equilibrium, np.ndarray]:
             total = torch.from_numpy(load / cell)
@@ -136,7 +138,9 @@ class Rigid(AbstractContact):
             )
             return state, (~(state.residual <= self.tolerance)).numpy()
 
-        found = seek(solved, own.isfinite().float(), strokes.peak, strokes.wanted[:, [0, 3]], ground)
+        found = seek(
+            solved, own.isfinite().float(), trajectories.peak, trajectories.wanted[:, [0, 3]], problem
+        )
         return found, found.failed.astype(np.int64)
 
 
@@ -156,9 +160,9 @@ def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
     return torch.from_numpy(below).float()
 
 
-def _telling(strokes: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
+def _telling(trajectories: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
     """Return the frame of each gesture that covers a sensor best, of those under its largest force, (B,)."""
     cover = (gap.isfinite().float() @ footprints.T).amax(1).double().numpy()
-    strongest = strokes.share >= full[strokes.owner] * (1 - 1e-9)
-    order = np.lexsort((-cover, ~strongest, strokes.owner))
-    return order[np.searchsorted(strokes.owner[order], np.arange(len(full)))]
+    strongest = trajectories.share >= full[trajectories.owner] * (1 - 1e-9)
+    order = np.lexsort((-cover, ~strongest, trajectories.owner))
+    return order[np.searchsorted(trajectories.owner[order], np.arange(len(full)))]

@@ -15,14 +15,14 @@ class Course(NamedTuple):
     """Trajectories and the way that they take.
 
     Attributes:
-        strokes: the frames (U,) of gestures (B,).
+        trajectories: the frames (U,) of gestures (B,).
         way: (U, 2), where each frame is within its room, m.
         first: (B,), the first frame of each gesture.
         net: (B, 2), from its first place to its last, m.
         travel: (B,), how far it gets from its first place, m.
     """
 
-    strokes: Trajectories
+    trajectories: Trajectories
     way: np.ndarray
     first: np.ndarray
     net: np.ndarray
@@ -59,7 +59,7 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
 
     share = np.zeros(len(owner))
     np.maximum.at(share, index, scale)
-    strokes = Trajectories(
+    trajectories = Trajectories(
         owner,
         gestures["shape"][owner],
         gestures["angle"][owner],
@@ -75,4 +75,4 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
     from_first = way - way[first[owner]]
     travel = np.zeros(len(first))
     np.maximum.at(travel, owner, np.hypot(*from_first.T))
-    return Course(strokes, way, first, from_first[first + counts - 1], travel)
+    return Course(trajectories, way, first, from_first[first + counts - 1], travel)

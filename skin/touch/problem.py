@@ -61,7 +61,7 @@ class Trajectories:
 
 
 class ContactResult(NamedTuple):
-    """The pressure of strokes.
+    """The pressure of trajectories.
 
     Attributes:
         frames: (U, H, W), Pa, float32, each divided by its share of full force: every one of a gesture sums
@@ -91,5 +91,5 @@ class Contact(Protocol):
     @property
     def advice(self) -> str: ...
 
-    def press(self, strokes: Trajectories, ground: ContactProblem) -> ContactResult:
+    def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the pressure of gestures, with the force that gives the wanted labels if there is one."""

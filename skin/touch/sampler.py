@@ -150,15 +150,17 @@ class TouchSampler:
         """Return the movie of gestures (B,), with the labels that it gives."""
         settings = self.settings
         taken = course(gestures, wanted, settings, self.contact.proportional)
-        pressed = self.contact.press(taken.strokes, ContactProblem(self.shapes, self.footprints, settings))
-        shown, shares = taken.strokes.index, taken.strokes.profile
+        pressed = self.contact.press(
+            taken.trajectories, ContactProblem(self.shapes, self.footprints, settings)
+        )
+        shown, shares = taken.trajectories.index, taken.trajectories.profile
         measures = measure(
             pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
         if not self.contact.proportional:
             # More of an object comes down as force grows, which moves the centre of pressure though it rests.
             measures = measures._replace(travel=torch.from_numpy(taken.travel))
-        begin = taken.strokes.place[taken.first]
+        begin = taken.trajectories.place[taken.first]
         values = pressed.peak, pressed.force, gestures["draws"], *taken.net.T, *begin.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
         known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}

@@ -48,7 +48,7 @@ def sampler(contact=None, **settings) -> TouchSampler:
     return TouchSampler(BODY, BODY.footprints(SENSORS), contact or Prescribed(), settings, True)
 
 
-def ground(**settings) -> ContactProblem:
+def problem(**settings) -> ContactProblem:
     given = GestureSettings.of(settings)
     shapes = Shapes(given.shapes, BODY, given.thresholds.contact)
     return ContactProblem(shapes, torch.from_numpy(BODY.footprints(SENSORS)).float(), given)
@@ -110,10 +110,10 @@ def test_the_peak_is_the_highest_cell_and_within_its_range(sampled):
 def test_every_frame_of_a_movie_is_at_rest(sampled):
     """The surface under pressure follows the object: gaps differ from the picture's by one number."""
     contact = sampled[0].contact
-    strokes = still(0.05, shares=(1.0, 0.5, 0.2))
-    gap = contact.gap(strokes, ground()).double()
+    trajectories = still(0.05, shares=(1.0, 0.5, 0.2))
+    gap = contact.gap(trajectories, problem()).double()
     surface = contact.compliance.double()
-    pressed = contact.press(strokes, ground())
+    pressed = contact.press(trajectories, problem())
     assert not pressed.refused.any()
     pressure = (pressed.frames * torch.tensor([1.0, 0.5, 0.2])[:, None, None]).flatten(1).double()
     height = pressure @ surface + gap
@@ -127,13 +127,13 @@ def test_every_frame_of_a_movie_is_at_rest(sampled):
 def test_a_flat_stamp_is_proportional_and_a_relief_is_not():
     shares = (1.0, 0.25)
     for contact, proportional in ((rigid(relief=0.0, fillet=0.0), True), (rigid(relief=0.01), False)):
-        frames = contact.press(still(0.03, shares=shares), ground(shapes=["fist"])).frames
+        frames = contact.press(still(0.03, shares=shares), problem(shapes=["fist"])).frames
         assert torch.allclose(frames[0], frames[1], rtol=1e-2, atol=50) == proportional
         assert (frames[1] > 0).sum() <= (frames[0] > 0).sum()
 
 
 def test_edges_of_a_flat_stamp_press_hardest_and_fillets_take_that_away():
-    place = ground(shapes=["disc"])
+    place = problem(shapes=["disc"])
     sharp, round_ = (
         rigid(relief=0.0, fillet=fillet).press(still(0.045), place).frames[0] for fillet in (0, 0.02)
     )
@@ -144,7 +144,7 @@ def test_edges_of_a_flat_stamp_press_hardest_and_fillets_take_that_away():
 
 def test_white_touches_first_and_the_outline_is_an_arc():
     contact = rigid(relief=0.01, fillet=0.0)
-    shapes = ground(shapes=["blurred_disc"])
+    shapes = problem(shapes=["blurred_disc"])
     gap = contact.gap(still(0.06), shapes)[0]
     grey = shapes.shapes.solids(
         *(getattr(still(0.06), name) for name in ("shape", "angle", "scale", "place"))
@@ -154,9 +154,9 @@ def test_white_touches_first_and_the_outline_is_an_arc():
     torch.testing.assert_close(gap[inside], expected - expected.min())
     assert gap[~inside].isinf().all()
 
-    square = ground(shapes=["square"])
-    strokes = still(0.06)
-    gap = rigid(relief=0.0, fillet=0.02).gap(strokes, square)[0].view(BODY.shape)
+    square = problem(shapes=["square"])
+    trajectories = still(0.06)
+    gap = rigid(relief=0.0, fillet=0.02).gap(trajectories, square)[0].view(BODY.shape)
     row = gap[10][gap[10].isfinite()]
     rim = np.minimum(np.arange(len(row)), np.arange(len(row))[::-1]) * BODY.cell[0]
     # The outline lies within a cell of the first one inside.
@@ -168,7 +168,7 @@ def test_white_touches_first_and_the_outline_is_an_arc():
 @pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (1, 0, 0, 1), (0, 0, 0, 1)])
 def test_the_force_is_raised_until_the_classes_hold(wanted):
     """At a low drawn peak a ball is small and safe; it is pressed until it is what it should be."""
-    where = ground(shapes=["blurred_disc"])
+    where = problem(shapes=["blurred_disc"])
     low = (where.settings.dangerous_peak if wanted[3] else where.settings.safe_peak)[0]
     pressed = rigid(relief=0.002).press(still(0.065 if wanted[0] else 0.03, peak=low, wanted=wanted), where)
     assert not pressed.refused.any()
@@ -190,7 +190,7 @@ def rounded(compliance: torch.Tensor, seed: int) -> torch.Tensor:
 @pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (1, 0, 0, 1), (0, 0, 0, 1)])
 def test_rounding_decides_nothing(wanted):
     """The same force, class by class, on every processor; the fewest digits move it by their own size."""
-    where = ground(shapes=["blurred_disc"])
+    where = problem(shapes=["blurred_disc"])
     low = (where.settings.dangerous_peak if wanted[3] else where.settings.safe_peak)[0]
     stroke = still(0.065 if wanted[0] else 0.03, peak=low, wanted=wanted)
     contact = rigid(relief=0.002)
@@ -209,7 +209,7 @@ def test_rounding_decides_nothing(wanted):
 @pytest.mark.parametrize("most", [82.7e3, 83.2e3, 83.4e3])
 def test_the_end_of_a_range_is_tried_itself(most):
     """The ball is big from 82.5 kPa on: wherever the search begins, it must not stop a little below that."""
-    where, contact = ground(shapes=["blurred_disc"]), rigid(relief=0.002)
+    where, contact = problem(shapes=["blurred_disc"]), rigid(relief=0.002)
     settings = GestureSettings(**dict(vars(where.settings), safe_peak=(10e3, 1.03 * most)))
     for peak in np.linspace(10e3, 80e3, 9):
         stroke = still(0.065, peak=peak, wanted=(1, 0, 0, 0))
@@ -217,7 +217,7 @@ def test_the_end_of_a_range_is_tried_itself(most):
 
 
 def test_what_no_force_can_make_big_is_hopeless():
-    where = ground(shapes=["fingertip"])
+    where = problem(shapes=["fingertip"])
     pressed = rigid(relief=0.05).press(still(0.06, wanted=(1, 0, 0, 0)), where)
     assert pressed.refused.all()
     assert pressed.hopeless.all()
@@ -264,10 +264,10 @@ def test_the_same_seed_gives_the_same_movies_on_any_number_of_threads(sampled):
 
 
 def test_prescribed_gestures_have_pictures_for_pressure():
-    where = ground(shapes=["hand"])
-    strokes = still(0.06, peak=40e3)
-    pressed = Prescribed().press(strokes, where)
-    poses = (getattr(strokes, name) for name in ("shape", "angle", "scale", "place"))
+    where = problem(shapes=["hand"])
+    trajectories = still(0.06, peak=40e3)
+    pressed = Prescribed().press(trajectories, where)
+    poses = (getattr(trajectories, name) for name in ("shape", "angle", "scale", "place"))
     picture = where.shapes.render(*poses)
     torch.testing.assert_close(pressed.frames / pressed.frames.sum(), picture / picture.sum())
     assert pressed.frames.max().item() == pytest.approx(40e3)
@@ -298,7 +298,7 @@ def test_the_skin_of_an_arm_falls_away_below_a_stamp():
     arm = Arm(radius=0.05, length=0.16, angle=3.2, cells=(20, 20), layers=BODY.layers)
     flat = Rigid(arm, HalfSpace(), relief=0.0, fillet=0.0)
     stamp = still(0.06)
-    given = ground(shapes=["square"])
+    given = problem(shapes=["square"])
     shapes = Shapes(("square",), arm, given.settings.thresholds.contact)
     gap = flat.gap(stamp, given._replace(shapes=shapes))[0].view(20, 20)
     assert (gap == gap[10:11])[gap.isfinite()].all()

@@ -17,14 +17,11 @@ _OWN = ("holds", "out", "run")
 
 @command("holds")
 def main(config: DictConfig) -> None:
-    """Bring a finished run back and play every course before it."""
+    """Play every course of held touches to a finished run; print and write when it raises the alarm."""
     settings = plain(config)["holds"]
     count, rate = settings["gestures"], settings["rate"]
     if not (isinstance(count, int) and count > 0 and isinstance(rate, int | float) and 0 < rate < inf):
-        raise InputError(
-            f"holds.gestures and holds.rate must be above 0, got {count} and {rate}: as in holds.gestures=40 "
-            "holds.rate=100"
-        )
+        raise InputError(f"holds.gestures={count} and holds.rate={rate} must be above 0: as in 40 and 100")
 
     import torch
     from rich.progress import track

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,12 +18,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
+from tempfile import mkdtemp
 from time import monotonic, sleep
+from typing import TextIO
 
 import pytest
 import torch
+from filelock import FileLock
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
@@ -45,11 +50,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in slow)
 
 
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory) -> Path:
+    """Return the folder that all processes of one run of the tests share."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 @pytest.fixture(scope="session", autouse=True)
-def own_cache(tmp_path_factory):
+def own_cache(shared):
     """Keep operators of tests apart from the user's; commands that tests start inherit the variable."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SKIN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("SKIN_CACHE", str(shared / "cache"))
         yield
 
 
@@ -111,11 +123,11 @@ def configured() -> Callable[..., DictConfig]:
 class Command:
     """A command in the background, with what tests need of ``subprocess.Popen``; its output goes to files."""
 
-    def __init__(self, ask: Callable[[dict], int | None], job: dict) -> None:
+    def __init__(self, begin: Callable[[dict], tuple[int, Callable[[], int | None]]], job: dict) -> None:
         self.args, self.returncode = job["command"], None
-        self._ask, self._out, self._err = ask, Path(job["out"]), Path(job["err"])
+        self._out, self._err = Path(job["out"]), Path(job["err"])
         self._read = {self._out: 0, self._err: 0}
-        self.pid = ask(job)
+        self.pid, self._ended = begin(job)
 
     def __enter__(self) -> "Command":
         return self
@@ -148,7 +160,7 @@ class Command:
     def poll(self) -> int | None:
         """Return the exit code, or None while the command runs."""
         if self.returncode is None:
-            self.returncode = self._ask({"ended": self.pid, "wait": False})
+            self.returncode = self._ended()
         return self.returncode
 
     def wait(self, timeout: float = PATIENCE) -> int:
@@ -161,6 +173,10 @@ class Command:
             sleep(0.01)
         return self.returncode
 
+    def completed(self) -> subprocess.CompletedProcess:
+        """Return what the command said and its exit code, once it has ended."""
+        return subprocess.CompletedProcess(self.args, self.wait(), self.out, self.err)
+
     def send_signal(self, number: int) -> None:
         if self.poll() is None:
             os.kill(self.pid, number)
@@ -170,28 +186,63 @@ class Command:
 
 
 @pytest.fixture(scope="session")
-def starter(own_cache) -> Iterator[subprocess.Popen]:
-    """Run the process that forks commands; see tests/starter.py."""
-    command = [sys.executable, str(Path(__file__).with_name("starter.py"))]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        yield process
-        process.kill()
+def starter(shared) -> Iterator[TextIO]:
+    """Connect to the process that forks commands for all who run tests, started once: tests/starter.py."""
+    named, process = shared / "starter", None
+    with FileLock(f"{named}.lock"):
+        if not named.exists() or not (connection := connected(named.read_text())):
+            folder = mkdtemp(prefix="skin-")  # a socket's path must be short
+            command = [sys.executable, str(Path(__file__).with_name("starter.py")), folder]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE)
+            process.stdout.readline()
+            named.write_text(folder)
+            connection = connected(folder)
+    yield connection
+    connection.close()
+    if process:
+        with process:
+            process.wait()
+        shutil.rmtree(folder)
+
+
+def connected(folder: str) -> TextIO | None:
+    """Return a connection to the starter of this folder, None if it has ended."""
+    with suppress(OSError), socket.socket(socket.AF_UNIX) as one:
+        one.connect(f"{folder}/jobs")
+        file = one.makefile("rw")
+        if file.readline():
+            return file
+        file.close()
+    return None
+
+
+def forked(starter: TextIO, job: dict) -> tuple[int, Callable[[], int | None]]:
+    """Begin a command as a fork of the starter; return its process's number and what gives its exit code."""
+
+    def ask(what: dict) -> int | None:
+        print(json.dumps(what), file=starter, flush=True)
+        return json.loads(starter.readline())
+
+    number = ask(job)
+    return number, lambda: ask({"ended": number})
+
+
+def started(job: dict) -> tuple[int, Callable[[], int | None]]:
+    """Begin a command anew, as :func:`forked` does."""
+    with open(job["in"]) as given, open(job["out"], "w") as out, open(job["err"], "w") as err:
+        command, files = [sys.executable, *job["command"]], {"stdin": given, "stdout": out, "stderr": err}
+        process = subprocess.Popen(command, cwd=job["folder"], env=job["environment"], **files)
+    return process.pid, process.poll
 
 
 @pytest.fixture(scope="session")
 def begin(request, tmp_path_factory) -> Callable[..., Command]:
     """Return a function that starts ``experiments/<script>``, or a script at a path, in a folder.
 
-    The command is a process of its own that shares its imports with others. ``stdin`` is the path of what it
-    reads, a terminal for example.
+    The command is a process of its own that shares its imports with others, where there are forks (not on
+    Windows) that libraries bear (not on macOS). ``stdin`` is the path of what it reads, such as a terminal.
     """
-    said, numbers = tmp_path_factory.mktemp("said"), count()
-
-    def ask(job: dict) -> int | None:
-        process = request.getfixturevalue("starter")
-        process.stdin.write(json.dumps(job) + "\n")
-        process.stdin.flush()
-        return json.loads(process.stdout.readline())
+    said, numbers, forks = tmp_path_factory.mktemp("said"), count(), sys.platform == "linux"
 
     def begin(folder, script, *arguments, stdin=os.devnull) -> Command:
         files = [said / f"{next(numbers)}" for _ in range(2)]
@@ -200,7 +251,7 @@ def begin(request, tmp_path_factory) -> Callable[..., Command]:
         job = {"command": [str(ROOT / "experiments" / script), *map(str, arguments)], "folder": str(folder)}
         job |= {"in": stdin, "out": str(files[0]), "err": str(files[1])}
         job |= {"environment": dict(os.environ), "seconds": PATIENCE}
-        return Command(ask, job)
+        return Command(partial(forked, request.getfixturevalue("starter")) if forks else started, job)
 
     return begin
 
@@ -218,9 +269,7 @@ def run(begin) -> Callable[..., subprocess.CompletedProcess]:
         if fresh:
             command = [sys.executable, ROOT / "experiments" / script, *arguments, *own]
             return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
-        command = begin(folder, script, *arguments, *own)
-        code = command.wait()
-        return subprocess.CompletedProcess(command.args, code, command.out, command.err)
+        return begin(folder, script, *arguments, *own).completed()
 
     return run
 

@@ -1,9 +1,9 @@
 """Runs commands, each in a fork of a process that has imported the heavy libraries once.
 
-A line of standard input is a job, and its process's number the answer; or it asks for the exit code of such a
-process. A job has a process of its own, with its own folder, environment, files and end, as one that a shell
-starts; only imports are shared, and the empty database that MLflow takes seconds to make. Where there is no
-fork (Windows), or none that libraries bear (macOS), it is started anew.
+Processes that run tests connect to a socket. A line is a job, and its process's number the answer; or it asks
+for the exit code of such a process. A job has a process of its own, with its own folder, environment, files
+and end, as one that a shell starts; only imports are shared, and the empty database that MLflow takes seconds
+to make. It ends when nobody is connected any more.
 """
 
 import atexit
@@ -13,12 +13,13 @@ import os
 import runpy
 import shutil
 import signal
-import subprocess
+import socket
 import sys
 import threading
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from select import select
+from typing import Any, TextIO
 
 __all__ = ["main"]
 
@@ -35,28 +36,47 @@ WARM = (
 
 
 def main() -> None:
-    """Run jobs until standard input ends; returns in every fork, too, which then runs its script."""
-    forks = hasattr(os, "fork") and sys.platform != "darwin"
-    started: dict[int, subprocess.Popen[bytes]] = {}
-    made = _warm() if forks else {}
-    if forks:
-        _share_database(Path(os.environ["SKIN_CACHE"]) / "empty.db")
-        assert threading.active_count() == 1, "a fork keeps one thread"
-        gc.freeze()  # else every fork would copy what it never changes
-    for line in sys.stdin:
-        job = json.loads(line)
-        if (number := job.get("ended")) in started:
-            answer = started[number].wait() if job["wait"] else started[number].poll()
-        elif number is not None:
-            ended, status = os.waitpid(number, 0 if job["wait"] else os.WNOHANG)
-            answer = os.waitstatus_to_exitcode(status) if ended else None
-        elif not forks:
-            process = _started(job)
-            started[answer := process.pid] = process
-        elif (answer := os.fork()) == 0:
-            _become(job, made)
-            return
-        print(json.dumps(answer), flush=True)
+    """Run jobs until nobody is connected; returns in every fork, too, which then runs its script."""
+    folder = Path(sys.argv[1])
+    made = _warm()
+    _share_database(folder / "empty.db")
+    assert threading.active_count() == 1, "a fork keeps one thread"
+    gc.freeze()  # else every fork would copy what it never changes
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(str(folder / "jobs"))
+    server.listen()
+    print("ready", flush=True)
+    clients: dict[socket.socket, TextIO] = {}
+    _accept(server, clients)
+    while clients:
+        for ready in select([server, *clients], [], [])[0]:
+            if ready is server:
+                _accept(server, clients)
+            elif not (line := clients[ready].readline()):
+                clients.pop(ready).close()
+                ready.close()
+            else:
+                job = json.loads(line)
+                if "ended" in job:
+                    answer = _ended(job["ended"])
+                elif (answer := os.fork()) == 0:
+                    server.close()
+                    _become(job, made)
+                    return
+                print(json.dumps(answer), file=clients[ready], flush=True)
+
+
+def _accept(server: socket.socket, clients: dict[socket.socket, TextIO]) -> None:
+    """Add the next connection, and greet it: who reads no greeting came too late."""
+    client = server.accept()[0]
+    clients[client] = client.makefile("rw")
+    print("ready", file=clients[client], flush=True)
+
+
+def _ended(number: int) -> int | None:
+    """Return the exit code of a process, None while it runs."""
+    ended, status = os.waitpid(number, os.WNOHANG)
+    return os.waitstatus_to_exitcode(status) if ended else None
 
 
 def _warm() -> dict[str, str]:
@@ -117,12 +137,6 @@ def _end(code: int) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
-
-
-def _started(job: dict[str, Any]) -> subprocess.Popen[bytes]:
-    with open(job["in"]) as given, open(job["out"], "w") as out, open(job["err"], "w") as err:
-        command, files = [sys.executable, *job["command"]], {"stdin": given, "stdout": out, "stderr": err}
-        return subprocess.Popen(command, cwd=job["folder"], env=job["environment"], **files)
 
 
 if __name__ == "__main__":

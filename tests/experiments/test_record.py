@@ -93,16 +93,12 @@ def refused(done, reason):
     assert re.search(reason, done.stderr.splitlines()[-1]), done.stderr
 
 
-def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, starter, tmp_path):
-    path, whole = tmp_path / "s.csv", resource.prlimit(starter.pid, resource.RLIMIT_FSIZE)
+def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_path):
+    path = tmp_path / "s.csv"
     with skin({}) as port:
-        resource.prlimit(starter.pid, resource.RLIMIT_FSIZE, (20_001, whole[1]))
-        try:
-            refused(
-                record(*FREE, port, "seconds=60"), r"^cannot write s\.csv: File too large; what it holds is"
-            )
-        finally:
-            resource.prlimit(starter.pid, resource.RLIMIT_FSIZE, whole)
+        with begin(tmp_path, "record.py", "out=s.csv", *FREE, port, "seconds=60") as full:
+            resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (20_001, resource.RLIM_INFINITY))
+            refused(full.completed(), r"^cannot write s\.csv: File too large; what it holds is")
         before = path.read_bytes()
         assert 19_800 < len(before) <= 20_001
         assert before.endswith(b"\n")

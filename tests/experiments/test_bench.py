@@ -12,7 +12,7 @@ GENERATION = ROOT / "experiments" / "benchmarks" / "generation.py"
 
 
 def test_generation_reports_rates_and_its_own_memory():
-    # 400 MB in this process must not count in the one that is measured
+    # 400 MB in this process must not count in the one that is measured.
     ballast = bytearray(400_000_000)
     command = [sys.executable, str(GENERATION), "naive", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
@@ -24,24 +24,21 @@ def test_generation_reports_rates_and_its_own_memory():
     assert len(ballast) == 400_000_000
 
 
-def test_bad_arguments_exit_with_2():
-    command = [sys.executable, str(ROOT / "experiments" / "bench.py"), "--repeats", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+def test_bad_arguments_exit_with_2(run, tmp_path):
+    done = run(tmp_path, "bench.py", "--repeats", "1", store=False)
     assert done.returncode == 2
     assert "repeats" in done.stderr
 
 
-def test_the_table_refuses_bad_arguments():
-    command = [sys.executable, str(ROOT / "experiments" / "reproduce_table.py"), "--seeds", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+def test_the_table_refuses_bad_arguments(run, tmp_path):
+    done = run(tmp_path, "reproduce_table.py", "--seeds", "0", store=False)
     assert done.returncode == 2
     assert "1 or more" in done.stderr
 
 
-def test_building_starts_cold_each_time(tmp_path, monkeypatch):
+def test_building_starts_cold_each_time(run, tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    command = [sys.executable, str(GENERATION.with_name("building.py")), "fem", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    done = run(tmp_path, "benchmarks/building.py", "fem", "1", store=False)
     figures = json.loads(done.stdout)
     # a warm operator is there in a hundredth of that
     assert figures["build_seconds"] > 0.02
@@ -60,9 +57,8 @@ def test_what_is_not_installed_is_left_out():
 
 
 @pytest.mark.slow
-def test_a_verdict_is_timed_by_the_wall_and_by_the_core():
-    command = [sys.executable, str(GENERATION.with_name("live.py")), "30"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+def test_a_verdict_is_timed_by_the_wall_and_by_the_core(run, tmp_path):
+    done = run(tmp_path, "benchmarks/live.py", "30", store=False)
     figures = json.loads(done.stdout)
     assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share"}
     assert 0 < figures["p50_ms"] <= figures["p99_ms"]

@@ -1,15 +1,9 @@
 """The paired difference is that of runs with the rows' present settings."""
 
-import runpy
-import subprocess
-import sys
-
 import pytest
 
-from skin.config import ROOT, checked, fingerprint
+from skin.config import checked, fingerprint
 from skin.tracking import Store
-
-PAIRED = ROOT / "experiments" / "paired.py"
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -32,15 +26,8 @@ def folder(tmp_path_factory, configured):
     return folder
 
 
-def test_the_difference_has_its_standard_error(folder):
-    command = [
-        sys.executable,
-        str(PAIRED),
-        "rules:fem",
-        "features:fem",
-        f"tracking.uri=sqlite:///{folder}/m.db",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=folder)
+def test_the_difference_has_its_standard_error(run, folder):
+    done = run(folder, "paired.py", "rules:fem", "features:fem")
     assert done.returncode == 0, done.stderr
     # differences 2, 3, 2: mean 7/3, deviation 1/sqrt 3, error 1/3
     assert done.stdout == "92.0 89.7 +2.3 ± 0.33 points over 3 seeds: differ\n"
@@ -56,10 +43,7 @@ def test_the_difference_has_its_standard_error(folder):
         (["rules:fem", "features:fem", "typo=1"], "typo"),
     ],
 )
-def test_bad_input_ends_with_code_2_and_says_what(folder, arguments, named, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(PAIRED.parent))  # as where a person starts it
-    monkeypatch.setattr(sys, "argv", ["paired.py", *arguments, f"tracking.uri=sqlite:///{folder}/m.db"])
-    with pytest.raises(SystemExit) as stop:
-        runpy.run_path(str(PAIRED), run_name="__main__")
-    assert stop.value.code == 2
-    assert named in capsys.readouterr().err
+def test_bad_input_ends_with_code_2_and_says_what(run, folder, arguments, named):
+    done = run(folder, "paired.py", *arguments)
+    assert done.returncode == 2
+    assert named in done.stderr

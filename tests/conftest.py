@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from copy import deepcopy
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -113,9 +114,13 @@ def played() -> Iterator[Callable[[Callable[[socket.socket, threading.Event], No
 def configured() -> Callable[..., DictConfig]:
     """Return a function from overrides to the composed configuration."""
 
+    made = {}
+
     def make(*overrides: str) -> DictConfig:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            return compose("train", overrides=list(overrides))
+        if overrides not in made:
+            with initialize_config_dir(str(CONF), version_base="1.3"):
+                made[overrides] = compose("train", overrides=list(overrides))
+        return deepcopy(made[overrides])
 
     return make
 

@@ -15,10 +15,8 @@ LEARNERS = {
     "features": ["experiment=features", "learner.rounds=30"],
     "network": ["experiment=gru", "trainer.max_epochs=16", "fusion.hidden=32", "data.batch_size=16"],
     "ensemble": [
-        "experiment=best",
-        "trainer.max_epochs=3",
-        "learner.copies.network=1",
-        "learner.members.features.rounds=20",
+        *("learner=ensemble", "representation=readings", "model=mlp", "fusion=early", "optimizer.lr=0.01"),
+        *("trainer.max_epochs=15", "learner.copies.network=1", "learner.members.features.rounds=20"),
     ],
 }
 RATE = 10.0  # Hz, of the device

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.setting import ROWS, machine, seconds, versions
-from skin.config import ROOT
+from skin.files import results
 
 HERE = Path(__file__).parent
 SIMULATORS = ("naive", "fem", "solid")
@@ -51,7 +51,7 @@ def main() -> None:
         say(f"training of {row}")
         figures["training"][row] = training.measure(row, repeats)
     text = json.dumps(figures, indent=2)
-    write(text + "\n", ROOT / "results" / "bench.json")
+    write(text + "\n", results(None) / "bench.json")
     print(text)
 
 

@@ -1,64 +1,9 @@
-"""Fit a simulated device to a real one: python experiments/calibrate.py session=bench.csv presses=gauge.csv
-
-Writes out=, which device.calibration= takes; ends with 1 where it does not simulate held-out presses better.
-calibrate.demo=true writes a session of an emulated device first: no hardware needed.
-"""
+"""Replaced by `skin calibrate`; the next release removes this file."""
 
 import sys
-from dataclasses import replace
-from pathlib import Path
 
-from skin.config import DictConfig, command, plain
-from skin.errors import InputError
-
-
-@command("calibrate")
-def main(config: DictConfig) -> None:
-    """Read a session and what pressed the skin; judge a calibration on held-out presses, write one of all."""
-    if config.session is None:
-        raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
-    files = [config.presses, None if config.calibrate.demo else config.session]
-    if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
-        raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
-
-    from rich.console import Console
-
-    from skin.build import build_device
-    from skin.device.simulated import Simulated
-    from skin.hardware.calibration import bench_session, gauge
-    from skin.hardware.calibration.bench import bench
-    from skin.hardware.calibration.fit import fit
-    from skin.hardware.calibration.outcome import judge
-    from skin.hardware.calibration.protocol import demo
-    from skin.hardware.calibration.show import about, show
-    from skin.signal.calibration import write
-
-    settings = plain(config)["calibrate"]
-    device = build_device(config)
-    if not isinstance(device, Simulated):
-        raise InputError("a calibration fits the simulation to a skin: leave out device=")
-    if settings["demo"]:
-        print(demo(device, settings, config.session))
-    shape = settings["indenter"], settings["radius"]
-    said = bench_session.read(config.session, *shape, settings["unit"])
-    rows = None if config.presses is None else gauge.read(config.presses, *shape, settings["delay"])
-    with Console(stderr=True).status("fitting"):
-        found = bench(device, said, rows)
-        outcome, calibration = judge(found, settings["held_out"]), fit(found)
-    show(calibration, outcome)
-    if not outcome.helps:
-        print(
-            f"It does not help, so {config.out} was not written: is the layout, the body or the clock wrong?"
-        )
-        sys.exit(1)
-    about_all = {
-        **calibration.about,
-        **about(outcome),
-        "session": config.session,
-        "presses_file": config.presses,
-    }
-    print(write(replace(calibration, about=about_all), config.out))
-
+from skin.cli import main
 
 if __name__ == "__main__":
-    main()
+    print("experiments/calibrate.py is now: skin calibrate", file=sys.stderr)
+    main(["calibrate", *sys.argv[1:]])

@@ -1,82 +1,9 @@
-"""A session, recorded and simulated: python experiments/compare.py session=session.csv
+"""Replaced by `skin compare`; the next release removes this file."""
 
-Gestures as experiments/record.py marks them, or the presses of a bench (presses=gauge.csv). Writes compare.md
-and .png into out=; run=latest compares its verdicts too. calibrate.py calibrate.demo=true makes a session.
-"""
+import sys
 
-from typing import TYPE_CHECKING
-
-from skin.config import DictConfig, command, plain
-from skin.errors import InputError
-from skin.files import results
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from skin.device.simulated import Simulated
-    from skin.plot.press_comparison import Verdicts
-    from skin.recording import Touches
-
-
-@command("compare")
-def main(config: DictConfig) -> None:
-    """Simulate what a session holds, compare readings and, given a run, verdicts; write one page."""
-    if config.session is None:
-        raise InputError("which session? add session=session.csv, of experiments/record.py or a bench")
-
-    from skin.build import build_device
-    from skin.console import quiet
-    from skin.device.simulated import Simulated
-    from skin.files import write
-    from skin.plot import gesture_comparison, gesture_page, press_comparison
-
-    quiet()
-    settings = plain(config)["compare"]
-    device = build_device(config)
-    if not isinstance(device, Simulated):
-        raise InputError("the other side is the session: leave out device=")
-    folder = results(config.out)
-    about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
-        f" with {device.calibration}." if device.calibration else ", not calibrated."
-    )
-    if config.presses is None and gesture_comparison.marked(config.session):
-        pairs = gesture_comparison.read(device, config.session, settings["seed"])
-        truth = [[bool(pair.labels[name]) for name in device.task.names] for pair in pairs.pairs]
-        text = gesture_page.page(
-            pairs, _verdicts(config, device, gesture_comparison.touches(pairs), truth), about
-        )
-        picture = gesture_page.figure(pairs, settings["shown"], folder / "compare.png")
-    else:
-        presses = press_comparison.read(device, config.session, config.presses, settings)
-        both = press_comparison.touches(presses, device.sensors.positions, device.rate, device.window)
-        text = press_comparison.page(presses, _verdicts(config, device, both), about)
-        picture = press_comparison.figure(presses, settings["shown"], folder / "compare.png")
-    print(text, write(text, folder / "compare.md"), picture, sep="\n")
-
-
-def _verdicts(
-    config: DictConfig, device: "Simulated", both: "Sequence[Touches]", truth: list[list[bool]] | None = None
-) -> "Verdicts | None":
-    """Return what a run says of both sides; None without a run."""
-    if config.run is None:
-        return None
-
-    import numpy as np
-
-    from skin.build import build_data, build_learner
-    from skin.device._blank import Blank
-    from skin.plot.press_comparison import Verdicts
-    from skin.reload import configuration, find, restore
-    from skin.tracking import Store
-
-    store = Store.open(config.tracking)
-    run = find(store, config.run)
-    trained = configuration(store, run, config.trust)
-    learner = build_learner(trained)
-    restore(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
-    simulated, recorded = ((learner.probabilities(side) > 0.5).numpy() for side in both)
-    return Verdicts(device.task.names, simulated, recorded, None if truth is None else np.array(truth))
-
+from skin.cli import main
 
 if __name__ == "__main__":
-    main()
+    print("experiments/compare.py is now: skin compare", file=sys.stderr)
+    main(["compare", *sys.argv[1:]])

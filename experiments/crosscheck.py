@@ -11,8 +11,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-import train
-from skin.config import ROOT
+from skin.commands import train
+from skin.files import results
 from studies.cli import configuration, refusing
 
 SAME = ("data=fem", "evaluation.devices=0", "evaluation.layouts=0", "tracking.experiment=mechanics")
@@ -22,9 +22,9 @@ SAME = ("data=fem", "evaluation.devices=0", "evaluation.layouts=0", "tracking.ex
 def main() -> None:
     """Train, try every run on every simulator, print and write the matrices; 1 if a run failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("what", nargs="*", help="rows of the table, and overrides of train.py")
+    parser.add_argument("what", nargs="*", help="rows of the table, and overrides of `skin train`")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each: seeds 0, 1, ...")
-    parser.add_argument("--out", type=Path, default=ROOT / "results", help="folder of crosscheck.md and .csv")
+    parser.add_argument("--out", type=Path, default=results(None), help="folder of crosscheck.md and .csv")
     arguments = parser.parse_intermixed_args()
     overrides = [*SAME, *(word for word in arguments.what if "=" in word)]
     rows = [word for word in arguments.what if "=" not in word] or ["features"]
@@ -49,9 +49,8 @@ def run(rows: list[str], seeds: range, overrides: list[str], folder: Path) -> in
         lacking = [str(seed) for seed in seeds if found(store, planned[row, name, seed]) is None]
         if lacking:
             words = [f"experiment={row}", *MECHANICS[name], *overrides, f"seed={','.join(lacking)}"]
-            sys.argv = [str(Path(train.__file__)), "-m", *words]
             with suppress(SystemExit):
-                train.main()
+                train.main(["-m", *words])
     touches = tests({name: composed(rows[0], name) for name in MECHANICS})
     trials, missing = [], 0
     for (_, name, _), config in planned.items():

@@ -2,11 +2,12 @@
 
 Each run keeps the mask it was trained with. To compare masks, train pairs on devices that have dead sensors,
 more and fewer of them, or a mask that never varies is learnt as if it were always so:
-python experiments/train.py -m experiment=temporal_graph row=dead representation.mask=true,false
+skin train -m experiment=temporal_graph row=dead representation.mask=true,false
     device.dead=[0,5] device.randomise=true seed=0,1,2
 """
 
-from skin.config import DictConfig, command, plain
+from skin.command import command
+from skin.config import DictConfig, plain
 from skin.files import results
 from studies.settings import DeadSettings
 

@@ -4,7 +4,8 @@ Trains each row on three skins of simulator=solid: upright sensors without frict
 with it. Overrides of the training follow: trainer.max_epochs=30 direction.rows=[gru] layout.path=mine.csv
 """
 
-from skin.config import DictConfig, command, overrides, plain
+from skin.command import command
+from skin.config import DictConfig, overrides, plain
 from skin.files import results
 from studies.settings import DirectionSettings
 

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from skin.config import DictConfig, command, overrides, plain
+from skin.command import command
+from skin.config import DictConfig, overrides, plain
 from skin.errors import InputError
 from skin.files import results
 from studies.embedding.settings import Probing

@@ -1,57 +1,9 @@
-"""Be a skin without hardware: python experiments/emulate.py port=pty link=./skin-port
+"""Replaced by `skin emulate`; the next release removes this file."""
 
-Prints what device.port takes, then plays simulated gestures into it until Ctrl-C; see conf/emulate.yaml.
-"""
+import sys
 
-import signal
-from contextlib import suppress
-from types import FrameType
-
-from skin.config import DictConfig, command, plain
-from skin.errors import InputError
-
-_FORMATS = ("text", "binary")
-
-
-@command("emulate")
-def main(config: DictConfig) -> None:
-    """Play gestures of the configured simulator, device and layout in real time."""
-    if config.format not in _FORMATS:
-        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
-
-    from skin.build import build_device
-    from skin.device.simulated import Simulated
-    from skin.hardware.emulator.emulator import Emulator, Settings
-    from skin.hardware.emulator.faults import Faults
-    from skin.hardware.emulator.outlet import outlet
-
-    groups = plain(config)
-    settings, faults = Settings.of(groups["emulate"]), Faults.of(groups["faults"])
-    device = build_device(config)
-    if not isinstance(device, Simulated):
-        raise InputError("only simulated gestures can be emulated: leave out device=")
-    signal.signal(signal.SIGTERM, _leave)
-    port = outlet(config.port, config.link)
-    try:
-        emulator = Emulator(device, port, settings, faults, config.format == "binary", _tell)
-        # From the first line on, because whoever reads it may stop this at once.
-        with suppress(KeyboardInterrupt):
-            print(port.address, flush=True)
-            scale = f" device.scale={emulator.converter.scale:g}" if settings.bits else ""
-            print(f"device=serial device.port={port.address}{scale}", flush=True)
-            emulator.run(config.seconds, config.gestures)
-        print(f"{emulator.frames} frames")
-    finally:
-        port.unplug()
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
-def _tell(t: float, text: str) -> None:
-    print(f"{t:8.2f} s  {text}", flush=True)
-
+from skin.cli import main
 
 if __name__ == "__main__":
-    main()
+    print("experiments/emulate.py is now: skin emulate", file=sys.stderr)
+    main(["emulate", *sys.argv[1:]])

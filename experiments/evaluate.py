@@ -1,58 +1,8 @@
-"""Try a trained run on other touches: python experiments/evaluate.py run=latest device.seed=7
+"""Short for `skin evaluate`."""
 
-On a skin, gesture by gesture: run=latest device=serial device.port=/dev/ttyACM0; see conf/device/serial.yaml.
-Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its own with that id.
-"""
+import sys
 
-from skin.config import DictConfig, command, overrides
-from skin.files import results
-
-
-@command("evaluate")
-def main(config: DictConfig) -> None:
-    """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
-    from skin.build import build_data, build_device, build_learner
-    from skin.console import quiet
-    from skin.device.serial import Serial
-    from skin.evaluation.report import evaluate
-    from skin.evaluation.show import report
-    from skin.plot.evaluation_page import publish, verdicts
-    from skin.reload import changed, configuration, find, operating_point, restore
-    from skin.run import conclude
-    from skin.tracking import Store
-
-    quiet()
-    store, folder = Store.open(config.tracking), results(config.out)
-    run = find(store, config.run)
-    given = overrides()
-    stored = configuration(store, run, config.trust)
-    config = changed(stored, config, given)
-    device, learner = build_device(config), build_learner(config)
-    shapes = device.blank() if isinstance(device, Serial) else device
-    restore(store, run, learner, build_data(config, shapes))
-    point = operating_point(run, learner, stored, config.evaluation)
-    if isinstance(device, Serial):
-        device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
-    title = f"{run.info.run_name} ({run.info.run_id})"
-    tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
-    with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
-        # Every evaluation keeps its files.
-        name = f"evaluation_{config.device['_target_'].split('.')[-2]}_{evaluation.info.run_id[:8]}"
-        if isinstance(device, Serial) and device.touches("test").labels is None:
-            chances = learner.probabilities(device.touches("test"))
-            said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
-            store.client.log_artifact(evaluation.info.run_id, str(path))
-            print(f"{title}\n{said}\n{path}")
-            return
-        found = evaluate(learner, device, config.evaluation, point)
-        conclude(store, evaluation, found, device.task, {})
-        about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
-        written = publish(folder / f"{name}.md", found, device.task, run.info.run_name, about)
-        for path in written:
-            store.client.log_artifact(evaluation.info.run_id, str(path))
-    report(found, title)
-    print(*written, sep="\n")
-
+from skin.cli import main
 
 if __name__ == "__main__":
-    main()
+    main(["evaluate", *sys.argv[1:]])

@@ -8,7 +8,8 @@ import csv
 from functools import partial
 from math import inf
 
-from skin.config import DictConfig, command, overrides, plain
+from skin.command import command
+from skin.config import DictConfig, overrides, plain
 from skin.errors import InputError
 from skin.files import results
 
@@ -34,6 +35,7 @@ def main(config: DictConfig) -> None:
     from skin.hardware.live.verdict import Patience
     from skin.reload import changed, configuration, find
     from skin.tracking import Store
+    from skin.trained import trained
 
     quiet()
     torch.set_num_threads(config.tracking.threads or 1)
@@ -42,7 +44,7 @@ def main(config: DictConfig) -> None:
     given = [one for one in overrides() if one.lstrip("+~").split("=")[0].split(".")[0] not in _OWN]
     stored = configuration(store, run, config.trust)
     own = changed(stored, config, given)
-    of = start.trained(store, run, own, stored)
+    of = trained(store, run, own, stored)
     if not isinstance(of.device, Simulated):
         raise InputError("held touches are simulated: give a run of simulated touches")
     engine = start.engine(of, Patience(), settings["touch"], settings["drift"])

@@ -5,7 +5,8 @@ highest reading. Writes margins_<row>_<id>.md, .csv and .png into out=, and the 
 run that has this id.
 """
 
-from skin.config import DictConfig, command, overrides
+from skin.command import command
+from skin.config import DictConfig, overrides
 from skin.errors import InputError
 from skin.files import results
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import command, plain
+from skin.command import command
+from skin.config import plain
 from skin.errors import InputError
 from skin.files import results
 from studies.settings import MovingSettings

@@ -22,7 +22,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("one")
     parser.add_argument("other")
-    parser.add_argument("overrides", nargs="*", help="settings of both, as of train.py")
+    parser.add_argument("overrides", nargs="*", help="settings of both, as of skin train")
     arguments = parser.parse_intermixed_args()
     one, other = (_overall(name, arguments.overrides) for name in (arguments.one, arguments.other))
     found = paired(one, other)

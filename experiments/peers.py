@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from peers import PEERS
 from skin.config import ROOT
 from skin.errors import InputError
+from skin.files import results
 from studies.cli import configuration, jobs, names, parser, refusing
 
 SCRIPT = Path(__file__).parent / "peers" / "learn.py"
@@ -28,7 +29,7 @@ def main() -> None:
     """Train the peers that are missing and log what their answers are worth; exit code 1 if one failed."""
     arguments = parser(__doc__)
     arguments.add_argument("--peers", type=names, default=PEERS[:3], metavar=",".join(PEERS))
-    arguments.add_argument("--folder", type=Path, default=ROOT / "results" / "peers", help="for the files")
+    arguments.add_argument("--folder", type=Path, default=results(None) / "peers", help="for the files")
     arguments.add_argument("--python", type=Path, default=PYTHON, help="of their environment")
     chosen = arguments.parse_intermixed_args()
     if unknown := [peer for peer in chosen.peers if peer not in PEERS]:

@@ -1,44 +1,8 @@
-"""Record a skin: python experiments/record.py out=session.csv device.port=/dev/ttyACM0 device.scale=0.039
-
-It asks for each gesture; Ctrl-C ends it, the same command goes on. Writes session.parquet for
-device=recording; record.finish=true does only that.
-"""
+"""Short for `skin record`."""
 
 import sys
-from contextlib import suppress
-from pathlib import Path
 
-from skin.config import DictConfig, command
-from skin.errors import InputError
-
-
-@command("record")
-def main(config: DictConfig) -> None:
-    """Write raw frames to a session, then its gestures to a recording."""
-    if config.out is None or not config.out.endswith(".csv"):
-        raise InputError(f"a session is a .csv file, got {config.out}: add out=session.csv")
-    settings = dict(config.record)
-    if unknown := sorted(set(settings) - {"free", "finish"}):
-        raise InputError(f"record has no {unknown[0]}: it takes free, finish")
-
-    from skin.build import build_device
-    from skin.device.serial import Serial
-    from skin.hardware.record.recorder import finish, record
-
-    device = build_device(config)
-    if not isinstance(device, Serial):
-        raise InputError("only a skin at a port is recorded: leave out device=")
-    path = Path(config.out).expanduser()
-    if not settings["finish"]:
-        with suppress(KeyboardInterrupt):
-            record(device, path, config.seconds, settings["free"], _tell)
-    written, count = finish(device, path)
-    print(f"{written}: {count} gestures")
-
-
-def _tell(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
+from skin.cli import main
 
 if __name__ == "__main__":
-    main()
+    main(["record", *sys.argv[1:]])

@@ -2,9 +2,8 @@
 
 import argparse
 import sys
-from pathlib import Path
 
-import train
+from skin.commands import train
 from skin.config import ROOT
 from studies.cli import refusing
 
@@ -31,7 +30,7 @@ def main() -> None:
 def report(overrides: list[str], budget: str) -> int:
     """Write and print what finished runs say, with their budget; return how many are missing."""
     from skin.build import build_device
-    from skin.files import write
+    from skin.files import results, write
     from skin.tracking import Store
     from studies.report_figures import draw_runs, draw_skin
     from studies.table import as_csv, collect, grid, markdown, report_values, rows, show
@@ -44,7 +43,7 @@ def report(overrides: list[str], budget: str) -> int:
     cells += [cell for cell in collect(store, entries.named(entries.others)) if cell.runs]
     simulators = list(dict.fromkeys(config.data.name for config in entries.rows))
     cells.sort(key=lambda cell: simulators.index(cell.simulator))
-    folder = ROOT / "results" / ("" if budget == "full" else budget)
+    folder = results(None) / ("" if budget == "full" else budget)
     lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"), budget)
     write(as_csv(lines), folder / "table.csv")
     title = TITLES[budget]
@@ -58,10 +57,9 @@ def report(overrides: list[str], budget: str) -> int:
 
 
 def _sweep(arguments: list[str]) -> int:
-    """Run ``train.py`` with arguments, in this process, and return its exit code."""
-    sys.argv = [str(Path(train.__file__)), *arguments]
+    """Run ``skin train`` with arguments, in this process, and return its exit code."""
     try:
-        train.main()
+        train.main(arguments)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1
     return 0

@@ -1,10 +1,11 @@
 """Try finished runs on windows that slide over streams of touches: python experiments/stream.py run=latest
 
 rows=all takes the newest finished runs of every row on simulator=, on whole touches and on windows of streams
-(train.py data.stream=true) each. Earlier results are read from MLflow.
+(skin train data.stream=true) each. Earlier results are read from MLflow.
 """
 
-from skin.config import DictConfig, command, overrides, plain
+from skin.command import command
+from skin.config import DictConfig, overrides, plain
 from skin.evaluation.course import Course
 from skin.files import results
 

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import train
-from skin.config import ROOT
+from skin.commands import train
+from skin.files import results
 from studies.cli import refusing
 from studies.study import SMOKE, Study, Variant, choose, read
 
@@ -28,7 +28,7 @@ def main() -> None:
     overrides += [word for word in arguments.what if "=" in word]
     chosen = choose(studies, [word for word in arguments.what if "=" not in word])
     planned = [(study, study.variants(overrides)) for study in chosen]
-    folder = arguments.out or ROOT / "results" / ("smoke" if arguments.smoke else "")
+    folder = arguments.out or results(None) / ("smoke" if arguments.smoke else "")
     missing = [run(study, variants, overrides, folder) for study, variants in planned]
     sys.exit(1 if any(missing) else 0)
 
@@ -43,9 +43,8 @@ def run(study: Study, variants: Sequence[Variant], overrides: list[str], folder:
     if any(finding.missing for finding in collect(store, variants)):
         for sweep in study.sweeps:
             # In this process, as it is the longest way into torch and mlflow; what fails is missing below.
-            sys.argv = [str(Path(train.__file__)), "-m", f"sweep={sweep}", *overrides]
             try:
-                train.main()
+                train.main(["-m", f"sweep={sweep}", *overrides])
             except SystemExit as stop:
                 if isinstance(stop.code, int) and stop.code > 128:  # a signal: train nothing more
                     raise

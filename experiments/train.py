@@ -1,15 +1,8 @@
-"""Train one configuration, or a sweep of them with -m; every run is logged to MLflow."""
+"""Short for `skin train`."""
 
-from skin.config import DictConfig, command
+import sys
 
-
-@command()
-def main(config: DictConfig) -> bool:
-    """Train and evaluate one configuration; False if that was done before."""
-    from skin.run import train
-
-    return train(config)
-
+from skin.cli import main
 
 if __name__ == "__main__":
-    main()
+    main(["train", *sys.argv[1:]])

@@ -6,7 +6,9 @@ physics.quick=true takes seconds; physics.laws=[hertz,punch] checks some. Exit c
 import sys
 from pathlib import Path
 
-from skin.config import ROOT, DictConfig, command, plain
+from skin.command import command
+from skin.config import ROOT, DictConfig, plain
+from skin.files import results
 
 
 @command("physics")
@@ -20,11 +22,11 @@ def main(config: DictConfig) -> None:
 
     settings = plain(config)["physics"]
     laws = chosen(settings["laws"])
-    results = []
+    outcomes = []
     shown = sys.stderr.isatty()
     for law in track(laws, "checking laws", console=Console(stderr=True), disable=not shown):
         outcome = law.check(settings["quick"])
-        results.append((law, outcome))
+        outcomes.append((law, outcome))
         failed = [finding for finding in outcome.findings if not finding.ok]
         print(f"{law.name}: {'FAILS' if failed else 'holds'}, {len(outcome.findings)} numbers", flush=True)
         for one in failed:
@@ -32,17 +34,17 @@ def main(config: DictConfig) -> None:
             print(f"  error {one.error:.2g}, tolerance {one.tolerance:g}", flush=True)
     if config.out is not None or settings["laws"] == "all":
         page, data = _places(config.out, settings["quick"])
-        publish(page, data, results)
+        publish(page, data, outcomes)
         print(f"{page / 'physics.md'}, {data}")
-    if any(not finding.ok for _, outcome in results for finding in outcome.findings):
+    if any(not finding.ok for _, outcome in outcomes for finding in outcome.findings):
         sys.exit(1)
 
 
 def _places(out: str | None, quick: bool) -> tuple[Path, Path]:
     """Return the folder of the page and the path of the findings."""
     if out is None and not quick:
-        return ROOT / "docs", ROOT / "results" / "physics.json"
-    folder = Path(out).expanduser() if out else ROOT / "results" / "quick"
+        return ROOT / "docs", results(None) / "physics.json"
+    folder = Path(out).expanduser() if out else results(None) / "quick"
     return folder, folder / "physics.json"
 
 

@@ -1,26 +1,20 @@
-"""The configuration: its schema, its fingerprint, and the entry point of every command.
+"""The configuration: its schema and its fingerprint.
 
 Only Hydra is imported here: ``--help`` and a mistyped key must not import torch.
 """
 
 from skin import interrupt  # isort: skip
-import sys
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import wraps
-from pathlib import Path
 from typing import Any, cast
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.errors import InputError
 from skin.identity import digest
-from skin.refusal import Refused, refusal, sentence
+from skin.paths import CONF, ROOT
+from skin.refusal import sentence
 
 __all__ = [
     "CONF",
@@ -28,15 +22,11 @@ __all__ = [
     "Config",
     "DictConfig",
     "checked",
-    "command",
     "fingerprint",
     "interrupt",
     "overrides",
     "plain",
 ]
-
-ROOT = Path(__file__).parents[1]
-CONF = ROOT / "conf"
 
 # They steer a run and change none of its results.
 _STEERING = ("tracking", "trust")
@@ -83,24 +73,24 @@ class Tracking:
 class Config:
     """What may stand at the top of a configuration; groups without a type here belong to their class."""
 
-    row: str
-    seed: int
-    epochs: dict[str, int]
-    touch: dict[str, Any]
-    body: dict[str, Any]
-    layout: dict[str, Any]
-    simulator: dict[str, Any]
-    device: dict[str, Any]
-    representation: dict[str, Any]
-    model: dict[str, Any]
-    fusion: dict[str, Any]
-    learner: dict[str, Any]
-    data: Data
-    optimizer: dict[str, Any]
-    trainer: dict[str, Any]
-    evaluation: Evaluation
-    tracking: Tracking
-    contact: dict[str, Any] | None = None  # older runs have none
+    row: str | None = None
+    seed: int | None = None
+    epochs: dict[str, int] | None = None
+    touch: dict[str, Any] | None = None
+    body: dict[str, Any] | None = None
+    layout: dict[str, Any] | None = None
+    simulator: dict[str, Any] | None = None
+    device: dict[str, Any] | None = None
+    representation: dict[str, Any] | None = None
+    model: dict[str, Any] | None = None
+    fusion: dict[str, Any] | None = None
+    learner: dict[str, Any] | None = None
+    data: Data | None = None
+    optimizer: dict[str, Any] | None = None
+    trainer: dict[str, Any] | None = None
+    evaluation: Evaluation | None = None
+    tracking: Tracking | None = None
+    contact: dict[str, Any] | None = None
     # What a command other than training adds.
     run: str | None = None
     trust: bool = False
@@ -172,48 +162,3 @@ def fingerprint(config: DictConfig) -> str:
 def overrides() -> list[str]:
     """Return what the command line of a running command asks for."""
     return list(HydraConfig.get().overrides.task)
-
-
-def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
-    """Make a command of a function that takes a checked configuration.
-
-    Bad input ends it with one sentence and exit code 2. In a multirun the job fails and the others run on.
-
-    Args:
-        name: the primary configuration, a file in ``conf/``.
-    """
-
-    def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
-        started = []
-
-        @wraps(task)
-        def job(config: DictConfig) -> Any:
-            started.append(True)
-            try:
-                return task(checked(config))
-            except Exception as error:
-                refused = refusal(error)
-                if refused is None:
-                    raise
-                if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    raise Refused(str(refused)) from error
-                print(refused, file=sys.stderr)
-                sys.exit(2)
-
-        composed = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(job)
-
-        def main() -> None:
-            # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
-            sys.argv[1:] = [value.replace("=~/", f"={Path.home()}/", 1) for value in sys.argv[1:]]
-            warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
-            try:
-                composed()
-            except SystemExit as stop:
-                # Hydra ends with 1 where the configuration could not be composed.
-                if stop.code == 1 and not started:
-                    sys.exit(2)
-                raise
-
-        return main
-
-    return decorate

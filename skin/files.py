@@ -7,15 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
-from skin.config import ROOT
 from skin.errors import InputError
 
 __all__ = ["results", "unwritable", "whole", "write"]
 
 
 def results(out: str | None) -> Path:
-    """Return the folder that ``out=`` names, relative to the current one; None: the repository's results."""
-    return ROOT / "results" if out is None else Path(out).expanduser()
+    """Return the folder that ``out=`` names, relative to the current one; None: ``results``."""
+    return Path("results" if out is None else out).expanduser()
 
 
 @contextmanager

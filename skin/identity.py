@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from skin import __version__
+from skin.paths import candidates
 
 __all__ = ["digest"]
 
-_ROOT = Path(__file__).parents[1]
 # Group -> settings that were added later. With these values nothing changes, so older runs keep their hash.
 _LATER: dict[str, dict[str, Any]] = {
     "touch": {"stretch": 4.0, "leak": 0.6, "strict": False},
@@ -48,9 +48,8 @@ def _file(name: str) -> Path | None:
     """Return the file that a setting names, as the package finds it, if there is one."""
     if "/" not in name and "." not in name:
         return None
-    path = Path(name).expanduser()
     try:
-        return next((found for found in (path, _ROOT / path) if found.is_file()), None)
+        return next((found for found in candidates(name) if found.is_file()), None)
     except OSError:
         return None
 

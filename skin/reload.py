@@ -64,7 +64,7 @@ def find(store: Store, name: str) -> Run:
     named = [run for run in runs if run.info.run_id.startswith(name)]
     found = runs[:1] if name == "latest" else named
     if not found:
-        raise InputError(f"no finished training run {name} in {store.uri}: experiments/train.py makes one")
+        raise InputError(f"no finished training run {name} in {store.uri}: skin train makes one")
     if len(found) > 1:
         raise InputError(f"{len(found)} runs have an id that begins with {name}: give more of it")
     return found[0]

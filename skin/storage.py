@@ -69,7 +69,7 @@ def read(path: str | Path) -> Recording:
     path = Path(path).expanduser()
     _check_suffix(path)
     if not path.is_file():
-        raise InputError(f"no recording {path}: experiments/generate.py n=1000 out={path} makes one")
+        raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
     try:
         about = _read_about(path)
         if isinstance(about, dict) and about.get("format") != FORMAT:

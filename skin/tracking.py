@@ -31,6 +31,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from skin.config import ROOT, Tracking
 from skin.errors import InputError
 from skin.files import whole
+from skin.paths import BUNDLED
 
 __all__ = ["Store", "commit", "ends_on_signal"]
 
@@ -59,8 +60,8 @@ class Store:
         Raises:
             InputError: the database is none, belongs to another version of MLflow, or cannot be written.
         """
-        uri = settings.uri or f"sqlite:///{ROOT / 'mlflow.db'}"
-        artifacts = Path(settings.artifacts).expanduser() if settings.artifacts else ROOT / "mlartifacts"
+        uri = settings.uri or f"sqlite:///{Path.cwd() / 'mlflow.db'}"
+        artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
         try:
             with _alone(uri, artifacts):
                 client = MlflowClient(tracking_uri=uri)
@@ -187,6 +188,8 @@ def commit() -> str:
         return result.stdout.strip()
 
     try:
+        if BUNDLED != ROOT:  # a wheel, which may lie in somebody else's repository
+            return "unknown"
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

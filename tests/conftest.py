@@ -221,6 +221,11 @@ def connected(folder: str) -> TextIO | None:
     return None
 
 
+def named(command: str | Path) -> list[str]:
+    """Return what Python is told to run: a verb of ``skin``, or a script, by its name or its path."""
+    return [str(ROOT / "experiments" / command)] if Path(command).suffix else ["-m", "skin", command]
+
+
 def forked(starter: TextIO, job: dict) -> tuple[int, Callable[[], int | None]]:
     """Begin a command as a fork of the starter; return its process's number and what gives its exit code."""
 
@@ -242,7 +247,7 @@ def started(job: dict) -> tuple[int, Callable[[], int | None]]:
 
 @pytest.fixture(scope="session")
 def begin(request, tmp_path_factory) -> Callable[..., Command]:
-    """Return a function that starts ``experiments/<script>``, or a script at a path, in a folder.
+    """Return a function that starts a verb of ``skin``, or a script of experiments or at a path, in a folder.
 
     The command is a process of its own that shares its imports with others, where there are forks (not on
     Windows) that libraries bear (not on macOS). ``stdin`` is the path of what it reads, such as a terminal.
@@ -253,7 +258,7 @@ def begin(request, tmp_path_factory) -> Callable[..., Command]:
         files = [said / f"{next(numbers)}" for _ in range(2)]
         for file in files:
             file.touch()
-        job = {"command": [str(ROOT / "experiments" / script), *map(str, arguments)], "folder": str(folder)}
+        job = {"command": [*named(script), *map(str, arguments)], "folder": str(folder)}
         job |= {"in": stdin, "out": str(files[0]), "err": str(files[1])}
         job |= {"environment": dict(os.environ), "seconds": PATIENCE}
         return Command(partial(forked, request.getfixturevalue("starter")) if forks else started, job)
@@ -263,7 +268,7 @@ def begin(request, tmp_path_factory) -> Callable[..., Command]:
 
 @pytest.fixture(scope="session")
 def run(begin) -> Callable[..., subprocess.CompletedProcess]:
-    """Return a function that runs ``experiments/<script>`` in a folder, with a store of its own there.
+    """Return a function that runs a command, named as for ``begin``, in a folder with a store of its own.
 
     ``store=False`` names no store. The command is started as by ``begin``; with ``fresh=True`` it shares
     nothing, as where a person starts it.
@@ -272,7 +277,7 @@ def run(begin) -> Callable[..., subprocess.CompletedProcess]:
     def run(folder, script, *arguments, store=True, fresh=False) -> subprocess.CompletedProcess:
         own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
         if fresh:
-            command = [sys.executable, ROOT / "experiments" / script, *arguments, *own]
+            command = [sys.executable, *named(script), *map(str, arguments), *own]
             return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
         return begin(folder, script, *arguments, *own).completed()
 

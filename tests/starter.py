@@ -119,10 +119,16 @@ def _become(job: dict[str, Any], made: dict[str, str]) -> None:
         os.close(file)
     signal.alarm(job["seconds"])
     script, *arguments = job["command"]
-    sys.argv, sys.path[0] = [script, *arguments], str(Path(script).parent)
+    sys.argv = [script, *arguments]
     code = 0
     try:
-        runpy.run_path(script, run_name="__main__")
+        if script == "-m":
+            sys.path[0] = job["folder"]
+            module, *sys.argv[1:] = arguments
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        else:
+            sys.path[0] = str(Path(script).parent)
+            runpy.run_path(script, run_name="__main__")
     except SystemExit as end:
         if not isinstance(end.code, int | None):
             raise

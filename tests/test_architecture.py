@@ -9,9 +9,10 @@ from skin.config import ROOT
 
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
-errors interrupt
+errors interrupt paths
 refusal identity labels rng material model lag sensors trust
 config recording body
+command
 files foreign description layout summary plausible
 storage touch tracking
 simulator
@@ -24,11 +25,15 @@ datamodule
 learner
 evaluation build
 reload
+trained
 hardware
 plot
 console
 run
 sweep
+commands
+cli
+__main__
 """
 LEVEL = {name: number for number, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 

@@ -2,9 +2,9 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 from omegaconf.errors import ReadonlyConfigError
@@ -153,8 +153,10 @@ def test_help_and_mistakes_wait_for_no_heavy_import(argument, code):
     assert train(argument, code=LIGHT).stdout.splitlines()[-1] == f"exit {code}"
 
 
-def test_generate_and_evaluate_know_the_same_groups():
-    for name in ("generate", "evaluate"):
-        stored = OmegaConf.load(CONF / f"{name}.yaml")
-        assert stored.defaults[0] == "train"
-        assert Path(ROOT / "experiments" / f"{name}.py").is_file()
+@pytest.mark.parametrize(("verb", "least"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
+def test_a_verb_composes_only_what_it_needs(verb, least):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose(verb)
+    groups = {"touch", "body", "layout", "simulator", "contact", "device", "data", "representation", "model"}
+    groups |= {"fusion", "learner"}
+    assert len(groups & set(config)) == least

@@ -15,11 +15,11 @@ MOMENTS = ["skin.interrupt", "torch._C"]
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", MOMENTS)
 @pytest.mark.parametrize(
-    "command", [["emulate.py"], ["train.py"], ["record.py", "out=x.csv"], ["evaluate.py"]], ids=lambda c: c[0]
+    "command", [["emulate"], ["train"], ["record", "out=x.csv"], ["evaluate"]], ids=lambda c: c[0]
 )
 def test_ctrl_c_among_imports(tmp_path, command, moment):
     script, *rest = command
-    line = [sys.executable, "-X", "importtime", str(ROOT / "experiments" / script), *rest]
+    line = [sys.executable, "-X", "importtime", "-m", "skin", script, *rest]
     with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         assert any(one.split("|")[-1].strip() == moment for one in process.stderr), "it never got there"
         process.send_signal(signal.SIGINT)

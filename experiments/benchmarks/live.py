@@ -75,12 +75,13 @@ def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
     from skin.reload import changed, find
     from skin.reload import configuration as stored
     from skin.tracking import Store
+    from skin.trained import trained
 
     config = configuration(*([f"tracking.uri={uri}"] if uri else []))
     store = Store.open(config.tracking)
     found = find(store, run)
     known = stored(store, found)
-    of = start.trained(store, found, changed(known, config, []), known)
+    of = trained(store, found, changed(known, config, []), known)
     assert isinstance(of.device, Simulated)
     return of.device, start.engine(of, Patience(), _TOUCH)
 

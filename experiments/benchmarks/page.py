@@ -1,6 +1,6 @@
 """How many pictures a second the live page draws, in a headless Chromium; and a picture of an alarm.
 
-python experiments/live.py web=true                                          # in one terminal
+skin live web=true                                          # in one terminal
 python experiments/benchmarks/page.py http://127.0.0.1:8765 30               # in another
 python experiments/benchmarks/page.py http://127.0.0.1:8765 60 --alarm live.png
 """

@@ -58,7 +58,7 @@ def newest(store: Store, config: DictConfig, rows: str | Sequence[str]) -> dict[
     if missing := [row for row in names if row not in seen]:
         raise InputError(
             f"no finished run of {', '.join(missing)} on {config.data.name} data in {store.uri}: "
-            f"python experiments/train.py experiment={missing[0]} simulator={config.data.name} makes one"
+            f"skin train experiment={missing[0]} simulator={config.data.name} makes one"
         )
     return dict(sorted(found.items()))
 

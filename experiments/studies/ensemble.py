@@ -128,7 +128,7 @@ def combine(
     if len(present) < 2:
         raise InputError(
             f"an ensemble needs two finished rows, got {', '.join(present) or 'none'} without "
-            f"{', '.join(missing)}: experiments/train.py experiment={(missing or ('ROW',))[0]} makes one"
+            f"{', '.join(missing)}: skin train experiment={(missing or ('ROW',))[0]} makes one"
         )
     identity = " ".join(run.info.run_id for run in present.values())
     done = {name: _finished(store, config, members=identity) for name, config in ways.items()}

@@ -83,7 +83,7 @@ def latest(store: Store, simulator: str, rows: str | Sequence[str]) -> list[Run]
     if missing := [row for row in names if row not in found]:
         raise InputError(
             f"no finished run of {', '.join(missing)} on {simulator} data in {store.uri}: "
-            f"python experiments/train.py experiment={missing[0]} simulator={simulator} makes one"
+            f"skin train experiment={missing[0]} simulator={simulator} makes one"
         )
     return [found[row] for row in names]
 

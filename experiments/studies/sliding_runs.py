@@ -48,7 +48,7 @@ def newest(store: Store, simulator: str, rows: str | Sequence[str]) -> list[Run]
     if missing := sorted(wanted - known) or ([] if wanted else ["features"]):
         raise InputError(
             f"no finished run of {', '.join(missing)} on {simulator} data in {store.uri}: "
-            f"python experiments/train.py experiment={missing[0]} simulator={simulator} makes one"
+            f"skin train experiment={missing[0]} simulator={simulator} makes one"
         )
     return [found[key] for key in sorted(found) if key[0] in wanted]
 

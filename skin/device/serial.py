@@ -106,7 +106,7 @@ class Serial(AbstractDevice):
         """Return the gestures, read when first asked for; labels are None where nobody knows them."""
         if split != "test":
             raise InputError(
-                f"device=serial has no {split} split: record a session with experiments/record.py, then take "
+                f"device=serial has no {split} split: record a session with skin record, then take "
                 "device=recording"
             )
         if self.recording is None:
@@ -124,7 +124,7 @@ class Serial(AbstractDevice):
         """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
         if self.port is None:
             raise InputError(
-                "device=serial needs a port: add device.port=/dev/ttyACM0; experiments/emulate.py makes one"
+                "device=serial needs a port: add device.port=/dev/ttyACM0; skin emulate makes one"
             )
         tap = Tap(partial(open_wire, self.port, self.baudrate))
         names = "format", "timeout", "backoff", "silence"

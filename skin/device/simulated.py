@@ -55,7 +55,7 @@ class Simulated(AbstractDevice):
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
         gain_spread, offset, noise, ... quantum: as in :class:`skin.signal.imperfection.Imperfection`.
-        calibration: file of experiments/calibrate.py, which takes the place of all these but dead and tare.
+        calibration: file of skin calibrate, which takes the place of all these but dead and tare.
         randomise: every gesture is felt by a device of its own.
         position_error: standard deviation of the true sensors' places about those that touches report, m.
         rate: frames per second, Hz.

@@ -125,7 +125,7 @@ def read(text: str) -> OperatingPoint | None:
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise InputError(
             f"the stored operating point {text[:200]!r} cannot be read: train the run again, or give the "
-            "threshold to live.py as live.patience.above=0.5"
+            "threshold to skin live as live.patience.above=0.5"
         ) from error
     return point
 

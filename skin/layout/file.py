@@ -11,11 +11,11 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout._place import place
 from skin.layout.base import AbstractLayout
+from skin.paths import candidates
 from skin.sensors import Sensors
 
 __all__ = ["File"]
 
-_ROOT = Path(__file__).parents[2]
 _NEED = (
     "a layout has the columns x_m, y_m and optionally depth_m, in metres from the upper left corner, and "
     "normal_x, normal_y, normal_z, which way a sensor faces"
@@ -64,12 +64,11 @@ class File(AbstractLayout):
 
 
 def _find(given: str) -> Path:
-    path = Path(given).expanduser()
-    candidates = [path] if path.is_absolute() else [Path.cwd() / path, _ROOT / path]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    looked = " and ".join(dict.fromkeys(map(str, candidates)))
+    places = candidates(given)
+    for path in places:
+        if path.is_file():
+            return path
+    looked = " and ".join(dict.fromkeys(map(str, places)))
     raise InputError(f"no layout file {given}: looked for {looked}; give layout.path=FILE.csv")
 
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from skin.errors import InputError
+from skin.paths import candidates
 
 __all__ = ["find", "load"]
 
-_ROOT = Path(__file__).parents[2]
 _OFFICIAL = "efficientnet_b0_rwightman-7f5810bc.pth"
 _SOURCE = f"https://download.pytorch.org/models/{_OFFICIAL}"
 _WAYS = "model.weights=random trains from scratch"
@@ -35,8 +35,7 @@ def find(weights: str) -> Path:
             f"put it there from {_SOURCE}, or give model.weights=FILE.pth; {_WAYS}"
         )
     else:
-        path = Path(str(weights)).expanduser()
-        named = [path] if path.is_absolute() else [Path.cwd() / path, _ROOT / path]
+        named = candidates(weights)
         looked = " and ".join(dict.fromkeys(map(str, named)))
         missing = (
             f"no weights file {weights}: looked for {looked}; "

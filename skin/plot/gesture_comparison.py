@@ -85,7 +85,7 @@ class Gestures:
 
 
 def marked(path: str) -> bool:
-    """Return whether a session marks gestures, as those of experiments/record.py do."""
+    """Return whether a session marks gestures, as those of skin record do."""
     beside = Path(path).expanduser().with_name(Path(path).name + ".json")
     try:
         about = json.loads(beside.read_text(encoding="utf-8"))
@@ -102,7 +102,7 @@ def read(device: Simulated, path: str, seed: int) -> Gestures:
 
     Args:
         device: with its imperfections, or its calibration.
-        path: x.csv of experiments/record.py.
+        path: x.csv of skin record.
         seed: of the emulator, or of the gestures of the same labels.
 
     Raises:

@@ -12,11 +12,11 @@ import numpy as np
 from skin import files
 from skin.errors import InputError
 from skin.foreign import settings
+from skin.paths import candidates
 
 __all__ = ["BROKEN", "QUANTITIES", "Calibration", "read", "write"]
 
 FORMAT = 1
-_ROOT = Path(__file__).parents[2]
 QUANTITIES = {
     "gain": 1.0,
     "offset": 0.0,
@@ -145,10 +145,9 @@ def read(path: str | Path) -> Calibration:
     Raises:
         InputError: no such file, unreadable, or contents that cannot be used.
     """
-    given = Path(path).expanduser()
-    found = next((place for place in (given, _ROOT / given) if place.is_file()), None)
+    found = next((place for place in candidates(path) if place.is_file()), None)
     if found is None:
-        raise InputError(f"no calibration {path}: experiments/calibrate.py session=FILE out={path} makes one")
+        raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
         stored: Any = settings(found)
     except (OSError, ValueError) as error:

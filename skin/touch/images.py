@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
 from skin.errors import InputError
+from skin.paths import BUNDLED, candidates
 
 __all__ = ["check", "hulls", "load", "pyramid"]
 
-_ROOT = Path(__file__).parents[2]
-_FOLDER = _ROOT / "data" / "shapes"
+_FOLDER = BUNDLED / "data" / "shapes"
 
 
 def load(name: str) -> np.ndarray:
@@ -49,8 +49,7 @@ def load(name: str) -> np.ndarray:
 
 def _find(name: str) -> Path:
     path = Path(name).expanduser()
-    candidates = [path, _ROOT / path] if path.suffix else [_FOLDER / f"{name}.png", path]
-    for candidate in candidates:
+    for candidate in candidates(path) if path.suffix else [_FOLDER / f"{name}.png", path]:
         if candidate.is_file():
             return candidate.resolve()
     known = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.png")))

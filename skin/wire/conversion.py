@@ -60,7 +60,7 @@ def newtons(
         if header is None or header.unit != "N":
             raise InputError(
                 f"the device sends {header.unit if header and header.unit else 'values of no unit'}, a model "
-                "takes N: give device.calibration=FILE.yaml of experiments/calibrate.py, or N per count "
+                "takes N: give device.calibration=FILE.yaml of skin calibrate, or N per count "
                 "as in device.scale=0.039"
             )
         scale = 1.0

@@ -23,7 +23,7 @@ PATIENCE = 300  # s: machines are busy at times
 def stream(begin, folder):
     """Return the bytes that an emulated skin sends for some gestures, and its N per count."""
     fast = ["port=tcp:0", "emulate.speed=20", f"gestures={COUNT}"]
-    with begin(folder, "emulate.py", *SKIN, *fast) as process:
+    with begin(folder, "emulate", *SKIN, *fast) as process:
         lines = process.lines()
         port = next(lines)
         scale = re.search(r"device\.scale=(\S+)", next(lines))[1]
@@ -67,7 +67,7 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played,
     again = answers(tmp_path, tell("evaluate.py", *file, f"out={tmp_path}/played"))
     assert len(next(iter(live.values()))) == COUNT
     assert again == live
-    text = tell("compare.py", *SKIN, "session=s.csv", "run=latest", f"out={tmp_path}")
+    text = tell("compare", *SKIN, "session=s.csv", "run=latest", f"out={tmp_path}")
     assert text.startswith("# The same gestures, simulated and recorded")
     ratio = float(re.search(r"median: (\d\.\d+)", text)[1])
     assert ratio == pytest.approx(1.0, abs=0.1)

@@ -21,7 +21,7 @@ def emulated(begin, tmp_path):
 
     @contextmanager
     def emulated(*overrides):
-        with begin(tmp_path, "emulate.py", *SMALL, *overrides) as process:
+        with begin(tmp_path, "emulate", *SMALL, *overrides) as process:
             lines = process.lines()
             yield next(lines), lines, process
 
@@ -69,11 +69,11 @@ def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulat
 @pytest.mark.parametrize(
     ("command", "reason"),
     [
-        (("emulate.py", "port=usb"), "pty or tcp"),
-        (("emulate.py", "format=morse"), "text, binary"),
-        (("emulate.py", "+faults.flip=1"), "flip"),
+        (("emulate", "port=usb"), "pty or tcp"),
+        (("emulate", "format=morse"), "text, binary"),
+        (("emulate", "+faults.flip=1"), "flip"),
         (("record.py",), "out=session.csv"),
-        (("compare.py",), "which session?"),
+        (("compare",), "which session?"),
     ],
 )
 @pytest.mark.slow

@@ -72,5 +72,5 @@ def test_what_cannot_be_used_is_refused(tmp_path, text, reason):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no calibration .*experiments/calibrate.py"):
+    with pytest.raises(InputError, match=r"no calibration .*skin calibrate"):
         read(tmp_path / "none.yaml")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from skin.body.sheet import Sheet
-from skin.config import ROOT
 from skin.device.serial import Serial
 from skin.hardware.live.loop import Session
 from skin.hardware.record.log import read
@@ -24,13 +23,13 @@ PATIENT = 300.0  # s: machines are busy at times
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 
 
-@pytest.mark.parametrize("script", ["listen.py", "record.py"])
+@pytest.mark.parametrize("verb", ["listen", "record"])
 @pytest.mark.slow
-def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, script):
-    out = {"listen.py": [], "record.py": ["out=s.csv"]}[script]
+def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
+    out = {"listen": [], "record": ["out=s.csv"]}[verb]
     with open_skin(plug.port):
         done = subprocess.run(
-            [sys.executable, ROOT / "experiments" / script, f"device.port={plug.port}", *out],
+            [sys.executable, "-m", "skin", verb, f"device.port={plug.port}", *out],
             cwd=tmp_path,
             capture_output=True,
             text=True,

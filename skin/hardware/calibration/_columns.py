@@ -18,7 +18,7 @@ from skin.files import whole, write
 __all__ = ["load", "numbers", "save"]
 
 _KEY = b"skin_session"
-_RECORDED = b"time,seq,raw_"  # of experiments/record.py: all its columns are numbers
+_RECORDED = b"time,seq,raw_"  # of skin record: all its columns are numbers
 _NUMBERS = b"0123456789+-.e,"
 _log = logging.getLogger("skin.hardware.record")
 
@@ -26,7 +26,7 @@ _log = logging.getLogger("skin.hardware.record")
 def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     """Return a table and what is known about it: JSON in a Parquet schema, or in ``x.csv.json`` beside it.
 
-    Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of experiments/record.py are
+    Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of skin record are
     skipped, with a warning.
 
     Raises:

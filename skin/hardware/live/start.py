@@ -2,55 +2,27 @@
 
 from dataclasses import dataclass, replace
 
-import torch
-from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 
-from skin.build import build_data, build_device, build_learner
 from skin.device.base import AbstractDevice
 from skin.device.recording import Recorded
 from skin.device.serial import Serial
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.report import Answers
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.verdict import Patience
-from skin.reload import operating_point, restore
 from skin.signal.contact_detection import DRIFT
 from skin.signal.contact_threshold import Threshold, rise
-from skin.tracking import Store
+from skin.trained import Trained
 from skin.wire.conversion import newtons
 from skin.wire.open import open_skin
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare
 
-__all__ = ["Source", "Trained", "advice", "engine", "source", "trained"]
+__all__ = ["Source", "advice", "engine", "source"]
 
-_FEW = 10  # gestures, where only their shape matters
 _FAINT = 0.3  # N that end a contact where nothing else is known
 _MANY = 4000  # windows of streams, a tenth of which tunes what touch is
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A run brought back.
-
-    Attributes:
-        device: that it was trained on, with few gestures.
-        learner: trained.
-        window: T, frames.
-        positions: (S, 3), m.
-        rate: Hz.
-        point: where its alarm is raised; None where it knows no label ``dangerous``.
-    """
-
-    device: AbstractDevice
-    learner: Answers
-    window: int
-    positions: torch.Tensor
-    rate: float
-    point: OperatingPoint | None = None
 
 
 @dataclass(frozen=True)
@@ -90,31 +62,6 @@ def source(device: AbstractDevice) -> Source:
 
 def _plain(sensors: int) -> Tare:
     return Tare(lambda baseline, header: newtons(sensors, None, 1.0, None, None), 0.0, 1.0)
-
-
-def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
-    """Return a run with what it learned.
-
-    Args:
-        store: where it is.
-        run: a finished training.
-        config: its configuration, changed as :func:`skin.reload.changed` does.
-        stored: its configuration as it was.
-
-    Raises:
-        InputError: what it learned does not fit the configuration.
-    """
-    own = OmegaConf.create(OmegaConf.to_container(config))
-    assert isinstance(own, DictConfig)
-    if "gestures" in own.device:
-        own.device.gestures = _FEW
-        own.device.fresh = False
-    device, learner = build_device(own), build_learner(own)
-    data = build_data(own, device)
-    restore(store, run, learner, data)
-    known = data.touches("train")
-    point = operating_point(run, learner, stored, config.evaluation)
-    return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
 
 
 def engine(of: Trained, patience: Patience, touch: float | None = None, drift: float = 600 * DRIFT) -> Engine:

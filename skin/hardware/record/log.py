@@ -1,6 +1,6 @@
 """A session on disk: raw frames as they arrive, and the events between them.
 
-A CSV that experiments/calibrate.py reads too: ``time`` (s since the start), ``seq`` and a column of raw
+A CSV that skin calibrate reads too: ``time`` (s since the start), ``seq`` and a column of raw
 values per sensor. Lines that start with # are JSON: what values mean, where a gesture begins and ends, gaps,
 invalid channels. Unit, layout and start time stand in ``x.csv.json``. Lines are only ever added, each in one
 piece, so the file is valid up to its last whole frame whatever ends the program.

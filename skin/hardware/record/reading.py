@@ -38,19 +38,19 @@ def read(path: Path) -> Stored:
     left out, for nobody knows what its frames mean. So is one whose line with the baseline is damaged.
 
     Raises:
-        InputError: no such file, or no session of experiments/record.py.
+        InputError: no such file, or no session of skin record.
     """
     beside = path.with_name(path.name + ".json")
     try:
         if path.exists() and not beside.exists():
-            raise InputError(f"{path} is no session of experiments/record.py: no {beside.name} is beside it")
+            raise InputError(f"{path} is no session of skin record: no {beside.name} is beside it")
         reading = _Reading(_about(beside))
         with path.open("rb") as file:
             for number, line in enumerate(file, 1):
                 if line.endswith(b"\n"):
                     reading.line(number, line[:-1])
     except FileNotFoundError as error:
-        raise InputError(f"no session {path}: experiments/record.py out={path} makes one") from error
+        raise InputError(f"no session {path}: skin record out={path} makes one") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     except _BAD as error:
@@ -59,7 +59,7 @@ def read(path: Path) -> Stored:
         raise InputError(f"{beside.name} is damaged or no session's: {error}") from error
     stored = reading.stored
     if stored.damaged and not stored.frames:
-        raise InputError(f"{path} is damaged or no session of experiments/record.py: {reading.first}")
+        raise InputError(f"{path} is damaged or no session of skin record: {reading.first}")
     for warning in stored.warnings:
         _log.warning("%s: %s", path, warning)
     return stored

@@ -8,6 +8,7 @@ from skin.errors import InputError
 from skin.hardware.live import start
 from skin.hardware.live.holds import COURSES, played, trials
 from skin.hardware.live.verdict import Patience
+from skin.trained import Trained
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
 LEARNERS = {
@@ -29,7 +30,7 @@ def trained(request, configured):
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device)
     learner.fit(data)
-    of = start.Trained(device, learner, device.window, data.touches("train").positions, device.rate)
+    of = Trained(device, learner, device.window, data.touches("train").positions, device.rate)
     return of, device.replace(stream=False)
 
 

@@ -61,7 +61,7 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begi
     pace = ["emulate.rate=50", "emulate.gap=1.5"]
     with ExitStack() as both:
         emulator = both.enter_context(
-            begin(tmp_path, "emulate.py", "simulator=naive", f"link={link}", *pace, *faults)
+            begin(tmp_path, "emulate", "simulator=naive", f"link={link}", *pace, *faults)
         )
         scale = until(lambda: re.search(r"device\.scale=(\S+)\n", emulator.out), emulator, "the port")[1]
         reader = ["device=serial", f"device.port={link}", f"device.scale={scale}", "device.backoff=[0.2,0.5]"]

@@ -12,7 +12,7 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     session, out = tmp_path / "bench.parquet", tmp_path / "mine.yaml"
     done = run(
         tmp_path,
-        "calibrate.py",
+        "calibrate",
         *SMALL,
         f"session={session}",
         f"out={out}",
@@ -46,7 +46,7 @@ def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tm
     perfect = ["device.gain_spread=0", "device.offset=0", "device.clip=1000"]
     session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
     files = f"session={session}", f"out={out}"
-    done = run(tmp_path, "calibrate.py", *SMALL, *perfect, *files, "calibrate.demo=true", store=False)
+    done = run(tmp_path, "calibrate", *SMALL, *perfect, *files, "calibrate.demo=true", store=False)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "It does not help" in done.stdout
     assert not out.exists()
@@ -60,7 +60,7 @@ def test_a_calibration_that_does_not_help_ends_with_1_and_writes_nothing(run, tm
     ],
 )
 def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, arguments, reason):
-    done = run(tmp_path, "calibrate.py", *arguments, store=False)
+    done = run(tmp_path, "calibrate", *arguments, store=False)
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,4 +1,4 @@
-"""experiments/animate.py as a person runs it."""
+"""`skin animate` as a person runs it."""
 
 import pytest
 from PIL import Image
@@ -6,7 +6,7 @@ from PIL import Image
 from skin.build import build_device
 from skin.storage import write
 
-NAIVE = ("animate.py", "simulator=naive")
+NAIVE = ("animate", "simulator=naive")
 
 
 @pytest.mark.slow

@@ -11,12 +11,12 @@ import pytest
 from skin.config import ROOT
 from skin.wire.text import Header, encode_header, encode_line
 
-LISTEN = str(ROOT / "experiments" / "listen.py")
+LISTEN = "-m", "skin", "listen"
 
 
 def listen(*arguments):
     return subprocess.run(
-        [sys.executable, LISTEN, *arguments],
+        [sys.executable, *LISTEN, *arguments],
         capture_output=True,
         text=True,
         timeout=120,
@@ -84,7 +84,7 @@ def test_another_number_of_sensors_and_silence_end_with_code_2(address):
 
 
 def test_ctrl_c_ends_it_well(address):
-    command = [sys.executable, LISTEN, f"device.port={address}", "seconds=null"]
+    command = [sys.executable, *LISTEN, f"device.port={address}", "seconds=null"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
     ) as process:

@@ -1,0 +1,129 @@
+"""Commands: functions of a configuration that Hydra composes from what the command line asks for."""
+
+from skin import interrupt  # isort: skip
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from functools import wraps
+from pathlib import Path
+from textwrap import indent
+from typing import Any
+
+from hydra import compose, initialize_config_dir, version
+from hydra._internal.utils import _run_hydra, get_args_parser  # what hydra.main itself calls, with sys.argv
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from skin.config import CONF, checked
+from skin.refusal import Refused, refusal, sentence
+
+__all__ = ["command", "interrupt"]
+
+_VERSION = "1.3"  # of Hydra, whose defaults hold
+
+
+def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[..., None]]:
+    """Make a command of a function that takes a checked configuration.
+
+    Bad input ends it with one sentence and exit code 2. In a multirun the job fails and the others run on.
+    The command takes the words of its command line; None: those of this process.
+
+    Args:
+        name: the primary configuration, a file in ``conf/``.
+    """
+
+    def decorate(task: Callable[[DictConfig], Any]) -> Callable[..., None]:
+        started = []
+
+        @wraps(task)
+        def job(config: DictConfig) -> Any:
+            started.append(True)
+            try:
+                return task(checked(config))
+            except Exception as error:
+                refused = refusal(error)
+                if refused is None:
+                    raise
+                if HydraConfig.get().mode == RunMode.MULTIRUN:
+                    raise Refused(str(refused)) from error
+                print(refused, file=sys.stderr)
+                sys.exit(2)
+
+        def main(words: Sequence[str] | None = None) -> None:
+            # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
+            typed = sys.argv[1:] if words is None else words
+            given = [word.replace("=~/", f"={Path.home()}/", 1) for word in typed]
+            warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+            version.setbase(_VERSION)
+            parser = get_args_parser()
+            asked = parser.parse_args(given)
+            try:
+                if asked.help:
+                    if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
+                        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+                    print(_help(sys.modules[task.__module__].__doc__ or "", asked.config_name or name, asked))
+                    return
+                _run_hydra(asked, parser, job, str(CONF), name)
+            except SystemExit as stop:
+                # Hydra ends with 1 where the configuration could not be composed.
+                if stop.code == 1 and not started:
+                    sys.exit(2)
+                raise
+
+        return main
+
+    return decorate
+
+
+def _help(about: str, name: str, asked: Any) -> str:
+    """Return what a command does, the options of its groups, and its settings with their comments."""
+    folders = [CONF, *([Path(asked.config_dir).resolve()] if asked.config_dir else [])]
+    words = [*asked.overrides, f"hydra.searchpath=[{','.join(map(str, folders[1:]))}]"]
+    try:
+        with initialize_config_dir(str(CONF), version_base=_VERSION):
+            config = compose(name, words, return_hydra_config=True)
+            loader = GlobalHydra.instance().config_loader()
+            chosen = {
+                group: option
+                for group, option in config.hydra.runtime.choices.items()
+                if not group.startswith("hydra/")
+            }
+            options = {group: loader.get_group_options(group) for group in chosen}
+    except Exception as error:
+        print(sentence(error), file=sys.stderr)
+        sys.exit(2)
+    width = max(map(len, chosen), default=0)
+    lines = [
+        f"  {group:{width}}  {', '.join(f'[{one}]' if one == chosen[group] else one for one in known)}"
+        for group, known in options.items()
+    ]
+    texts = [_text(folders, part) for part in reversed(_parts(folders, name))]
+    for group, option in chosen.items():
+        if option and (text := _text(folders, f"{group}/{option}")):
+            texts.append(f"{group}:\n{indent(text, '  ')}")
+    settings = indent("\n\n".join(texts), "  ")
+    groups = "\n".join(["Groups, as in GROUP=OPTION; [what is chosen]:", *lines])
+    return f"{about.strip()}\n\n{groups}\n\nSettings, as in NAME=VALUE or GROUP.NAME=VALUE:\n\n{settings}"
+
+
+def _parts(folders: Sequence[Path], name: str) -> list[str]:
+    """Return the configurations without a group that one consists of, itself last."""
+    stored = OmegaConf.load(next(path for folder in folders if (path := folder / f"{name}.yaml").is_file()))
+    assert isinstance(stored, DictConfig)
+    below = [part for part in stored.get("defaults", []) if isinstance(part, str) and part != "_self_"]
+    return [one for part in below if part != "command" for one in _parts(folders, part)] + [name]
+
+
+def _text(folders: Sequence[Path], name: str) -> str:
+    """Return the settings in a configuration's file, with its comments and without its defaults list."""
+    found = [path for folder in folders if (path := folder / f"{name}.yaml").is_file()]
+    lines = found[-1].read_text().splitlines() if found else []
+    kept, listed = [], False
+    for line in lines:
+        listed = line.startswith("defaults:") or (listed and line.startswith((" ", "-")))
+        if not listed and not line.startswith(("_target_", "_convert_", "_partial_", "# @package")):
+            kept.append(line)
+    return "\n".join(kept).strip()

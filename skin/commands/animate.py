@@ -1,0 +1,37 @@
+"""Animate a simulated or recorded touch as GIF; or draw its strongest frame as PNG.
+
+    skin animate out=x.gif labels=[big,dynamic,press] shape=hand seed=3
+    skin animate out=x.png device=recording device.path=touches.parquet index=5
+
+Without device= the touch is simulated.
+"""
+
+from omegaconf import DictConfig
+
+from skin.command import command
+from skin.errors import InputError
+
+
+@command("animate")
+def main(config: DictConfig) -> None:
+    """Write a GIF or PNG of a simulated touch, or of one that a recording holds."""
+    if config.out is None or not config.out.endswith((".gif", ".png")):
+        raise InputError(
+            f"an animation is a .gif file, a still a .png file, got out={config.out}: add out=touch.gif"
+        )
+
+    from pathlib import Path
+
+    from skin.build import build_device
+    from skin.device.simulated import Simulated
+    from skin.plot.animation import still, write
+    from skin.plot.touches import recorded, simulated
+
+    device = build_device(config)
+    if isinstance(device, Simulated):
+        scene = simulated(device, list(config.labels), config.shape, config.seed, config.view == "skin3d")
+    else:
+        scene = recorded(device, config.index)
+    path = Path(config.out).expanduser()
+    path = (still if path.suffix == ".png" else write)(scene, config.view, path)
+    print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

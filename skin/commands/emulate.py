@@ -1,0 +1,56 @@
+"""Emulate a skin at a pseudo-terminal or TCP port, with simulated gestures.
+
+    skin emulate port=pty link=./skin-port
+
+Prints the settings that connect to it, then sends gestures until Ctrl-C.
+"""
+
+import signal
+from contextlib import suppress
+from types import FrameType
+
+from skin.command import command
+from skin.config import DictConfig, plain
+from skin.errors import InputError
+
+_FORMATS = ("text", "binary")
+
+
+@command("emulate")
+def main(config: DictConfig) -> None:
+    """Play gestures of the configured simulator, device and layout in real time."""
+    if config.format not in _FORMATS:
+        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
+
+    from skin.build import build_device
+    from skin.device.simulated import Simulated
+    from skin.hardware.emulator.emulator import Emulator, Settings
+    from skin.hardware.emulator.faults import Faults
+    from skin.hardware.emulator.outlet import outlet
+
+    groups = plain(config)
+    settings, faults = Settings.of(groups["emulate"]), Faults.of(groups["faults"])
+    device = build_device(config)
+    if not isinstance(device, Simulated):
+        raise InputError("only simulated gestures can be emulated: leave out device=")
+    signal.signal(signal.SIGTERM, _leave)
+    port = outlet(config.port, config.link)
+    try:
+        emulator = Emulator(device, port, settings, faults, config.format == "binary", _tell)
+        # From the first line on, because whoever reads it may stop this at once.
+        with suppress(KeyboardInterrupt):
+            print(port.address, flush=True)
+            scale = f" device.scale={emulator.converter.scale:g}" if settings.bits else ""
+            print(f"device=serial device.port={port.address}{scale}", flush=True)
+            emulator.run(config.seconds, config.gestures)
+        print(f"{emulator.frames} frames")
+    finally:
+        port.unplug()
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _tell(t: float, text: str) -> None:
+    print(f"{t:8.2f} s  {text}", flush=True)

@@ -1,0 +1,46 @@
+"""Write simulated touches to a Parquet or CSV file.
+
+    skin generate n=1000 out=touches.parquet
+
+Prints a summary of the touches, and warns where a shape tells a label.
+"""
+
+from skin.command import command
+from skin.config import DictConfig, fingerprint, plain
+from skin.errors import InputError
+
+
+@command("generate")
+def main(config: DictConfig) -> None:
+    """Draw a budget of n gestures and write all that is known about them."""
+    if config.out is None:
+        raise InputError("where to? add out=touches.parquet or out=touches.csv")
+    if not config.out.endswith((".parquet", ".csv")):
+        raise InputError(f"a recording is a .parquet or .csv file, got {config.out}: add out=touches.parquet")
+
+    from dataclasses import replace
+
+    from omegaconf import OmegaConf
+
+    from skin.balance import announce
+    from skin.build import build_device
+    from skin.device.recording import Recorded
+    from skin.device.simulated import Simulated
+    from skin.storage import write
+    from skin.summary import line
+
+    device = build_device(config)
+    if not isinstance(device, Simulated | Recorded):
+        raise InputError("only simulated touches are generated: leave out device=")
+    recording = device.recording()
+    if isinstance(device, Simulated):
+        announce(device, recording)
+    # Where the touches go does not change them.
+    source = OmegaConf.masked_copy(config, [str(key) for key in config if key != "out"])
+    about = {"config_hash": fingerprint(source), "config": plain(source)}
+    path = write(replace(recording, metadata=recording.metadata | about), config.out)
+    # What a file says of itself may be anything.
+    said = (
+        line(recording.metadata["summary"]) if isinstance(device, Simulated) else f"{len(recording)} gestures"
+    )
+    print(f"{path}: {said}")

@@ -1,0 +1,39 @@
+"""Check a port: print frame rate, errors and channel values.
+
+    skin listen device.port=/dev/ttyACM0
+
+Listens for seconds=, or until Ctrl-C.
+"""
+
+import signal
+from contextlib import suppress
+
+from skin.command import command
+from skin.config import DictConfig, plain
+from skin.errors import InputError
+
+_KEYS = ("baudrate", "format", "limits", "timeout")
+
+
+@command("listen")
+def main(config: DictConfig) -> None:
+    """Say once a second how many frames came, how fast and how sound; at the end, what each channel read."""
+    device = plain(config)["device"]
+    if device["port"] is None:
+        raise InputError("which port? add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER")
+
+    from skin.wire.diagnosis import Listener
+    from skin.wire.errors import SkinDisconnected, SkinTimeout
+    from skin.wire.open import open_skin
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sensors = None if config.n is None else range(config.n)
+    with open_skin(device["port"], sensors, **{key: device[key] for key in _KEYS}) as skin:
+        listener = Listener(skin)
+        try:
+            with suppress(KeyboardInterrupt):
+                for line in listener.lines(config.seconds):
+                    print(line, flush=True)
+        except (SkinTimeout, SkinDisconnected) as error:
+            raise InputError(f"{device['port']}: {error}") from error
+        print(listener.summary())

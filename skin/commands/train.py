@@ -1,0 +1,18 @@
+"""Train a configuration, or with -m a sweep of them; log every run to MLflow.
+
+    skin train experiment=features
+    skin train -m experiment=rules,features seed=0,1,2
+
+A run that finished with the same configuration is skipped; tracking.resume=false trains it again.
+"""
+
+from skin.command import command
+from skin.config import DictConfig
+
+
+@command()
+def main(config: DictConfig) -> bool:
+    """Train and evaluate one configuration; False if that was done before."""
+    from skin.run import train
+
+    return train(config)

@@ -1,0 +1,96 @@
+"""A finished training run that predicts, for scripts and for ``skin live``."""
+
+from dataclasses import dataclass
+
+from mlflow.entities import Run
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from skin.build import build_data, build_device, build_learner
+from skin.config import Tracking, checked
+from skin.device.base import AbstractDevice
+from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.report import Answers
+from skin.recording import Touches
+from skin.reload import configuration, find, operating_point, restore
+from skin.tracking import Store
+
+__all__ = ["Trained", "load_run", "trained"]
+
+_FEW = 10  # gestures, where only their shape matters
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained run.
+
+    Attributes:
+        device: that it was trained on, with few gestures.
+        learner: trained.
+        window: T, frames.
+        positions: (S, 3), m.
+        rate: Hz.
+        point: where its alarm is raised; None where it knows no label ``dangerous``.
+    """
+
+    device: AbstractDevice
+    learner: Answers
+    window: int
+    positions: Tensor
+    rate: float
+    point: OperatingPoint | None = None
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The names of the columns of :meth:`predict`."""
+        return tuple(self.device.task.names)
+
+    def predict(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of this window and rate.
+
+        Raises:
+            InputError: touches that the run cannot take.
+        """
+        return self.learner.probabilities(touches)
+
+
+def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) -> Trained:
+    """Return a finished training run.
+
+    Args:
+        name: the beginning of its id; ``latest`` is the last one that finished.
+        uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
+        trust: build whatever its configuration names, which may run any code.
+
+    Raises:
+        InputError: there is no such run, or it cannot be loaded.
+    """
+    store = Store.open(Tracking(uri, None, "skin", True, None))
+    run = find(store, name)
+    stored = configuration(store, run, trust)
+    return trained(store, run, checked(stored), stored)
+
+
+def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
+    """Return a run with what it learned.
+
+    Args:
+        store: where it is.
+        run: a finished training.
+        config: its configuration, changed as :func:`skin.reload.changed` does.
+        stored: its configuration as it was.
+
+    Raises:
+        InputError: what it learned does not fit the configuration.
+    """
+    own = OmegaConf.create(OmegaConf.to_container(config))
+    assert isinstance(own, DictConfig)
+    if "gestures" in own.device:
+        own.device.gestures = _FEW
+        own.device.fresh = False
+    device, learner = build_device(own), build_learner(own)
+    data = build_data(own, device)
+    restore(store, run, learner, data)
+    known = data.touches("train")
+    point = operating_point(run, learner, stored, config.evaluation)
+    return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)

@@ -1,0 +1,58 @@
+"""The command `skin`: its verbs, their help, and what is wrong with what is typed."""
+
+import subprocess
+import sys
+
+import pytest
+
+from skin.cli import main, verbs
+
+VERBS = sorted(verbs())
+MOVED = ["animate", "calibrate", "compare", "emulate", "listen"]
+HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
+
+
+def test_the_verbs_are_listed_without_imports():
+    code = f"import sys, skin.cli; skin.cli.main([]); print(*({HEAVY} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    *lines, heavy = done.stdout.splitlines()
+    assert not heavy
+    listed = [line.split(maxsplit=1) for line in lines if line.startswith("  ")]
+    assert [name for name, _ in listed] == VERBS
+    assert all(text.endswith(".") for _, text in listed)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
+    main([verb, "--help"])
+    text = capsys.readouterr().out
+    assert f"skin {verb} " in text
+    assert ("fusion" in text) == (verb in ("train", "evaluate", "live", "compare"))
+    assert "[serial]" in text if verb in ("listen", "record") else "[simulated]" in text
+    assert "hydra" not in text
+
+
+def test_help_knows_overrides_and_mistakes(capsys):
+    main(["train", "model=mlp", "--help"])
+    assert "[mlp]" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "model=cn", "--help"])
+    assert stop.value.code == 2
+    assert "cn" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("verb", "words"), [("trian", "did you mean train?"), ("x", "animate, calibrate")])
+def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([verb])
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "generate", "record", "live", *MOVED])
+def test_the_scripts_of_before_still_run(run, tmp_path, name):
+    done = run(tmp_path, f"{name}.py", "typo=1", store=False)
+    assert done.returncode == 2
+    assert "typo" in done.stderr
+    assert (f"is now: skin {name}" in done.stderr) == (name in MOVED)

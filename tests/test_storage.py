@@ -124,7 +124,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
 
 
 def test_files_that_are_no_recordings_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no recording .*x.parquet: experiments/generate.py"):
+    with pytest.raises(InputError, match=r"no recording .*x.parquet: skin generate"):
         read(tmp_path / "x.parquet")
     with pytest.raises(InputError, match=r"\.parquet or \.csv file, got x.txt"):
         write(recording(), tmp_path / "x.txt")

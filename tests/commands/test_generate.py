@@ -1,4 +1,4 @@
-"""experiments/generate.py as a person runs it."""
+"""`skin generate` as a person runs it."""
 
 import pytest
 

@@ -6,9 +6,10 @@ Only Hydra is imported here: ``--help`` and a mistyped key must not import torch
 from skin import interrupt  # isort: skip
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import wraps
+from math import isnan
 from pathlib import Path
 from typing import Any, cast
 
@@ -145,8 +146,20 @@ def checked(config: DictConfig) -> DictConfig:
     except OmegaConfBaseException as error:
         raise InputError(sentence(error)) from error
     assert isinstance(whole, DictConfig)
+    # It would pass every comparison that is not written for it.
+    for name in _not_numbers(OmegaConf.to_container(whole)):
+        raise InputError(f"{name} is nan: give a number")
     OmegaConf.set_readonly(whole, True)
     return whole
+
+
+def _not_numbers(value: Any, name: str = "") -> Iterator[str]:
+    """Yield the names of settings that are NaN."""
+    if isinstance(value, float) and isnan(value):
+        yield name
+    elif isinstance(value, dict | list):
+        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _not_numbers(one, f"{name}.{key}" if name else str(key))
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -4,7 +4,9 @@ Only Hydra is imported here: ``--help`` and a mistyped key must not import torch
 """
 
 from skin import interrupt  # isort: skip
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from math import isnan
 from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
@@ -135,8 +137,20 @@ def checked(config: DictConfig) -> DictConfig:
     except OmegaConfBaseException as error:
         raise InputError(sentence(error)) from error
     assert isinstance(whole, DictConfig)
+    # It would pass every comparison that is not written for it.
+    for name in _not_numbers(OmegaConf.to_container(whole)):
+        raise InputError(f"{name} is nan: give a number")
     OmegaConf.set_readonly(whole, True)
     return whole
+
+
+def _not_numbers(value: Any, name: str = "") -> Iterator[str]:
+    """Yield the names of settings that are NaN."""
+    if isinstance(value, float) and isnan(value):
+        yield name
+    elif isinstance(value, dict | list):
+        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _not_numbers(one, f"{name}.{key}" if name else str(key))
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

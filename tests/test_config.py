@@ -89,6 +89,14 @@ def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
         checked(configured(override))
 
 
+@pytest.mark.parametrize(
+    "name", ["device.noise", "optimizer.lr", "touch.small_area.0", "touch.thresholds.area"]
+)
+def test_what_is_no_number_is_refused_by_name(configured, name):
+    with pytest.raises(InputError, match=f"^{name} is nan: give a number$"):
+        checked(configured(f"{name}=nan"))
+
+
 def test_keys_that_only_steer_leave_the_fingerprint(configured):
     same = configured("tracking.uri=sqlite:///elsewhere.db", "tracking.resume=false", "tracking.threads=1")
     assert fingerprint(same) == fingerprint(configured())

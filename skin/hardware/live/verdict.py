@@ -1,6 +1,7 @@
 """The verdict on a window, and how long it must persist before it is shown."""
 
 from dataclasses import dataclass, field
+from math import inf
 
 from skin.errors import InputError
 from skin.labels import OPPOSITE
@@ -64,7 +65,9 @@ class Patience:
     above: float | None = None
 
     def __post_init__(self) -> None:
-        if min(self.label, self.alarm, self.calm) < 0 or not (self.above is None or 0 < self.above < 1):
+        times = self.label, self.alarm, self.calm
+        # A time that is NaN would never pass, and so hide every alarm.
+        if not all(0 <= time < inf for time in times) or not (self.above is None or 0 < self.above < 1):
             raise InputError(f"live.patience takes times from 0 s up and above= between 0 and 1, got {self}")
         if self.alarm > 0.03:
             raise InputError(

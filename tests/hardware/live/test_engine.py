@@ -180,7 +180,16 @@ def test_labels_that_exclude_each_other_have_one_winner():
     assert not verdict.dangerous
 
 
-@pytest.mark.parametrize("wrong", [{"alarm": 0.1}, {"label": -1.0}, {"above": 1.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"alarm": 0.1},
+        {"label": -1.0},
+        {"above": 1.0},
+        *({name: float("nan")} for name in ("label", "alarm", "calm", "above")),
+        *({name: float("inf")} for name in ("label", "calm")),
+    ],
+)
 def test_patience_that_would_be_too_late_is_refused(wrong):
     with pytest.raises(InputError, match="patience"):
         Patience(**wrong)

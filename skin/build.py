@@ -11,6 +11,7 @@ from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.learner.base import AbstractLearner
 from skin.plausible import check, warn_of_surface
+from skin.settings import check_groups
 
 if TYPE_CHECKING:
     from skin.datamodule import TouchData
@@ -21,6 +22,7 @@ __all__ = ["build_data", "build_device", "build_learner"]
 def build_device(config: DictConfig) -> AbstractDevice:
     """Return the source of touches, with its body, layout and, where it has one, its simulator."""
     groups = plain(config)
+    check_groups({name: groups[name] for name in ("body", "layout", "device")})
     check(groups)
     body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
     mechanics = groups["device"].get("simulator")
@@ -42,10 +44,13 @@ def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
     except TypeError as error:
         known = ", ".join(entry.name for entry in fields(Augmentation))
         raise InputError(f"data.augment takes {known}: {error}") from error
+    check_groups({"representation": groups["representation"]})
     representation = instantiate(groups["representation"])
     return TouchData(device, representation, config.data.batch_size, config.seed, augmentation)
 
 
 def build_learner(config: DictConfig) -> AbstractLearner:
     """Return what will learn, untrained."""
-    return instantiate(plain(config)["learner"], seed=config.seed)
+    learner = plain(config)["learner"]
+    check_groups({"learner": learner})
+    return instantiate(learner, seed=config.seed)

@@ -13,7 +13,7 @@ errors interrupt paths
 refusal identity labels rng material model lag sensors trust
 config recording body
 command
-files foreign description layout summary plausible
+files foreign description layout summary plausible settings
 storage touch tracking
 simulator
 contact

@@ -9,29 +9,28 @@ hardware is needed. Ctrl-C stops.
 
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from skin.command import command
 from skin.config import DictConfig, overrides, plain
 
 if TYPE_CHECKING:
-    from skin.hardware.live.verdict import Patience
+    from skin.hardware.live.settings import Settings
 
 
 @command("live")
 def main(config: DictConfig) -> None:
     """Bring a finished run back, open what is watched, and show verdicts until somebody ends it."""
-    from skin.hardware.live.verdict import Patience
+    from skin.hardware.live.settings import Settings
 
-    live = plain(config)["live"]
-    patience = Patience(**live["patience"])
+    live = Settings.of(plain(config)["live"])
     try:
-        _watch(config, live, patience)
+        _watch(config, live)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> None:
+def _watch(config: DictConfig, live: "Settings") -> None:
     import torch
     from rich.console import Console
 
@@ -56,9 +55,9 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
     if advice := start.advice(stored, device):
         said.print(advice, highlight=False)
     of = trained(store, run, learnt, stored)
-    engine = start.engine(of, patience, live["touch"], live["drift"])
+    engine = start.engine(of, live.patience, live.touch, live.drift)
     if of.point is not None:
-        above = patience.above
+        above = live.patience.above
         said.print(of.point.sentence() if above is None else f"alarm above {above:g}", highlight=False)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
@@ -66,9 +65,9 @@ def _watch(config: DictConfig, live: dict[str, Any], patience: "Patience") -> No
         source = start.source(device)
         skin = open_.enter_context(source.skin)
         places, span = of.positions.numpy(), of.window / of.rate
-        board = Board(Facts(run.info.run_name, source.name, places, of.device.size, live["top"], span))
+        board = Board(Facts(run.info.run_name, source.name, places, of.device.size, live.top, span))
         if config.web:
-            said.print(f"page: {open_.enter_context(web.served(board, live['web_port']))}", highlight=False)
+            said.print(f"page: {open_.enter_context(web.served(board, live.web_port))}", highlight=False)
         session = Session(skin, source.tare, engine, board)
         open_.callback(lambda: said.print(f"{session.verdicts} verdicts, {session.line}", highlight=False))
         open_.enter_context(terminal.shown(board, Console()))

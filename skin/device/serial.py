@@ -23,7 +23,7 @@ from skin.wire.conversion import Newtons, newtons
 from skin.wire.detect import Format
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.listener import Tap
-from skin.wire.open import open_skin
+from skin.wire.open import Settings, open_skin
 from skin.wire.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare, settle
@@ -93,6 +93,10 @@ class Serial(AbstractDevice):
             raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
         if self.labels == "none" and self.stream:
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
+        names = "baudrate", "format", "timeout", "backoff", "silence"
+        self._settings: dict[str, Any] = {name: getattr(self, name) for name in names}
+        self._settings["limits"] = None if self.limits is None else tuple(self.limits)
+        Settings(**self._settings)  # refuses what cannot be used
         self.rate = 10.0 if self.rate is None else float(self.rate)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
@@ -127,10 +131,7 @@ class Serial(AbstractDevice):
                 "device=serial needs a port: add device.port=/dev/ttyACM0; skin emulate makes one"
             )
         tap = Tap(partial(open_wire, self.port, self.baudrate))
-        names = "format", "timeout", "backoff", "silence"
-        settings: dict[str, Any] = {name: getattr(self, name) for name in names}
-        settings["limits"] = None if self.limits is None else tuple(self.limits)
-        return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **settings), tap
+        return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **self._settings), tap
 
     def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
         """Read the beginning: is the device fast enough, and what does it say untouched?

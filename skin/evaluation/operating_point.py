@@ -131,7 +131,10 @@ def read(text: str) -> OperatingPoint | None:
 
 
 def check(settings: Evaluation) -> None:
-    """Raise InputError where no threshold can be chosen as asked."""
+    """Raise InputError where no run can be evaluated, or no threshold chosen, as asked."""
+    for name, least in (("devices", 0), ("layouts", 0), ("gestures", 1)):
+        if getattr(settings, name) < least:
+            raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {least}")
     if not 0 < settings.false_alarm_rate < 1:
         raise InputError(
             f"a false-alarm rate is between 0 and 1, got {settings.false_alarm_rate:g}: "

@@ -2,10 +2,11 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt
 from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostingRegressor
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -42,7 +43,11 @@ class Features(AbstractLearner):
     """
 
     def __init__(
-        self, rounds: int = 500, learning_rate: float = 0.1, patience: int = 30, seed: int = 0
+        self,
+        rounds: Annotated[int, Ge(1)] = 500,
+        learning_rate: Annotated[float, Gt(0)] = 0.1,
+        patience: Annotated[int, Ge(1)] = 30,
+        seed: int = 0,
     ) -> None:
         self._settings = {
             "max_iter": rounds,

@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.refusal import sentence
 from skin.representation.base import Frames
 
 if TYPE_CHECKING:
+    from pytorch_lightning import Callback, Trainer
     from pytorch_lightning.loggers import Logger
 
     from skin.classifier import MakeOptimizer, TouchClassifier
@@ -63,9 +66,17 @@ class Network(AbstractLearner):
         self._classifier: TouchClassifier | None = None
 
     def check(self, data: "TouchData") -> None:
-        """Build the network for nothing: choices that do not fit, or missing weights, show at once."""
+        """Build network, optimizer and trainer for nothing: what does not fit shows at once."""
         with torch.random.fork_rng():
-            self.build(data)
+            network = self.build(data)
+        self._trainer_of(None, [])
+        settings = self._optimizer.keywords if isinstance(self._optimizer, partial) else {}
+        if text := [name for name, value in settings.items() if isinstance(value, str)]:
+            raise InputError(f"optimizer.{text[0]}={settings[text[0]]} is text, and must be a number")
+        try:
+            self._optimizer(network.parameters())
+        except (TypeError, ValueError) as error:
+            raise InputError(f"the optimizer refuses its settings: {error}") from error
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train on the training split; validation chooses the epoch.
@@ -73,7 +84,6 @@ class Network(AbstractLearner):
         Raises:
             InputError: the choices do not fit each other or the data.
         """
-        from pytorch_lightning import Trainer
         from pytorch_lightning.callbacks import ModelCheckpoint
 
         from skin.learner._clock import Clock
@@ -83,14 +93,7 @@ class Network(AbstractLearner):
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
-            settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
-            trainer = Trainer(
-                **settings,
-                logger=logger or False,
-                callbacks=[best, clock],
-                enable_model_summary=False,
-                default_root_dir=folder,
-            )
+            trainer = self._trainer_of(logger, [best, clock], folder)
             with warnings.catch_warnings():
                 # Lightning 2.6 asks torch 2.13 for a deprecated class
                 warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
@@ -98,6 +101,32 @@ class Network(AbstractLearner):
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
             classifier.load_state_dict(weights["state_dict"])
         self.seconds_per_epoch = median(clock.seconds)
+
+    def _trainer_of(
+        self, logger: "Logger | None", callbacks: "list[Callback]", folder: str | None = None
+    ) -> "Trainer":
+        """Return Lightning's trainer; callbacks and loggers of its settings join ours.
+
+        Raises:
+            InputError: settings that it does not take.
+        """
+        from pytorch_lightning import Trainer
+        from pytorch_lightning.utilities.exceptions import MisconfigurationException
+
+        settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
+        epochs, theirs = settings.get("max_epochs"), settings.pop("logger", None)
+        if not isinstance(epochs, int) or epochs < 1:
+            raise InputError(f"trainer.max_epochs={epochs} must be a whole number from 1 up")
+        loggers = [one for one in (logger, *(theirs if isinstance(theirs, list) else [theirs])) if one]
+        try:
+            return Trainer(
+                **settings | {"callbacks": [*callbacks, *(settings.get("callbacks") or [])]},
+                logger=loggers or False,
+                enable_model_summary=False,
+                default_root_dir=folder,
+            )
+        except (TypeError, ValueError, MisconfigurationException) as error:
+            raise InputError(f"pytorch_lightning.Trainer refuses trainer: {sentence(error)}") from error
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model takes."""

@@ -73,8 +73,10 @@ class Settings:
         for name in ("baudrate", "timeout", "queue"):
             if not 0 < getattr(self, name) < inf:
                 raise InputError(f"device.{name} must be above 0, got {getattr(self, name)}")
-        if self.limits is not None and len(self.limits) != 2:
-            raise InputError(f"device.limits must be [smallest, largest], got {list(self.limits)}")
+        if self.limits is not None:
+            known = [limit for limit in self.limits if limit is not None]
+            if len(self.limits) != 2 or sorted(set(known)) != known:
+                raise InputError(f"device.limits must be [smallest, largest], got {list(self.limits)}")
         if len(self.backoff) != 2 or not 0 < self.backoff[0] <= self.backoff[1] < inf:
             raise InputError(f"device.backoff must be [first, longest] in s, got {list(self.backoff)}")
         if self.silence is not None and not 0 <= self.silence < inf:

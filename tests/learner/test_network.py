@@ -102,3 +102,16 @@ def test_probabilities_are_the_dense_layers_on_the_embedding(configured, made_up
     with torch.inference_mode():
         expected = classifier.head(found).sigmoid()
     assert torch.allclose(learner.probabilities(touches), expected, atol=1e-6)
+
+
+def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_device, tmp_path):
+    stop = "{_target_: pytorch_lightning.callbacks.EarlyStopping, monitor: val_loss, stopping_threshold: 100}"
+    log = f"{{_target_: pytorch_lightning.loggers.CSVLogger, save_dir: {tmp_path}, name: theirs}}"
+    config = configured(
+        "representation=readings", "model=mlp", f"+trainer.callbacks=[{stop}]", f"+trainer.logger={log}"
+    )
+    data = TouchData(made_up_device, instantiate(config.representation))
+    build_learner(config).fit(data, CSVLogger(tmp_path, name="ours"))
+    for name in ("ours", "theirs"):
+        lines = next((tmp_path / name).rglob("metrics.csv")).read_text().splitlines()
+        assert len(lines) == 3  # validation and training of the first epoch, in which it stops

@@ -8,27 +8,37 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import torch
-from mlflow.entities import Run
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
+from rich.console import Console
 
 from skin.balance import announce
 from skin.build import build_data, build_device, build_learner
-from skin.config import fingerprint, plain
+from skin.config import fingerprint, overrides, plain
 from skin.console import quiet
 from skin.evaluation.operating_point import check, choose
 from skin.evaluation.report import Report, evaluate
 from skin.evaluation.show import report as show
+from skin.evaluation.show import table
 from skin.labels import Task
 from skin.plot.figures import confusions, save
 from skin.recording import Touches, digest
 from skin.reload import TAG
 from skin.tracking import Store
 
-__all__ = ["PARENT", "conclude", "describe", "tags", "train"]
+__all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "tags", "train"]
 
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
+
+SWEPT = "SKIN_SWEPT"
+"""Environment variable by which a sweep tells its jobs which settings it sweeps."""
+
+_STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
+_NAMED = ("experiment", "row", "seed", "simulator")  # a run's name has them in any case
 
 
 class _OpenLogger(MLFlowLogger):
@@ -55,13 +65,14 @@ def train(config: DictConfig) -> bool:
     if finished:
         if PARENT not in os.environ:
             print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
+            Console().print(table(finished[0].data.metrics, finished[0].info.run_name))
         return False
     check(config.evaluation)
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
     announce(device, shown=PARENT not in os.environ)
-    name = f"{config.row} {identity['simulator']} {config.seed}"
+    name = " ".join([config.row, identity["simulator"], *_differences(), f"seed {config.seed}"])
     with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         describe(store, run.info.run_id, config, data.touches("train"))
@@ -113,8 +124,25 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
         }
     else:
         choices.pop("simulator", None)
-    for name, value in (choices | scalars).items():
-        store.client.log_param(run, name, value)
+    params = changed() | choices | scalars
+    store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
+
+
+def _differences() -> list[str]:
+    """Return what tells this run from others with its row, simulator and seed: in a sweep, what is swept."""
+    found = {key: value for key, value in changed().items() if key not in _NAMED}
+    if SWEPT in os.environ:
+        found = {key: value for key, value in found.items() if key in os.environ[SWEPT].split()}
+    return [f"{key.split('.')[-1]}={value}" for key, value in found.items()]
+
+
+def changed() -> dict[str, str]:
+    """Return the overrides of the running command that a result may depend on; none outside of a command."""
+    if not HydraConfig.initialized():
+        return {}
+    parsed = OverridesParser.create().parse_overrides(overrides())
+    found = {one.key_or_group: one.get_value_element_as_str() for one in parsed if not one.is_delete()}
+    return {key: value for key, value in found.items() if not key.startswith(_STEERING)}
 
 
 def conclude(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:

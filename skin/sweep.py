@@ -97,10 +97,16 @@ class Sweep(Callback):
             # What no job could accept is refused once, before any of them; Hydra lets only exits pass here.
             print(refused, file=sys.stderr)
             sys.exit(2)
+
+        from skin.run import SWEPT
+
         _share_cores(config.hydra.launcher)
         atexit.register(self._close)
         # Swept or not, Hydra lists only what belongs to jobs here.
         self._jobs = jobs(list(config.hydra.overrides.task), config.hydra.sweeper.params or {})
+        os.environ[SWEPT] = " ".join(
+            key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1
+        )
         self._progress = Progress([_seconds(store, job) for job in self._jobs])
 
     def _open(self, config: DictConfig) -> "Store":

@@ -78,14 +78,37 @@ def runs(folder):
 def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
     with begin(tmp_path, *sweep(tmp_path, "seed=0,1,2")) as first:
         next(line for line in first.lines() if line.startswith("[2/3]"))
-    assert [one[:2] for one in runs(tmp_path)][:2] == [("sweep", "RUNNING"), ("rules naive 0", "FINISHED")]
+    assert [one[:2] for one in runs(tmp_path)][:2] == [
+        ("sweep", "RUNNING"),
+        ("rules naive seed 0", "FINISHED"),
+    ]
     again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
     assert again.returncode == 0, again.stderr
     assert [line for line in again.stdout.splitlines() if "finished before" in line] == [
         line for line in again.stdout.splitlines() if line.startswith("[1/3]") and "…" not in line
     ]
     finished = [name for name, status, parent in runs(tmp_path) if status == "FINISHED" and parent]
-    assert finished == ["rules naive 0", "rules naive 1", "rules naive 2"]
+    assert finished == ["rules naive seed 0", "rules naive seed 1", "rules naive seed 2"]
+
+
+@pytest.mark.slow
+def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_its_scores(run, tmp_path):
+    given = ["train", *SMALL, "device.offset=0.2", "layout=grid"]
+    first = run(tmp_path, *given)
+    assert first.returncode == 0, first.stderr
+    with sqlite3.connect(tmp_path / "m.db") as database:
+        (name,) = database.execute("select name from runs").fetchone()
+        params = dict(database.execute("select key, value from params"))
+    database.close()
+    assert name.startswith("rules naive ")
+    assert name.endswith(" offset=0.2 layout=grid seed 0")
+    assert (params["device.offset"], params["layout"], params["seed"]) == ("0.2", "grid", "0")
+    again = run(tmp_path, *given)
+    assert again.returncode == 0, again.stderr
+    assert "did this before" in again.stdout
+    rows = [line for line in first.stdout.splitlines() if line.startswith("│")]
+    assert rows == [line for line in again.stdout.splitlines() if line.startswith("│")]
+    assert rows
 
 
 @pytest.mark.slow
@@ -93,8 +116,7 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path):
     done = run(tmp_path, *sweep(tmp_path, "device.offset=-1,0.1"), store=False)
     assert done.returncode == 1
     assert "offset" in done.stderr
-    states = [status for name, status, parent in runs(tmp_path) if parent]
-    assert states == ["FINISHED"]
+    assert [one[:2] for one in runs(tmp_path) if one[2]] == [("rules naive offset=0.1 seed 0", "FINISHED")]
     assert [status for name, status, parent in runs(tmp_path) if not parent] == ["FAILED"]
 
 

@@ -1,5 +1,6 @@
 """Print an evaluation as a table."""
 
+from collections.abc import Mapping
 from math import isnan
 
 from rich.console import Console
@@ -7,7 +8,7 @@ from rich.table import Table
 
 from skin.evaluation.report import SHARES, Report
 
-__all__ = ["number", "report"]
+__all__ = ["number", "report", "table"]
 
 
 def report(found: Report, title: str, console: Console | None = None) -> None:
@@ -19,21 +20,24 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
         console: where to print; None takes standard output.
     """
     console = console or Console()
-    columns = list(dict.fromkeys(name.split("/")[0] for name in found.metrics))
-    lines = dict.fromkeys(
-        name.split("/", 1)[1] for name in found.metrics if name.endswith((*SHARES, "/degrees"))
-    )
-    table = Table("", *columns, title=title)
-    for line in lines:
-        values = (found.metrics.get(f"{column}/{line}") for column in columns)
-        unit = 1 if line.endswith("/degrees") else 100
-        table.add_row(line, *(number(value, unit) for value in values))
-    console.print(table)
+    console.print(table(found.metrics, title))
     if found.point is not None and found.reached is not None:
         said = f"{found.point.sentence()}; {found.reached.sentence()}"
         console.print(said, markup=False, highlight=False, soft_wrap=True)
     for column, reason in found.cannot.items():
         console.print(f"{column}: {reason}", markup=False)
+
+
+def table(metrics: Mapping[str, float], title: str) -> Table:
+    """Return the table of metrics such as ``same/overall/accuracy``; others are left out."""
+    shown = [name for name in metrics if name.endswith((*SHARES, "/degrees"))]
+    columns = list(dict.fromkeys(name.split("/")[0] for name in shown))
+    made = Table("", *columns, title=title)
+    for line in dict.fromkeys(name.split("/", 1)[1] for name in shown):
+        values = (metrics.get(f"{column}/{line}") for column in columns)
+        unit = 1 if line.endswith("/degrees") else 100
+        made.add_row(line, *(number(value, unit) for value in values))
+    return made
 
 
 def number(value: float | None, unit: float = 100) -> str:

@@ -29,6 +29,7 @@ _LIBRARIES = {
     "torch_geometric.nn": (
         ("torch_geometric.nn.aggr", "Aggregation"),
         ("torch_geometric.nn.conv", "MessagePassing"),
+        ("torch_geometric.nn.models.basic_gnn", "BasicGNN"),
     ),
 }
 _BASES = {"skin": tuple((f"skin.{group}.base", f"Abstract{group.capitalize()}") for group in GROUPS)}
@@ -39,8 +40,8 @@ def vet(config: Any, where: str) -> None:
     """Check that a stored configuration builds nothing but parts of this package and of its libraries.
 
     Allowed are subclasses of a group's base class that ``skin`` defines, optimizers of ``torch.optim``, and
-    aggregations and convolutions of ``torch_geometric.nn``. Names are resolved, so that
-    ``skin.config.sys.exit`` is not taken for a part of ``skin``.
+    aggregations, convolutions and networks (``BasicGNN``) of ``torch_geometric.nn``. Names are resolved, so
+    that ``skin.config.sys.exit`` is not taken for a part of ``skin``.
 
     Args:
         config: plain containers.

@@ -12,6 +12,12 @@ from skin.errors import InputError
 from skin.representation.graph import Graph
 
 OPTIONS = sorted((Path(__file__).parents[2] / "conf" / "model").glob("*.yaml"))
+NETWORKS = {
+    "GCN": {},
+    "GIN": {},
+    "GAT": {"heads": 4, "v2": True},
+    "PNA": {"aggregators": ["mean", "max", "std"], "scalers": ["identity", "amplification"]},
+}
 CHANGES = {
     "gcn": [
         {"pooling": "max", "norm": "batch", "activation": "relu"},
@@ -21,6 +27,10 @@ CHANGES = {
     ],
     "cnn": [{"channels": [4], "embedding": None}, {"repeat": 3}],
     "transformer": [{"pooling": "max", "layers": 1, "heads": 1}],
+    "pyg": [
+        {"network": {"_target_": f"torch_geometric.nn.models.{name}"} | extra}
+        for name, extra in NETWORKS.items()
+    ],
     "mlp": [{"widths": [5], "activation": "silu"}],
 }
 # Biases, kept because the original has them: a softmax takes the first away, a norm behind them the others.

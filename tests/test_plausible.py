@@ -39,7 +39,7 @@ SMALL = ("body.size=[0.08,0.08]", "body.cells=[4,4]", "layout=grid", "layout.row
             "layout.depth=5",
             r"depth = 5 m, on a surface of 0.16 x 0.16 m, 0.015 m thick: positions are in metres",
         ),
-        ("layout.depth=deep", r"layout.depth must be a length in m or null, got 'deep'"),
+        ("layout.depth=deep", r"layout.depth=deep must be a valid number"),
     ],
 )
 def test_a_value_off_by_a_unit_is_refused_with_the_range(configured, override, message):

@@ -9,7 +9,7 @@ import pytest
 from skin.config import ROOT
 
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-WRITTEN = re.compile(r"^[\w./-]*(?:python )?(?:experiments/)?\w+\.py .*?\b(?:out|link|session)=(\S+)", re.M)
+WRITTEN = re.compile(r"^(?:skin \w+|python (?:experiments/)?\w+\.py) .*?\b(?:out|link|session)=(\S+)", re.M)
 
 
 def files():

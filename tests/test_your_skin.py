@@ -110,4 +110,7 @@ def test_the_training_of_the_page_runs(home, run, monkeypatch):
     with sqlite3.connect(home / "m.db") as database:
         states = database.execute("select name, status from runs order by start_time").fetchall()
     database.close()
-    assert states == [("custom solid 0", "FINISHED"), ("margins of custom solid 0", "FINISHED")]
+    assert [state for _, state in states] == ["FINISHED", "FINISHED"]
+    name = states[0][0]
+    assert name.startswith("custom solid body=mine ")
+    assert states[1][0] == f"margins of {name}"

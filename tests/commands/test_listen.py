@@ -60,7 +60,10 @@ def test_it_says_what_comes(address):
     [
         ([], "which port? add device.port="),
         (["device.port=/dev/ttyACM77"], "no port /dev/ttyACM77"),
-        (["device.port=/dev/ttyACM77", "device.format=xml"], "device.format must be one of"),
+        (
+            ["device.port=/dev/ttyACM77", "device.format=xml"],
+            "device.format=xml must be 'auto', 'text' or 'binary'",
+        ),
     ],
 )
 def test_what_cannot_be_listened_to_ends_with_code_2_and_a_sentence(arguments, said):

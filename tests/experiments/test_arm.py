@@ -23,7 +23,7 @@ SOLID = (
 @pytest.mark.slow
 def test_generated_touches_train_and_are_evaluated(run, tmp_path):
     arm = "body=arm", "body.angle=2.5", "layout=grid"
-    made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet")
+    made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet", store=False)
     assert made.returncode == 0, made.stderr
     assert read(tmp_path / "arm.parquet").size == pytest.approx((0.125, 0.16))
     recording = *arm, "device=recording", "device.path=arm.parquet"

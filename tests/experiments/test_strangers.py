@@ -107,8 +107,8 @@ CASES = {
     "a name made by interpolation": (None, lambda bait, marker: {
         "row": "os.mkdir", "body": {"_target_": "${row}", "_args_": [str(marker)]}}),
     "a method of a class": (None, lambda bait, marker: {
-        "body": {"_target_": "skin.config.Path.touch", "_args_": [
-            {"_target_": "skin.config.Path", "_args_": [str(marker)]}]}}),
+        "body": {"_target_": "skin.files.Path.touch", "_args_": [
+            {"_target_": "skin.files.Path", "_args_": [str(marker)]}]}}),
 }  # fmt: skip
 
 

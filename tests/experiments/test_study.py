@@ -96,7 +96,7 @@ def test_what_is_missing_is_trained_and_what_failed_is_told(run, folder):
     assert "SMOKE" in done.stdout
     assert "SMOKE" in next((folder / "r").glob("study_*.md")).read_text()
     assert [line.count("| failed |") for line in table(folder, "transformer")] == [0, 1, 1]
-    assert done.stderr.count("failed: unknown pooling 'attention'") == 2
+    assert done.stderr.count("failed: model.pooling=attention must be 'mean' or 'max'") == 2
 
 
 def table(folder, name):

@@ -57,12 +57,10 @@ def test_settings_that_do_not_fit_are_refused(configured, made_up_device, overri
         build_learner(config).check(build_data(config, made_up_device))
 
 
-@pytest.mark.parametrize("name", ["GCN", "GIN", "GAT", "GraphSAGE"])
-def test_it_trains(configured, made_up_device, name):
+def test_it_trains(configured, made_up_device):
     config = configured(
         "representation=graph",
         "model=pyg",
-        f"model.network._target_=torch_geometric.nn.models.{name}",
         "fusion.head=conv",
         "trainer.max_epochs=12",
         "optimizer.lr=0.01",

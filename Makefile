@@ -64,6 +64,7 @@ peers: $(READY) $(PEERS)/.ready  ## LightGBM and aeon's ROCKETs on the same touc
 	$(BIN)/python experiments/peers.py --seeds $(SEEDS)
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
+	@echo "runs: http://127.0.0.1:5000/#/experiments"
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 

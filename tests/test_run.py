@@ -1,9 +1,11 @@
 """A run counts as finished only with all its results."""
 
+import re
+
 import pytest
 
 import skin.run
-from skin.config import checked
+from skin.config import ROOT, checked
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -49,3 +51,9 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
     assert run.data.metrics["parameters"] == 196
     assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
     assert skin.run.train(config) is False
+    page = (ROOT / "docs" / "mlflow.md").read_text()
+    for name in run.data.metrics:
+        # train_accuracy_press is told of as train_accuracy
+        parts = name.split("/") if f"`{name}`" not in page else [name]
+        parts = [re.sub("(_accuracy)_[a-z]+$", r"\1", part) for part in parts]
+        assert all(f"`{part}`" in page for part in parts), name

@@ -83,6 +83,7 @@ class Sweep(Callback):
         self._parent = ""
         self._failed = 0
         self._jobs: list[dict[str, str]] = []
+        self._swept: list[str] = []
         self._progress = Progress([])
         self._began = 0.0
 
@@ -104,9 +105,8 @@ class Sweep(Callback):
         atexit.register(self._close)
         # Swept or not, Hydra lists only what belongs to jobs here.
         self._jobs = jobs(list(config.hydra.overrides.task), config.hydra.sweeper.params or {})
-        os.environ[SWEPT] = " ".join(
-            key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1
-        )
+        self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
+        os.environ[SWEPT] = " ".join(self._swept)
         self._progress = Progress([_seconds(store, job) for job in self._jobs])
 
     def _open(self, config: DictConfig) -> "Store":
@@ -159,7 +159,8 @@ class Sweep(Callback):
 
     def _label(self, config: DictConfig) -> str:
         number = int(config.hydra.job.num)
-        chosen = " ".join(f"{key}={value}" for key, value in self._jobs[number].items())
+        job = self._jobs[number]
+        chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
         return f"[{number + 1}/{len(self._jobs)}] {chosen}"
 
     def _rest(self) -> str:

@@ -1,6 +1,7 @@
 """Commands: functions of a configuration that Hydra composes from what the command line asks for."""
 
 from skin import interrupt  # isort: skip
+import os
 import signal
 import sys
 import warnings
@@ -58,6 +59,9 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             given = [word.replace("=~/", f"={Path.home()}/", 1) for word in typed]
             warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
             version.setbase(_VERSION)
+            # Hydra then raises what it would print in several lines.
+            whole = os.environ.get("HYDRA_FULL_ERROR", "")
+            os.environ["HYDRA_FULL_ERROR"] = "1"
             parser = get_args_parser()
             asked = parser.parse_args(given)
             try:
@@ -67,11 +71,15 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                     print(_help(sys.modules[task.__module__].__doc__ or "", asked.config_name or name, asked))
                     return
                 _run_hydra(asked, parser, job, str(CONF), name)
-            except SystemExit as stop:
-                # Hydra ends with 1 where the configuration could not be composed.
-                if stop.code == 1 and not started:
-                    sys.exit(2)
-                raise
+            except Exception as error:
+                refused = refusal(error)
+                if refused is None or whole:
+                    raise
+                print(refused, file=sys.stderr)
+                sys.exit(1 if started else 2)
+            finally:
+                if not whole:
+                    del os.environ["HYDRA_FULL_ERROR"]
 
         return main
 

@@ -5,7 +5,7 @@ import os
 import sqlite3
 from collections.abc import Iterator
 
-from hydra.errors import CompactHydraException, HydraException, InstantiationException
+from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.errors import InputError
@@ -50,6 +50,8 @@ def refusal(error: Exception) -> InputError | None:
             )
     if not isinstance(error, HydraException | OmegaConfBaseException | TypeError):
         return None
+    if isinstance(error, OverrideParseException):
+        return InputError(f"{error.override} is no override: {sentence(error)}")
     cause = error.__cause__ if isinstance(error, InstantiationException) else None
     if isinstance(cause, InputError):
         return cause
@@ -71,6 +73,8 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 def sentence(error: BaseException) -> str:
     """Return what an error says, on one line; OmegaConf adds lines about its own objects."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    told = str(error).split("Config search path:")[0]
+    lines = [line.strip() for line in told.splitlines() if line.strip()]
     kept = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
-    return "; ".join(kept)
+    ends = [" " if line.endswith((".", ":", ",")) else "; " for line in kept[:-1]] + [""]
+    return "".join(line + end for line, end in zip(kept, ends, strict=True))

@@ -56,3 +56,20 @@ def test_the_scripts_of_before_still_run(run, tmp_path, name):
     assert done.returncode == 2
     assert "typo" in done.stderr
     assert (f"is now: skin {name}" in done.stderr) == (name in MOVED)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("learner.rounds=20", "Could not override 'learner.rounds'."),
+        ("model=cn", "Could not find 'model/cn'"),
+        ("seed=[", "seed=["),
+    ],
+)
+def test_what_cannot_be_composed_is_one_sentence(override, said, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["train", override])
+    assert stop.value.code == 2
+    text = capsys.readouterr().err
+    assert said in text
+    assert text.count("\n") == 1

@@ -67,10 +67,10 @@ def test_a_run_is_loaded_and_predicts_a_recording(run, tmp_path):
         skin.load_run("none", f"sqlite:///{tmp_path}/m.db")
 
 
-def test_the_example_of_the_readme_runs(tmp_path):
+def test_the_example_of_the_readme_runs():
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
+    made = {}
+    exec(code, made)
+    assert made["readings"].shape == (20,)
+    assert made["pressure"].grad.abs().max() > 0

@@ -65,7 +65,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=3, help="runs per variant: seeds 0, 1, ...")
     parser.add_argument("--smoke", action="store_true", help="little data, one epoch: ignore the scores")
     parser.add_argument("--out", type=Path, help="folder of the results; default: results/")
-    parser.add_argument("--config-dir", type=Path, help="folder of configuration of your own, as of train.py")
+    parser.add_argument("--config-dir", type=Path, help="folder of your own configuration, as of skin train")
     arguments = parser.parse_intermixed_args()
     if arguments.seeds < 1:
         parser.error(f"{arguments.seeds} is no number of seeds: give --seeds 1 or more")

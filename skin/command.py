@@ -19,7 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from skin.config import CONF, checked
-from skin.refusal import Refused, refusal, sentence
+from skin.refusal import Refused, refusal
 
 __all__ = ["command", "interrupt"]
 
@@ -54,55 +54,53 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                 sys.exit(2)
 
         def main(words: Sequence[str] | None = None) -> None:
-            # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
-            typed = sys.argv[1:] if words is None else words
-            given = [word.replace("=~/", f"={Path.home()}/", 1) for word in typed]
-            warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
-            version.setbase(_VERSION)
-            # Hydra then raises what it would print in several lines.
-            whole = os.environ.get("HYDRA_FULL_ERROR", "")
-            os.environ["HYDRA_FULL_ERROR"] = "1"
-            parser = get_args_parser()
-            asked = parser.parse_args(given)
+            about = sys.modules[task.__module__].__doc__ or ""
             try:
-                if asked.help:
-                    if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
-                        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-                    print(_help(sys.modules[task.__module__].__doc__ or "", asked.config_name or name, asked))
-                    return
-                _run_hydra(asked, parser, job, str(CONF), name)
+                _run(job, name, about, sys.argv[1:] if words is None else words)
             except Exception as error:
                 refused = refusal(error)
-                if refused is None or whole:
+                if refused is None or "HYDRA_FULL_ERROR" in os.environ:
                     raise
                 print(refused, file=sys.stderr)
                 sys.exit(1 if started else 2)
-            finally:
-                if not whole:
-                    del os.environ["HYDRA_FULL_ERROR"]
 
         return main
 
     return decorate
 
 
+def _run(job: Callable[[DictConfig], Any], name: str, about: str, words: Sequence[str]) -> None:
+    """Compose a configuration and run a job with it, or print what the words ask for instead."""
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    version.setbase(_VERSION)
+    parser = get_args_parser()
+    # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
+    asked = parser.parse_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
+    if asked.help:
+        if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
+            signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        print(_help(about, asked.config_name or name, asked))
+        return
+    given = os.environ.get("HYDRA_FULL_ERROR")
+    # Hydra then raises what it would print in several lines.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        _run_hydra(asked, parser, job, str(CONF), name)
+    finally:
+        if given is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+
+
 def _help(about: str, name: str, asked: Any) -> str:
     """Return what a command does, the options of its groups, and its settings with their comments."""
     folders = [CONF, *([Path(asked.config_dir).resolve()] if asked.config_dir else [])]
     words = [*asked.overrides, f"hydra.searchpath=[{','.join(map(str, folders[1:]))}]"]
-    try:
-        with initialize_config_dir(str(CONF), version_base=_VERSION):
-            config = compose(name, words, return_hydra_config=True)
-            loader = GlobalHydra.instance().config_loader()
-            chosen = {
-                group: option
-                for group, option in config.hydra.runtime.choices.items()
-                if not group.startswith("hydra/")
-            }
-            options = {group: loader.get_group_options(group) for group in chosen}
-    except Exception as error:
-        print(sentence(error), file=sys.stderr)
-        sys.exit(2)
+    with initialize_config_dir(str(CONF), version_base=_VERSION):
+        config = compose(name, words, return_hydra_config=True)
+        loader = GlobalHydra.instance().config_loader()
+        choices = config.hydra.runtime.choices.items()
+        chosen = {group: option for group, option in choices if not group.startswith("hydra/")}
+        options = {group: loader.get_group_options(group) for group in chosen}
     width = max(map(len, chosen), default=0)
     lines = [
         f"  {group:{width}}  {', '.join(f'[{one}]' if one == chosen[group] else one for one in known)}"

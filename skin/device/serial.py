@@ -33,6 +33,7 @@ from skin.wire.transport import open_wire
 __all__ = ["Serial"]
 
 _LABELS = ("announced", "prompted", "none")
+_AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
 
 
 @dataclass(kw_only=True, eq=False)
@@ -93,8 +94,7 @@ class Serial(AbstractDevice):
             raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
         if self.labels == "none" and self.stream:
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
-        names = "baudrate", "format", "timeout", "backoff", "silence"
-        self._settings: dict[str, Any] = {name: getattr(self, name) for name in names}
+        self._settings: dict[str, Any] = {name: getattr(self, name) for name in _AS_OPENED}
         self._settings["limits"] = None if self.limits is None else tuple(self.limits)
         Settings(**self._settings)  # refuses what cannot be used
         self.rate = 10.0 if self.rate is None else float(self.rate)

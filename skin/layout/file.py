@@ -33,7 +33,7 @@ class File(AbstractLayout):
     columns are ignored.
 
     Args:
-        path: the file; a relative path is looked for in the working directory, then in the repository.
+        path: the file; a relative path is looked for in the current folder, then beside the package.
         footprint: extent (x, y) over which a sensor feels, m.
         depth: of all sensors, m, where the file has no ``depth_m``; None: ``body.sensor_depth``.
 

@@ -19,7 +19,7 @@ def find(weights: str) -> Path:
     """Return the file that ``model.weights`` stands for.
 
     Args:
-        weights: a path, looked for in the working directory, then in the repository; or ``imagenet``:
+        weights: a path, looked for in the current folder, then beside the package; or ``imagenet``:
             torchvision's file of EfficientNet-B0 in ``hub/checkpoints`` of ``$TORCH_HOME``, where torchvision
             itself would keep it.
 

@@ -140,7 +140,7 @@ def read(path: str | Path) -> Calibration:
     """Read a file that :func:`write` or a person wrote; a single number stands for every sensor.
 
     Args:
-        path: a relative one is looked for in the working directory, then in the repository.
+        path: a relative one is looked for in the current folder, then beside the package.
 
     Raises:
         InputError: no such file, unreadable, or contents that cannot be used.

@@ -23,7 +23,7 @@ def load(name: str) -> np.ndarray:
 
     Args:
         name: the stem of a file in ``data/shapes``, or the path of any picture; a relative path is looked
-            for in the working directory, then in the repository.
+            for in the current folder, then beside the package.
 
     Raises:
         InputError: no such picture, unreadable, empty, black, or not finite.

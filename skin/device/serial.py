@@ -127,9 +127,7 @@ class Serial(AbstractDevice):
     def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
         """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
         if self.port is None:
-            raise InputError(
-                "device=serial needs a port: add device.port=/dev/ttyACM0; skin emulate makes one"
-            )
+            raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
         tap = Tap(partial(open_wire, self.port, self.baudrate))
         return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **self._settings), tap
 

@@ -54,9 +54,8 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                 sys.exit(2)
 
         def main(words: Sequence[str] | None = None) -> None:
-            about = sys.modules[task.__module__].__doc__ or ""
             try:
-                _run(job, name, about, sys.argv[1:] if words is None else words)
+                _run(job, name, sys.argv[1:] if words is None else words)
             except Exception as error:
                 refused = refusal(error)
                 if refused is None or "HYDRA_FULL_ERROR" in os.environ:
@@ -69,7 +68,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
     return decorate
 
 
-def _run(job: Callable[[DictConfig], Any], name: str, about: str, words: Sequence[str]) -> None:
+def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> None:
     """Compose a configuration and run a job with it, or print what the words ask for instead."""
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     version.setbase(_VERSION)
@@ -79,7 +78,7 @@ def _run(job: Callable[[DictConfig], Any], name: str, about: str, words: Sequenc
     if asked.help:
         if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-        print(_help(about, asked.config_name or name, asked))
+        print(_help(sys.modules[job.__module__].__doc__ or "", asked.config_name or name, asked))
         return
     given = os.environ.get("HYDRA_FULL_ERROR")
     # Hydra then raises what it would print in several lines.

@@ -6,15 +6,11 @@ python experiments/benchmarks/generation.py fem 3
 import json
 import sys
 import time
-from pathlib import Path
 from statistics import median
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
-from benchmarks.setting import configuration, peak_memory
+from experiments.benchmarks.setting import configuration, peak_memory
 from skin.build import build_device
 from skin.device.simulated import Simulated
 

@@ -6,17 +6,12 @@ python experiments/benchmarks/live.py 1000 --run latest  # what a run has learnt
 
 import argparse
 import json
-import sys
 import time
-from pathlib import Path
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 import torch
 
-from benchmarks.setting import configuration
+from experiments.benchmarks.setting import configuration
 from skin.build import build_data, build_device, build_learner
 from skin.device.simulated import Simulated
 from skin.hardware.live.engine import Detection, Engine

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 
-from benchmarks.setting import configuration, seconds
+from experiments.benchmarks.setting import configuration, seconds
 from skin.build import build_device
 from skin.device.simulated import Simulated
 from skin.simulator import _pynite

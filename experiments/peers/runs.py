@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from peers.exchange import ABOUT, Foreign, export
+from experiments.peers.exchange import ABOUT, Foreign, export
 from skin.balance import announce
 from skin.build import build_device
 from skin.config import fingerprint, plain

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from experiments.studies.table import Cell
 from skin.device.simulated import Simulated
 from skin.evaluation.metrics import confusion
 from skin.plot import figures
@@ -20,7 +21,6 @@ from skin.representation.interp import Interpolation
 from skin.simulator.naive import Naive
 from skin.touch.sampler import Movie
 from skin.tracking import Store
-from studies.table import Cell
 
 __all__ = ["draw_runs", "draw_skin"]
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from experiments.validation.finding import Finding, Law, Outcome, Picture
 from skin.files import whole, write
-from validation.finding import Finding, Law, Outcome, Picture
 
 __all__ = ["as_json", "draw", "page", "publish"]
 

@@ -9,6 +9,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from experiments.studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
+from experiments.studies.embedding.settings import Probing
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
@@ -16,8 +18,6 @@ from skin.layout.scattered import Scattered
 from skin.learner.network import Network
 from skin.recording import Touches
 from skin.representation.graph import adjacency, neighbours
-from studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
-from studies.embedding.settings import Probing
 
 __all__ = [
     "FRAME",

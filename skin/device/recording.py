@@ -12,6 +12,8 @@ from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
 from skin.rng import Stream, generator
 from skin.storage import read
+from skin.wire.open import open_skin
+from skin.wire.source import Source
 
 __all__ = ["Recorded"]
 
@@ -60,7 +62,7 @@ class Recorded(AbstractDevice):
         self.path, self.split_seed = path, split_seed
         self.sensors = layout.sensors(body)
         self._compare(body)
-        self.body, self.task, self.size = body, self._recording.task, body.size
+        self.surface, self.task, self.size = body, self._recording.task, body.size
         touches = self._recording.touches
         self.rate, self.window = touches.rate, touches.readings.shape[1]
 
@@ -89,7 +91,15 @@ class Recorded(AbstractDevice):
         """Return the touches of a split; a file has no fresh ones."""
         return self.recording(split, epoch).touches
 
-    def recording(self, split: Split | None = None, epoch: int = 0) -> Recording:
+    def all_touches(self) -> Touches:
+        """Return the touches of the whole file."""
+        return self._recording.touches
+
+    def source(self) -> Source:
+        """Open the file as a stream of frames, in real time."""
+        return Source.of_newtons(self.path, open_skin(self.path, self.sensors), len(self.sensors))
+
+    def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return all that the file holds of a split; None takes the whole file."""
         if split is None or (split == "test" and self._test == "all"):
             return self._recording

@@ -15,7 +15,7 @@ from skin.contact.prescribed import Prescribed
 from skin.device._threads import in_threads
 from skin.device._tracking import tracker
 from skin.device._truth import true_model, true_readings, true_sensors
-from skin.device.base import AbstractDevice, Split
+from skin.device.base import AbstractSimulated, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
@@ -28,6 +28,8 @@ from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import TouchSampler, balanced
 from skin.touch.stream import Strip, draw_timeline, touched
+from skin.wire.open import open_skin
+from skin.wire.source import Source
 
 __all__ = ["Simulated"]
 
@@ -35,7 +37,7 @@ _BATCH = 1024
 
 
 @dataclass(kw_only=True, eq=False)
-class Simulated(AbstractDevice):
+class Simulated(AbstractSimulated):
     """Yields gestures sampled from seeds alone, as a device with imperfections feels them.
 
     Training, validation and holdout are 80/10/10 of one budget of gestures; test gestures come from a stream
@@ -145,6 +147,10 @@ class Simulated(AbstractDevice):
         """
         recording = self._split(split, epoch, complete)
         return replace(recording, metadata=self._metadata(recording, split, epoch))
+
+    def source(self) -> Source:
+        """Open a stream of test gestures, in real time."""
+        return Source.of_newtons("simulator", open_skin("simulated", device=self), len(self.sensors))
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
         if split == "test":

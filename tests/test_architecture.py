@@ -9,7 +9,7 @@ from skin.config import ROOT
 
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
-errors interrupt paths
+errors interrupt paths option
 refusal identity labels rng material model lag sensors trust
 config recording body
 command

@@ -18,6 +18,7 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.evaluation.report import evaluate
     from skin.evaluation.show import report
+    from skin.option import option
     from skin.plot.evaluation_page import publish, verdicts
     from skin.reload import changed, configuration, find, operating_point, restore
     from skin.run import conclude
@@ -37,7 +38,7 @@ def main(config: DictConfig) -> None:
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         # Every evaluation keeps its files.
-        name = f"evaluation_{config.device['_target_'].split('.')[-2]}_{evaluation.info.run_id[:8]}"
+        name = f"evaluation_{option(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
             chances = learner.probabilities(touches)
             said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")

@@ -176,7 +176,7 @@ class AbstractSimulated(AbstractDevice):
 
         Args:
             frames: its length.
-            gap: [least, most] idle frames between two touches; None: as the sampler's settings say.
+            gap: [least, most] idle frames between two touches; None: as ``touch.gap``.
             number: of the stream: another number, other gestures.
         """
 

@@ -3,14 +3,13 @@
 from typing import Literal
 
 import numpy as np
-import torch
 
 from skin.body.base import AbstractBody
+from skin.device._split import rows
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.rng import Stream, generator
 from skin.storage import read
 from skin.wire.open import open_skin
 from skin.wire.source import Source
@@ -103,9 +102,5 @@ class Recorded(AbstractDevice):
         """Return all that the file holds of a split; None takes the whole file."""
         if split is None or (split == "test" and self._test == "all"):
             return self._recording
-        count = len(self._recording)
-        training = round(0.8 * count)
-        middle = training + (count - training) // 2
-        bounds = {"train": (0, training), "validation": (training, middle)}
-        order = generator(Stream.SPLIT, self.split_seed).permutation(count)
-        return self._recording[torch.from_numpy(order[slice(*bounds.get(split, (middle, None)))])]
+        part: Split = "holdout" if split == "test" else split
+        return self._recording[rows(part, len(self._recording), self.split_seed)]

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.device._truth import true_sensors
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.layout.grid import Grid
@@ -80,10 +79,10 @@ def test_conditions_are_paired_by_seed(device):
     for other in (near, far, varied):
         assert torch.equal(other.constants.gain, plain.constants.gain)
         assert other.test_gestures == 12
-    np.testing.assert_array_equal(true_sensors(plain).positions, device.sensors.positions)
-    moved = [true_sensors(other).positions - device.sensors.positions for other in (near, far)]
+    np.testing.assert_array_equal(plain.true_sensors.positions, device.sensors.positions)
+    moved = [other.true_sensors.positions - device.sensors.positions for other in (near, far)]
     np.testing.assert_allclose(moved[1], 2.5 * moved[0], atol=1e-12)
-    np.testing.assert_array_equal(true_sensors(varied).positions, device.sensors.positions)
+    np.testing.assert_array_equal(varied.true_sensors.positions, device.sensors.positions)
     assert (varied.body.variation, varied.body.variation_seed) == (0.2, 2)
     assert plain.body.variation == 0
 

@@ -11,8 +11,6 @@ from peers.exchange import ABOUT, Foreign, export
 from skin.balance import announce
 from skin.build import build_device
 from skin.config import fingerprint, plain
-from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.evaluation.operating_point import choose
 from skin.evaluation.report import evaluate
 from skin.run import conclude, describe, tags
@@ -39,11 +37,12 @@ def learn(
         InputError: the device has no unseen devices and layouts: it is not simulated.
         subprocess.CalledProcessError: the peer failed.
     """
-    device, source = build_device(config), _source(config)
+    device, source = (
+        build_device(config).simulated("peers are compared on simulated touches"),
+        _source(config),
+    )
     announce(device)
     where = folder / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
-    if not isinstance(device, Simulated):
-        raise InputError("peers are compared on simulated touches: leave device=simulated")
     with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config)) as run:
         describe(
             store, run.info.run_id, OmegaConf.create({"row": config.row, **source}), device.touches("train")

@@ -37,13 +37,11 @@ def learn(
         InputError: the device has no unseen devices and layouts: it is not simulated.
         subprocess.CalledProcessError: the peer failed.
     """
-    device, source = (
-        build_device(config).simulated("peers are compared on simulated touches"),
-        _source(config),
-    )
+    source, identity = _source(config), tags(config)
+    device = build_device(config).simulated("peers are compared on simulated touches")
     announce(device)
-    where = folder / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
-    with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config)) as run:
+    where = folder / f"{identity['simulator']}-{config.seed}-{fingerprint(source)}"
+    with store.run(f"{config.row} {identity['simulator']} {config.seed}", identity) as run:
         describe(
             store, run.info.run_id, OmegaConf.create({"row": config.row, **source}), device.touches("train")
         )

@@ -28,7 +28,6 @@ def main(config: DictConfig) -> None:
     from rich.progress import track
 
     from skin.console import quiet
-    from skin.device.simulated import Simulated
     from skin.files import whole
     from skin.hardware.live import start
     from skin.hardware.live.holds import FIELDS, courses
@@ -45,11 +44,11 @@ def main(config: DictConfig) -> None:
     stored = configuration(store, run, config.trust)
     own = changed(stored, config, given)
     of = trained(store, run, own, stored)
-    if not isinstance(of.device, Simulated):
+    if (device := of.device.simulation) is None:
         raise InputError("held touches are simulated: give a run of simulated touches")
     engine = start.engine(of, Patience(), settings["touch"], settings["drift"])
     lines = [FIELDS]
-    for said in courses(engine, of.device.replace(stream=False), count, rate, partial(track, transient=True)):
+    for said in courses(engine, device.replace(stream=False), count, rate, partial(track, transient=True)):
         lines.append(said)
         print(", ".join(f"{name} {value}" for name, value in zip(FIELDS, said, strict=True) if value != ""))
     path = results(config.out) / f"holds_{own.row}_{run.info.run_id[:8]}.csv"

@@ -12,7 +12,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from skin.command import command
 from skin.config import plain
-from skin.errors import InputError
 from skin.files import results
 from studies.settings import MovingSettings
 
@@ -27,15 +26,12 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.console import quiet
-    from skin.device.simulated import Simulated
     from studies.moving import change
     from studies.moving_runs import train_lines
     from studies.moving_table import comparison, publish
 
     quiet()
-    device = build_device(_free(config))
-    if not isinstance(device, Simulated):
-        raise InputError("how sensors move is known in simulation only: leave out device=")
+    device = build_device(_free(config)).simulated("how sensors move is known in simulation only")
     moves = change(device, config.n)
     print(moves.sentence, flush=True)
     overrides = HydraConfig.get().overrides.task

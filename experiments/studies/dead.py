@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from skin.build import build_data, build_device, build_learner
-from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.metrics import metrics
 from skin.files import write
@@ -75,8 +74,8 @@ def try_run(store: Store, line: str, run: Run, config: DictConfig, settings: Dea
     The training's own number of dead sensors, or a device per gesture, does not count.
     """
     own = changed(configuration(store, run, config.trust), config, [])
-    device, learner = build_device(own), build_learner(own)
-    if not isinstance(device, Simulated):
+    device, learner = build_device(own).simulation, build_learner(own)
+    if device is None:
         raise InputError(f"run {run.info.run_id} was not trained on a simulated skin: leave its row out")
     restore(store, run, learner, build_data(own, device))
     trials = []

@@ -17,7 +17,7 @@ from rich.progress import track
 
 from skin.build import build_data, build_device, build_learner
 from skin.config import checked, fingerprint
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.metrics import metrics
 from skin.learner.base import AbstractLearner
@@ -89,8 +89,8 @@ def latest(store: Store, simulator: str, rows: str | Sequence[str]) -> list[Run]
 
 
 def conditions(
-    device: Simulated, errors: Sequence[float], variation: float, seed: int, gestures: int
-) -> list[Simulated]:
+    device: AbstractSimulated, errors: Sequence[float], variation: float, seed: int, gestures: int
+) -> list[AbstractSimulated]:
     """Return devices of another seed: one per error of the sensors' places, and one with moduli that vary.
 
     Args:
@@ -139,8 +139,8 @@ def try_run(store: Store, run: Run, config: DictConfig, settings: MovingSettings
 
 def _try(store: Store, run: Run, config: DictConfig, settings: MovingSettings) -> dict[str, float]:
     own = changed(configuration(store, run, config.trust), config, [])
-    device, learner = build_device(own), build_learner(own)
-    if not isinstance(device, Simulated):
+    device, learner = build_device(own).simulation, build_learner(own)
+    if device is None:
         raise InputError(f"run {run.info.run_id} was not trained on a simulated skin: leave its row out")
     restore(store, run, learner, build_data(own, device))
     found: dict[str, float] = {}
@@ -154,7 +154,7 @@ def _metric(condition: int, seed: int) -> str:
     return f"moving/condition_{condition}/device_{seed}"
 
 
-def _accuracy(learner: AbstractLearner, device: Simulated) -> float:
+def _accuracy(learner: AbstractLearner, device: AbstractSimulated) -> float:
     """Return the overall accuracy on a device's test touches, per cent."""
     touches = device.touches("test")
     assert touches.labels is not None

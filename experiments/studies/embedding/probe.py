@@ -10,7 +10,6 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
 from skin.learner.network import Network
@@ -86,7 +85,7 @@ def probe(device: AbstractDevice, settings: Probing, learner: Network | None) ->
     """
     if device.task.direction:
         raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
-    for seed in settings.seeds if isinstance(device, Simulated) else settings.seeds[:1]:
+    for seed in settings.seeds if device.simulation else settings.seeds[:1]:
         touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
         for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):
             yield _found(attribute, name, seed, _space(vectors, touches, mixed), device.task.names)
@@ -186,26 +185,29 @@ def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[s
 def _touches(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
     """Return the touches of one layout, those to train the SVM on first."""
     count = settings.train + settings.test
-    if isinstance(device, Simulated):
-        drawn = device.replace(data_seed=_FIRST_SEED + seed, gestures=count).recording().touches
+    if device.simulation is not None:
+        drawn = device.simulation.replace(data_seed=_FIRST_SEED + seed, gestures=count).recording().touches
         return [drawn[: settings.train], drawn[settings.train :]]
     return [device.touches("train")[: settings.train], device.touches("test")[: settings.test]]
 
 
 def _layouts(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
     """Return as many other touches on each of some scattered layouts; none where that cannot be."""
-    if not isinstance(device, Simulated) or settings.layouts < 2:
+    simulation = device.simulation
+    if simulation is None or settings.layouts < 2:
         return []
-    count = len(device.sensors)
+    count = len(simulation.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
         return []  # no grid of so many sensors could be scattered
-    footprint, depth, found = device.sensors.footprint, device.sensors.positions[:, 2], []
+    sensors, found = simulation.sensors, list[AbstractDevice]()
     for number in range(settings.layouts):
         seed_of = _FIRST_LAYOUT + number
-        layout = Scattered(rows, count // rows, seed=seed_of, footprint=footprint, depth=depth)
+        layout = Scattered(
+            rows, count // rows, seed=seed_of, footprint=sensors.footprint, depth=sensors.positions[:, 2]
+        )
         draw = _FIRST_SEED * (2 + number) + seed
-        found.append(device.replace(layout=layout, data_seed=draw, gestures=settings.test))
+        found.append(simulation.replace(layout=layout, data_seed=draw, gestures=settings.test))
     return [one.recording().touches for one in found]
 
 

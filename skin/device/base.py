@@ -80,7 +80,10 @@ class AbstractDevice(ABC):
         )
 
     def blank(self) -> "AbstractDevice":
-        """Return a device with touches of the same shape for which nobody has to touch a skin."""
+        """Return a device with labelled touches of the same shape, to restore a run with.
+
+        By default it is the device itself. One whose touches may lack labels returns another.
+        """
         return self
 
     def source(self) -> "Source":

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 
 from skin.body.base import AbstractBody
+from skin.device._blank import Blank
 from skin.device._split import rows
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
@@ -93,6 +94,10 @@ class Recorded(AbstractDevice):
     def all_touches(self) -> Touches:
         """Return the touches of the whole file."""
         return self._recording.touches
+
+    def blank(self) -> AbstractDevice:
+        """Return a device that has labels, which the file may lack."""
+        return Blank.of(self.task, self.size, self._recording.touches)
 
     def source(self) -> Source:
         """Open the file as a stream of frames, in real time."""

@@ -71,8 +71,16 @@ def test_fixed_touches_stay_the_same(device):
 def test_only_a_simulated_device_says_that_it_is_one(device):
     assert device.simulation is (device if isinstance(device, Simulated) else None)
     assert device.wired is None
-    assert device.blank() is device
     assert len(device.recording("holdout", complete=False)) == 5
+
+
+def test_a_blank_has_labelled_touches_of_the_same_shape(device):
+    blank = device.blank()
+    assert (blank.task, blank.size) == (device.task, device.size)
+    touches, own = blank.touches("train"), device.touches("train")
+    assert touches.readings.shape[1:] == own.readings.shape[1:]
+    assert touches.labels.shape[1:] == own.labels.shape[1:]
+    assert torch.equal(touches.positions, own.positions)
 
 
 def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):

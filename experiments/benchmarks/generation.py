@@ -12,7 +12,6 @@ import numpy as np
 
 from experiments.benchmarks.setting import configuration, peak_memory
 from skin.build import build_device
-from skin.device.simulated import Simulated
 
 __all__ = ["measure"]
 
@@ -25,8 +24,8 @@ def measure(simulator: str, repeats: int) -> dict[str, float]:
     The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
     readings, imperfections.
     """
-    device = build_device(configuration(f"simulator={simulator}", f"data.gestures={GESTURES}"))
-    assert isinstance(device, Simulated)
+    config = configuration(f"simulator={simulator}", f"data.gestures={GESTURES}")
+    device = build_device(config).simulated("gestures are generated")
     taken = []
     for seed in range(repeats + 1):
         began = time.perf_counter()

@@ -57,6 +57,7 @@ def report(words: Sequence[str], budget: str, folder: Path) -> int:
     from experiments.studies.tables import markdown
     from skin.build import build_device
     from skin.files import write
+    from skin.run import simulator
     from skin.tracking import Store
 
     entries = Entries(words)
@@ -64,7 +65,8 @@ def report(words: Sequence[str], budget: str, folder: Path) -> int:
     entries.vote(store)
     cells = collect(store, entries.named(entries.rows))
     cells += [cell for cell in collect(store, entries.named(entries.others)) if cell.runs]
-    simulators = list(dict.fromkeys(config.data.name for config in entries.rows))
+    skins = {simulator(config): config for config in reversed(entries.rows)}
+    simulators = list(reversed(skins))
     cells.sort(key=lambda cell: simulators.index(cell.simulator))
     lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"), budget)
     title = _TITLE if budget == "full" else _SMOKE + _TITLE
@@ -72,9 +74,9 @@ def report(words: Sequence[str], budget: str, folder: Path) -> int:
         write(markdown(grid(lines), title), folder / "table.md"),
         write(as_csv(lines), folder / "table.csv"),
     ]
-    skin = {config.data.name: config for config in reversed(entries.rows)}
-    name = "fem" if "fem" in skin else simulators[-1]
-    pictures = [*draw_runs(cells, store, folder), *draw_skin(build_device(skin[name]), folder, name)]
+    name = "fem" if "fem" in skins else simulators[-1]
+    device = build_device(skins[name]).simulated("the figures of the report are of a simulated skin")
+    pictures = [*draw_runs(cells, store, folder), *draw_skin(device, folder, name)]
     show(lines, title)
     print(f"{', '.join(map(str, paths))} and {len(pictures)} figures beside them")
     return sum(cell.missing for cell in cells)

@@ -17,7 +17,7 @@ from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
 from skin.recording import Touches, digest
 from skin.reload import restore
-from skin.run import conclude, describe, tags
+from skin.run import conclude, describe, simulator, tags
 from skin.tracking import Store
 
 __all__ = ["WAYS", "average", "combine", "decisions", "disagreement", "vote"]
@@ -156,7 +156,7 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
     """Evaluate one ensemble, log its run and return it."""
     device, known = asked.device, _Known(asked.chances, asked.device.task, way)
     about = {"members": identity} | {f"left_out_{column}": who for column, who in asked.left_out.items()}
-    with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config) | about) as run:
+    with store.run(f"{config.row} {simulator(config)} seed {config.seed}", tags(config) | about) as run:
         groups = ("representation", "model", "fusion", "learner", "optimizer", "trainer", "epochs")
         kept = {key: value for key, value in plain(config).items() if key not in groups}
         describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))

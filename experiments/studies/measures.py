@@ -208,7 +208,7 @@ class Holds:
 
         of = trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
         engine = start.engine(of, Patience(), self.touch, self.drift)
-        device = of.device.replace(stream=False)
+        device = of.device.simulated("held touches are simulated").replace(stream=False)
         table = [FIELDS, *courses(engine, device, self.gestures, self.rate, partial(track, transient=True))]
         told = (zip(FIELDS, values, strict=True) for values in table[1:])
         lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
@@ -233,7 +233,8 @@ class Motion:
         from experiments.studies.motion import change
         from skin.files import write
 
-        found = change(subject.device, self.gestures)
+        device = subject.device.simulated("how sensors move is known in simulation only")
+        found = change(device, self.gestures)
         text = f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"
         return Measured(
             {}, text, lambda title, path: [write(f"# {title}\n\n{text}\n", path.with_suffix(".md"))]
@@ -251,7 +252,7 @@ class Embeddings(Probing):
         from experiments.studies.embedding.probe import probe
         from skin.balance import announce
 
-        device, learner = subject.device, subject.finished and subject.finished.learner
+        device, learner = subject.device, subject.finished.learner if subject.finished else None
         announce(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.representation.graph import neighbours
 
@@ -55,7 +55,7 @@ class Change:
         return f"{line}: " + ("below 1 %, no effect possible" if small else "an effect is possible")
 
 
-def change(device: Simulated, count: int, neighbourhood: int = 6) -> Change:
+def change(device: AbstractSimulated, count: int, neighbourhood: int = 6) -> Change:
     """Measure how far ``count`` test gestures move the sensors of a skin in which they can.
 
     Args:

@@ -18,7 +18,7 @@ from skin.commands import train
 from skin.config import checked, fingerprint
 from skin.errors import InputError
 from skin.reload import find
-from skin.run import tags
+from skin.run import simulator
 from skin.tracking import Store
 
 __all__ = ["Planned", "finished", "known", "multirun", "trained"]
@@ -62,8 +62,8 @@ def known(study: Study, config: DictConfig, store: Store) -> list[Planned]:
         run = find(store, study.run)
         return [Planned(Variant(_name(run), {}, {}), run.data.tags.get("seed", ""), run)]
     found: dict[tuple[str, str], Planned] = {}
-    simulator = tags(config)["simulator"]
-    for run in store.find("FINISHED", simulator=simulator):
+    data = simulator(config)
+    for run in store.find("FINISHED", simulator=data):
         row = run.data.tags["row"]
         if "learned" in run.data.tags and (study.rows == "all" or row in (study.rows or ())):
             one = Planned(Variant(_name(run), {"row": row}, {}), run.data.tags["seed"], run)
@@ -73,8 +73,8 @@ def known(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     missing = [row for row in wanted if row not in (*rows, "all")] or ([] if rows else ["features"])
     if missing:
         raise InputError(
-            f"no finished run of {', '.join(missing)} on {simulator} data in {store.uri}: "
-            f"skin train experiment={missing[0]} simulator={simulator} makes one"
+            f"no finished run of {', '.join(missing)} on {data} data in {store.uri}: "
+            f"skin train experiment={missing[0]} simulator={data} makes one"
         )
     return [found[key] for key in sorted(found)]
 

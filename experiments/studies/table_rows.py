@@ -9,6 +9,7 @@ from experiments.peers import PEERS
 from experiments.studies.ensemble import WAYS, combine
 from experiments.studies.runs import finished
 from skin.config import CONF, checked
+from skin.run import simulator
 from skin.sweep import jobs
 from skin.tracking import Store
 
@@ -50,7 +51,7 @@ class Entries:
 
     def named(self, configs: list[DictConfig]) -> list[tuple[str, str, DictConfig]]:
         """Return configurations with their row and simulator."""
-        return [(config.row, config.data.name, config) for config in configs]
+        return [(config.row, simulator(config), config) for config in configs]
 
 
 def _composed(*words: str) -> DictConfig:

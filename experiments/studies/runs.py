@@ -58,18 +58,19 @@ def known(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     Raises:
         InputError: there is none, or a row that is named has none.
     """
-    if study.run is not None:
+    if study.rows is None:
+        assert study.run is not None
         run = find(store, study.run)
         return [Planned(Variant(_name(run), {}, {}), run.data.tags.get("seed", ""), run)]
     found: dict[tuple[str, str], Planned] = {}
     data = simulator(config)
     for run in store.find("FINISHED", simulator=data):
         row = run.data.tags["row"]
-        if "learned" in run.data.tags and (study.rows == "all" or row in (study.rows or ())):
+        if "learned" in run.data.tags and (study.rows == "all" or row in study.rows):
             one = Planned(Variant(_name(run), {"row": row}, {}), run.data.tags["seed"], run)
             found.setdefault((one.variant.name, one.seed), one)
     rows = {one.variant.chosen["row"] for one in found.values()}
-    wanted = [study.rows] if isinstance(study.rows, str) else list(study.rows or ())
+    wanted = [study.rows] if isinstance(study.rows, str) else list(study.rows)
     missing = [row for row in wanted if row not in (*rows, "all")] or ([] if rows else ["features"])
     if missing:
         raise InputError(

@@ -152,7 +152,7 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
 
 @pytest.mark.slow
 def test_verdicts_are_sorted_by_margins(run, trained):
-    few = ["study.rows=[rules]", "study.run=null", "simulator=naive", "out=margins"]
+    few = ["study.rows=[rules]", "simulator=naive", "out=margins"]
     done = run(trained, "study", "study=margins", "study.measure.gestures=400", *few)
     assert done.returncode == 0, done.stderr
     said = done.stdout.splitlines()
@@ -174,7 +174,7 @@ def test_verdicts_are_sorted_by_margins(run, trained):
 
 @pytest.mark.slow
 def test_every_course_is_played_and_no_alarm_ends_early(run, trained):
-    few = ["study.rows=[rules]", "study.run=null", "simulator=naive", "out=holds"]
+    few = ["study.rows=[rules]", "simulator=naive", "out=holds"]
     done = run(trained, "study", "study=holds", "study.measure.gestures=2", "study.measure.rate=10", *few)
     assert done.returncode == 0, done.stderr
     found = lines(next((trained / "holds").glob("holds_rules_*.csv")))

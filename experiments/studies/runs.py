@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
 from mlflow.entities import Run
 from omegaconf import DictConfig
@@ -87,9 +88,11 @@ def finished(store: Store, config: DictConfig, **further: str) -> Run | None:
 
 def multirun(line: Sequence[str]) -> None:
     """Train what a line of overrides sweeps, as ``skin train -m`` does; failed runs are told and left out."""
+    sources = HydraConfig.get().runtime.config_sources
+    folder = [one.path for one in sources if one.provider == "command-line"]  # of --config-dir
     with _another_command():
         try:
-            train.main(["-m", *line])
+            train.main(["-m", *(["--config-dir", *folder] if folder else []), *line])
         except SystemExit as stop:
             if isinstance(stop.code, int) and stop.code > 128:  # a signal: train nothing more
                 raise

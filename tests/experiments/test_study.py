@@ -254,3 +254,21 @@ def test_rows_decide_together(run, trained):
     found = {line["variant"]: line for line in lines(trained / "ensemble" / "study_ensemble.csv")}
     assert list(found) == ["rules", "temporal_graph", "ensemble_vote", "ensemble_average"]
     assert 0 < float(found["ensemble_vote"]["same/any/disagreement"]) < 1
+
+
+@pytest.mark.slow
+def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
+    (tmp_path / "own" / "study").mkdir(parents=True)
+    (tmp_path / "own" / "experiment").mkdir()
+    (tmp_path / "own" / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /learner: rules\nrow: mine\n"
+    )
+    (tmp_path / "own" / "study" / "noise.yaml").write_text(
+        "about: noise\ntrainings: [{experiment: mine, device.noise: [0.05, 0.5]}]\ndifferences: greater\n"
+    )
+    few = ["--config-dir", tmp_path / "own", "study.seeds=[0]"]
+    done = run(tmp_path, "study", *few, "study=noise", *NAIVE)
+    assert done.returncode == 0, done.stderr
+    found = lines(tmp_path / "results" / "study_noise.csv")
+    assert [line["variant"] for line in found] == ["noise=0.05", "noise=0.5"]
+    assert "| noise=0.5 |  | " in (tmp_path / "results" / "study_noise.md").read_text()

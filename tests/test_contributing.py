@@ -11,6 +11,7 @@ BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(
 FILES = {text.split("\n")[0].removeprefix("# "): text for kind, text in BLOCKS if kind in ("python", "yaml")}
 COMMANDS = [line.split() for _, text in BLOCKS for line in text.splitlines() if line.startswith("skin ")]
 TRAINING = [words[2:] for words in COMMANDS if words[1] == "train"]
+EVALUATION = [words[2:] for words in COMMANDS if words[1] == "evaluate"]
 SMALL = ["data.gestures=48", "device.test_gestures=48", "evaluation.safe_gestures=64"]
 SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
 
@@ -31,7 +32,7 @@ def test_one_option_of_each_of_four_groups_is_shown():
     groups = {name.split("/")[1] for name in FILES if name.endswith(".yaml")}
     assert groups == {"simulator", "representation", "model", "fusion"}
     assert len(FILES) == 8
-    assert len(TRAINING) == 4
+    assert (len(TRAINING), len(EVALUATION)) == (4, 1)
 
 
 @pytest.mark.parametrize("overrides", TRAINING, ids=lambda words: words[-1])
@@ -39,17 +40,19 @@ def test_an_option_of_ones_own_is_trained_and_evaluated(run, own, overrides):
     simulator = [] if any(one.startswith("simulator=") for one in overrides) else ["simulator=naive"]
     done = run(own, "train", *overrides, *simulator, *SMALL, "trainer.max_epochs=1")
     assert done.returncode == 0, done.stderr
-    refused = run(own, "evaluate", "run=latest")
+    refused = run(own, "evaluate", "run=latest")  # without trust
     assert refused.returncode == 2
     assert "trust=true" in refused.stderr
     assert refused.stderr.count("\n") == 1
-
-
-def test_a_stored_run_is_evaluated_where_it_is_trusted(run, own):
-    (command,) = [words[2:] for words in COMMANDS if words[1] == "evaluate"]
-    done = run(own, "evaluate", *command, "evaluation.safe_gestures=64")
+    done = run(own, "evaluate", *EVALUATION[0])
     assert done.returncode == 0, done.stderr
-    assert "accuracy" in done.stdout
+    assert "overall/accuracy" in done.stdout
+
+
+def test_help_lists_options_of_ones_own(run, own):
+    said = run(own, "train", "--config-dir", "conf", *TRAINING[0][2:], "--help", store=False).stdout
+    assert "fem, [gaussian], naive, solid" in said
+    assert "spread: 0.01  # m" in said
 
 
 @pytest.mark.parametrize(

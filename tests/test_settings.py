@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live.settings import Settings
-from skin.settings import check
+from skin.settings import check, check_groups
 
 
 class Thing:
@@ -57,6 +57,26 @@ def test_what_fits_is_taken():
 def test_what_does_not_fit_is_refused_by_name(wrong, said):
     with pytest.raises(InputError, match=f"^{said}"):
         check(Thing, FIT | wrong, "thing")
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ({"_target_": f"{__name__}.Thing", "count": 0}, "model.count=0 must be greater"),
+        (
+            {"_target_": "absent.Thing"},
+            "model._target_=absent.Thing cannot be imported: No module named 'absent'",
+        ),
+        ({"_target_": "skin.model.mlp.Mpl"}, "model._target_=skin.model.mlp.Mpl cannot be imported"),
+    ],
+)
+def test_classes_of_others_are_checked_too(part, said):
+    with pytest.raises(InputError, match=f"^{said}"):
+        check_groups({"learner": {"model": part}})
+
+
+def test_classes_of_libraries_check_themselves():
+    check_groups({"learner": {"optimizer": {"_target_": "torch.optim.Adam", "no": "such setting"}}})
 
 
 SMALL = ["simulator=naive", "data.gestures=20"]

@@ -4,6 +4,8 @@ import math
 import os
 import sys
 import tempfile
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -13,11 +15,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
+from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
 from skin.balance import announce
 from skin.build import build_data, build_device, build_learner
-from skin.config import fingerprint, overrides, plain
+from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
 from skin.evaluation.operating_point import check, choose
 from skin.evaluation.report import Report, evaluate
@@ -30,9 +33,6 @@ from skin.reload import TAG
 from skin.tracking import Store
 
 __all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "tags", "train"]
-
-PARENT = "SKIN_PARENT_RUN"
-"""Environment variable by which a sweep tells its jobs the id of their parent run."""
 
 SWEPT = "SKIN_SWEPT"
 """Environment variable by which a sweep tells its jobs which settings it sweeps."""
@@ -60,6 +60,9 @@ def train(config: DictConfig) -> bool:
     quiet()
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
+    if rank_zero_only.rank:
+        _join(config)
+        return True
     store, identity = Store.open(config.tracking), tags(config)
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
@@ -88,6 +91,13 @@ def train(config: DictConfig) -> bool:
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
+
+
+def _join(config: DictConfig) -> None:
+    """Train in one of several processes (``trainer.devices``); the first one does all the rest."""
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        data, learner = build_data(config, build_device(config)), build_learner(config)
+        learner.fit(data)
 
 
 def tags(config: DictConfig) -> dict[str, str]:

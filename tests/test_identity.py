@@ -59,8 +59,8 @@ def test_todays_run_differs_from_the_older_one_by_its_alarm_alone(configured):
 @pytest.mark.parametrize(
     "overrides",
     [
-        ["+trainer.precision=bf16-mixed"],
-        ["+trainer.devices=2", "+trainer.strategy=ddp", "+trainer.num_nodes=2"],
+        ["trainer.precision=bf16-mixed"],
+        ["trainer.devices=2", "trainer.strategy=ddp", "+trainer.num_nodes=2"],
         ["trainer.accelerator=gpu"],
         ["+trainer.enable_progress_bar=true"],
         ["tracking.threads=1"],

@@ -1,16 +1,17 @@
 """Learning by gradient descent."""
 
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from skin.config import PARENT
 from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
 from skin.learner.base import AbstractLearner
@@ -81,6 +82,8 @@ class Network(AbstractLearner):
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train on the training split; validation chooses the epoch.
 
+        Where several processes train together, only the first has what was learned.
+
         Raises:
             InputError: the choices do not fit each other or the data.
         """
@@ -88,19 +91,21 @@ class Network(AbstractLearner):
 
         from skin.learner._clock import Clock
 
-        clock = Clock()
         with torch.random.fork_rng(), TemporaryDirectory() as folder:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
+            clock = Clock(Path(folder) / "seconds.json")
             trainer = self._trainer_of(logger, [best, clock], folder)
             with warnings.catch_warnings():
                 # Lightning 2.6 asks torch 2.13 for a deprecated class
                 warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
                 trainer.fit(classifier, datamodule=data)
+            if not trainer.is_global_zero:
+                return
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
             classifier.load_state_dict(weights["state_dict"])
-        self.seconds_per_epoch = median(clock.seconds)
+            self.seconds_per_epoch = clock.median()
 
     def _trainer_of(
         self, logger: "Logger | None", callbacks: "list[Callback]", folder: str | None = None
@@ -119,7 +124,7 @@ class Network(AbstractLearner):
             raise InputError(f"trainer.max_epochs={epochs} must be a whole number from 1 up")
         loggers = [one for one in (logger, *(theirs if isinstance(theirs, list) else [theirs])) if one]
         try:
-            return Trainer(
+            trainer = Trainer(
                 **settings | {"callbacks": [*callbacks, *(settings.get("callbacks") or [])]},
                 logger=loggers or False,
                 enable_model_summary=False,
@@ -127,6 +132,8 @@ class Network(AbstractLearner):
             )
         except (TypeError, ValueError, MisconfigurationException) as error:
             raise InputError(f"pytorch_lightning.Trainer refuses trainer: {sentence(error)}") from error
+        _check_processes(trainer)
+        return trainer
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model takes."""
@@ -194,3 +201,24 @@ class Network(AbstractLearner):
         self._data, self._classifier = data, classifier
         self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
         return classifier
+
+
+def _check_processes(trainer: "Trainer") -> None:
+    """Refuse ways to start further processes that cannot work here.
+
+    Raises:
+        InputError: naming one that does.
+    """
+    from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
+
+    launcher = trainer.strategy.launcher
+    if isinstance(launcher, _SubprocessScriptLauncher) and PARENT in os.environ:
+        raise InputError(
+            f"trainer.devices={trainer.num_devices} would start a whole sweep again for each process: add "
+            "trainer.strategy=ddp_spawn"
+        )
+    if isinstance(launcher, _MultiProcessingLauncher) and launcher.is_interactive_compatible:
+        raise InputError(
+            "trainer.strategy starts processes as forks, which must not use the database of runs: give "
+            "trainer.strategy=ddp or ddp_spawn"
+        )

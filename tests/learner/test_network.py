@@ -115,3 +115,22 @@ def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_devi
     for name in ("ours", "theirs"):
         lines = next((tmp_path / name).rglob("metrics.csv")).read_text().splitlines()
         assert len(lines) == 3  # validation and training of the first epoch, in which it stops
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["representation=image", "model=cnn"],
+        ["representation=graph", "model=gcn", "model.norm=batch", "fusion=early"],
+        ["representation=graph", "model=pyg"],
+        ["representation=measured", "model=mlp", "fusion.head=residual"],
+        ["representation=graph", "model=transformer", "fusion.head=transformer"],
+    ],
+)
+def test_it_trains_with_half_of_the_digits(configured, made_up_device, overrides):
+    config = configured(*overrides, "trainer.max_epochs=1", "trainer.precision=bf16-mixed")
+    learner = build_learner(config)
+    learner.fit(TouchData(made_up_device, instantiate(config.representation), 32))
+    found = learner.probabilities(made_up_device.touches("test"))
+    assert found.dtype == torch.float32
+    assert found.isfinite().all()

@@ -50,6 +50,8 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
     assert seen == ["RUNNING"]
     (run,) = Store.open(config.tracking).find("FINISHED")
     assert run.data.metrics["parameters"] == 196
+    choices = {group: run.data.params[group] for group in ("representation", "model", "fusion", "learner")}
+    assert choices == {"representation": "graph", "model": "gcn", "fusion": "linked", "learner": "network"}
     assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
     assert skin.run.train(config) is False
     page = (ROOT / "docs" / "mlflow.md").read_text()

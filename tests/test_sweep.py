@@ -120,7 +120,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_its_scores(run, tmp_path):
-    given = ["train", *SMALL, "device.offset=0.2", "layout=grid"]
+    given = ["train", *SMALL, "device.offset=0.2", "layout=grid", "model=mlp"]
     first = run(tmp_path, *given)
     assert first.returncode == 0, first.stderr
     with sqlite3.connect(tmp_path / "m.db") as database:
@@ -130,6 +130,8 @@ def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_it
     assert name.startswith("rules naive ")
     assert name.endswith(" offset=0.2 layout=grid seed 0")
     assert (params["device.offset"], params["layout"], params["seed"]) == ("0.2", "grid", "0")
+    assert params["learner"] == "rules"
+    assert not {"representation", "model", "fusion"} & set(params)  # rules use none of them
     again = run(tmp_path, *given)
     assert again.returncode == 0, again.stderr
     assert "did this before" in again.stdout

@@ -132,7 +132,7 @@ class Network(AbstractLearner):
             )
         except (TypeError, ValueError, MisconfigurationException) as error:
             raise InputError(f"pytorch_lightning.Trainer refuses trainer: {sentence(error)}") from error
-        _check_processes(trainer)
+        _check(trainer)
         return trainer
 
     def probabilities(self, touches: Touches) -> Tensor:
@@ -203,11 +203,11 @@ class Network(AbstractLearner):
         return classifier
 
 
-def _check_processes(trainer: "Trainer") -> None:
-    """Refuse ways to start further processes that cannot work here.
+def _check(trainer: "Trainer") -> None:
+    """Refuse what Lightning takes and this program cannot do.
 
     Raises:
-        InputError: naming one that does.
+        InputError: naming what it can.
     """
     from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
 
@@ -221,4 +221,9 @@ def _check_processes(trainer: "Trainer") -> None:
         raise InputError(
             "trainer.strategy starts processes as forks, which must not use the database of runs: give "
             "trainer.strategy=ddp or ddp_spawn"
+        )
+    if trainer.precision not in ("32-true", "16-mixed", "bf16-mixed"):
+        raise InputError(
+            f"trainer.precision={trainer.precision} would change the touches too: give 32-true, 16-mixed or "
+            "bf16-mixed"
         )

@@ -65,6 +65,7 @@ def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_de
         (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
         (["learner.activation=sine"], "activation=relu, elu or silu"),
         (["fusion.head=sum"], "set fusion.head to one of"),
+        (["trainer.precision=bf16-true"], "give 32-true, 16-mixed or bf16-mixed"),
     ],
 )
 def test_choices_that_do_not_fit_are_refused(overrides, words, configured, made_up_device):
@@ -127,7 +128,7 @@ def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_devi
         ["representation=graph", "model=transformer", "fusion.head=transformer"],
     ],
 )
-def test_it_trains_with_half_of_the_digits(configured, made_up_device, overrides):
+def test_it_trains_with_half_of_the_bits(configured, made_up_device, overrides):
     config = configured(*overrides, "trainer.max_epochs=1", "trainer.precision=bf16-mixed")
     learner = build_learner(config)
     learner.fit(TouchData(made_up_device, instantiate(config.representation), 32))

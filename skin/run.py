@@ -23,6 +23,7 @@ from skin.balance import announce
 from skin.build import build_data, build_device, build_learner
 from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
+from skin.errors import InputError
 from skin.evaluation.operating_point import check, choose
 from skin.evaluation.report import Report, evaluate
 from skin.evaluation.show import report as show
@@ -60,8 +61,10 @@ def train(config: DictConfig) -> bool:
     A run that finished with the same fingerprint is not repeated, unless ``tracking.resume=false``.
     """
     quiet()
-    if config.tracking.threads:
-        torch.set_num_threads(config.tracking.threads)
+    if (threads := config.tracking.threads) is not None:
+        if threads < 1:
+            raise InputError(f"tracking.threads={threads} must be at least 1, or null")
+        torch.set_num_threads(threads)
     if rank_zero_only.rank:
         _join(config)
         return True

@@ -7,6 +7,7 @@ import pytest
 
 import skin.run
 from skin.config import ROOT, checked
+from skin.errors import InputError
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -60,6 +61,11 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
         parts = name.split("/") if f"`{name}`" not in page else [name]
         parts = [re.sub("(_accuracy)_[a-z]+$", r"\1", part) for part in parts]
         assert all(f"`{part}`" in page for part in parts), name
+
+
+def test_no_threads_are_refused(configured):
+    with pytest.raises(InputError, match=r"tracking\.threads=0 must be at least 1, or null"):
+        skin.run.train(checked(configured("tracking.threads=0")))
 
 
 def logged(folder):

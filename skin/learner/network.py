@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
+from annotated_types import Ge, Le, Lt
 from torch import Tensor
 
 from skin.config import PARENT
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from pytorch_lightning import Callback, Trainer
     from pytorch_lightning.loggers import Logger
 
-    from skin.classifier import MakeOptimizer, TouchClassifier
+    from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
 __all__ = ["Network"]
@@ -51,18 +52,18 @@ class Network(AbstractLearner):
         self,
         model: Callable[..., Any],
         fusion: Callable[..., AbstractFusion],
-        optimizer: "MakeOptimizer",
+        optimizer: Callable[..., Any],
         trainer: dict[str, Any],
-        hidden: Sequence[int] = (32,),
+        hidden: Sequence[Annotated[int, Ge(1)]] = (32,),
         activation: str = "relu",
-        warmup: float | None = None,
-        dropout: float = 0.0,
+        warmup: Annotated[float, Ge(0), Le(1)] | None = None,
+        dropout: Annotated[float, Ge(0), Lt(1)] = 0.0,
         seed: int = 0,
     ) -> None:
         self._fusion = partial(fusion, model)
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
-        self._warmup, self._dropout = warmup, dropout
+        self._warmup, self._dropout = None if warmup is None else float(warmup), dropout
         self._data: TouchData | None = None
         self._classifier: TouchClassifier | None = None
 
@@ -120,7 +121,7 @@ class Network(AbstractLearner):
 
         settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
         epochs, theirs = settings.get("max_epochs"), settings.pop("logger", None)
-        if not isinstance(epochs, int) or epochs < 1:
+        if type(epochs) is not int or epochs < 1:
             raise InputError(f"trainer.max_epochs={epochs} must be a whole number from 1 up")
         loggers = [one for one in (logger, *(theirs if isinstance(theirs, list) else [theirs])) if one]
         try:

@@ -65,6 +65,11 @@ def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_de
         (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
         (["learner.activation=sine"], "activation=relu, elu or silu"),
         (["fusion.head=sum"], "set fusion.head to one of"),
+        (["learner.hidden=[8,0]"], r"learner.hidden=\[8, 0\] must be greater than or equal to 1"),
+        (["learner.hidden=8"], "learner.hidden=8 must be a list"),
+        (["learner.dropout=1"], "learner.dropout=1 must be less than 1"),
+        (["learner.warmup=-0.1"], "learner.warmup=-0.1 must be greater than or equal to 0"),
+        (["trainer.max_epochs=1.5"], "trainer.max_epochs=1.5 must be a whole number from 1 up"),
         (["trainer.precision=bf16-true"], "give 32-true, 16-mixed or bf16-mixed"),
     ],
 )
@@ -135,3 +140,8 @@ def test_it_trains_with_half_of_the_bits(configured, made_up_device, overrides):
     found = learner.probabilities(made_up_device.touches("test"))
     assert found.dtype == torch.float32
     assert found.isfinite().all()
+
+
+def test_a_learning_rate_may_fall_from_the_start(configured, made_up_device):
+    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1", "learner.warmup=0")
+    build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))

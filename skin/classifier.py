@@ -111,7 +111,8 @@ class TouchClassifier(pl.LightningModule):
         batches, self._batches[stage] = self._batches[stage], []
         count = sum(size for size, _ in batches)
         for name in batches[0][1]:
-            self.log(f"{stage}_{name}", sum(size * values[name] for size, values in batches) / count)
+            mean = sum(size * values[name] for size, values in batches) / count
+            self.log(f"{stage}_{name}", mean, sync_dist=True)  # the mean over processes that train together
 
     def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
         if self.task.kind == "exclusive":

@@ -20,6 +20,7 @@ from skin.refusal import sentence
 
 __all__ = [
     "CONF",
+    "PARENT",
     "ROOT",
     "Config",
     "DictConfig",
@@ -29,6 +30,9 @@ __all__ = [
     "overrides",
     "plain",
 ]
+
+PARENT = "SKIN_PARENT_RUN"
+"""Environment variable by which a sweep tells its jobs the id of their parent run."""
 
 # They steer a run and change none of its results.
 _STEERING = ("tracking", "trust")

@@ -8,7 +8,7 @@ __all__ = ["quiet"]
 
 def quiet() -> None:
     """Quieten Lightning's remarks on hardware and logging, and torch's on a change in its own insides."""
-    for name in ("pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):
+    for name in ("lightning_fabric", "pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.setLevel(logging.ERROR)

@@ -23,7 +23,8 @@ class TouchData(pl.LightningDataModule):
     """Cuts a device's touches into batches and shows them as a representation does.
 
     Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
-    one. A device that draws fresh gestures is asked again every epoch.
+    one. A device that draws fresh gestures is asked again every epoch. Processes that train together share
+    each training batch; each of them validates on all gestures.
 
     Args:
         device: source of touches.
@@ -134,7 +135,17 @@ class _Batches:
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
         for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
             batch = touches[index]
-            yield data.augmentation(batch, generator) if data.augmentation else batch
+            yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
+
+    def _share(self, batch: Touches) -> Touches:
+        """Return this process's part of a batch where several train together.
+
+        Each takes a whole batch that has less than two gestures for each of them: batch norm needs two.
+        """
+        trainer = self.data.trainer
+        if trainer is None or trainer.world_size == 1 or len(batch) < 2 * trainer.world_size:
+            return batch
+        return batch[trainer.global_rank :: trainer.world_size]
 
     def _slices(self) -> Iterator[slice]:
         size = self.data.batch_size

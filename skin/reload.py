@@ -19,6 +19,7 @@ from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose, read
 from skin.foreign import settings
+from skin.identity import renamed
 from skin.learner.base import AbstractLearner
 from skin.tracking import Store
 from skin.trust import vet
@@ -84,7 +85,7 @@ def configuration(store: Store, run: Run, trust: bool = False) -> DictConfig:
     with tempfile.TemporaryDirectory() as folder:
         path = _fetched(store, run, "config.yaml", folder)
         try:
-            stored = settings(path)
+            stored = renamed(settings(path))
         except (ValueError, OSError) as error:
             raise InputError(f"run {run.info.run_id} has no readable config.yaml: {error}") from error
     if not isinstance(stored, dict):

@@ -4,7 +4,10 @@ import math
 import os
 import sys
 import tempfile
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import torch
@@ -14,12 +17,14 @@ from hydra.utils import get_object
 from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
+from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
 from skin.balance import announce
 from skin.build import build_data, build_device, build_learner
-from skin.config import fingerprint, overrides, plain
+from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
+from skin.errors import InputError
 from skin.evaluation.operating_point import check, choose
 from skin.evaluation.report import Report, evaluate
 from skin.evaluation.show import report as show
@@ -33,13 +38,11 @@ from skin.tracking import Store
 
 __all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "simulator", "tags", "train"]
 
-PARENT = "SKIN_PARENT_RUN"
-"""Environment variable by which a sweep tells its jobs the id of their parent run."""
-
 SWEPT = "SKIN_SWEPT"
 """Environment variable by which a sweep tells its jobs which settings it sweeps."""
 
 _STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
+_NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
 _NAMED = ("experiment", "row", "seed", "simulator")  # a run's name has them in any case
 
 
@@ -60,8 +63,13 @@ def train(config: DictConfig) -> bool:
     A run that finished with the same fingerprint is not repeated, unless ``tracking.resume=false``.
     """
     quiet()
-    if config.tracking.threads:
-        torch.set_num_threads(config.tracking.threads)
+    if (threads := config.tracking.threads) is not None:
+        if threads < 1:
+            raise InputError(f"tracking.threads={threads} must be at least 1, or null")
+        torch.set_num_threads(threads)
+    if rank_zero_only.rank:
+        _join(config)
+        return True
     store, identity = Store.open(config.tracking), tags(config)
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
@@ -74,7 +82,7 @@ def train(config: DictConfig) -> bool:
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
     announce(device, shown=PARENT not in os.environ)
-    name = " ".join([config.row, identity["simulator"], *_differences(), f"seed {config.seed}"])
+    name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
     with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         describe(store, run.info.run_id, config, data.touches("train"))
@@ -90,6 +98,13 @@ def train(config: DictConfig) -> bool:
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
+
+
+def _join(config: DictConfig) -> None:
+    """Train in one of several processes (``trainer.devices``); the first one does all the rest."""
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        data, learner = build_data(config, build_device(config)), build_learner(config)
+        learner.fit(data)
 
 
 def tags(config: DictConfig) -> dict[str, str]:
@@ -124,7 +139,9 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(plain(config))), "config.yaml")
     store.client.set_tag(run, "data_hash", digest(touches))
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
-    choices = {group: _option(config[group]) for group in groups if group in config}
+    unused = _unused(config)
+    used = [group for group in groups if group in config and group not in unused]
+    choices = {group: _option(config[group]) for group in used}
     scalars = {"seed": config.seed, "row": config.row}
     if "simulator" in config.device:
         scalars |= {
@@ -135,25 +152,40 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
         }
     else:
         choices.pop("simulator", None)
-    params = changed() | choices | scalars
+    params = changed(config) | choices | scalars
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
 
 
-def _differences() -> list[str]:
+def _differences(config: DictConfig) -> list[str]:
     """Return what tells this run from others with its row, simulator and seed: in a sweep, what is swept."""
-    found = {key: value for key, value in changed().items() if key not in _NAMED}
+    found = {key: value for key, value in changed(config).items() if key not in _NAMED}
     if SWEPT in os.environ:
         found = {key: value for key, value in found.items() if key in os.environ[SWEPT].split()}
     return [f"{key.split('.')[-1]}={value}" for key, value in found.items()]
 
 
-def changed() -> dict[str, str]:
-    """Return the overrides of the running command that a result may depend on; none outside of a command."""
+def changed(config: DictConfig) -> dict[str, str]:
+    """Return the overrides of the running command that its result may depend on; else none."""
     if not HydraConfig.initialized():
         return {}
     parsed = OverridesParser.create().parse_overrides(overrides())
     found = {one.key_or_group: one.get_value_element_as_str() for one in parsed if not one.is_delete()}
-    return {key: value for key, value in found.items() if not key.startswith(_STEERING)}
+    unused = _unused(config)
+    return {
+        key: value
+        for key, value in found.items()
+        if not key.startswith(_STEERING) and key.split(".")[0] not in unused
+    }
+
+
+def _unused(config: DictConfig) -> tuple[str, ...]:
+    """Return the groups that have no part in a run, because its learner holds no network."""
+    return () if _holds(plain(config).get("learner"), "model") else _NETWORK
+
+
+def _holds(value: Any, name: str) -> bool:
+    """Return whether a setting has this name, however deep."""
+    return isinstance(value, dict) and (name in value or any(_holds(one, name) for one in value.values()))
 
 
 def conclude(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:

@@ -92,11 +92,8 @@ def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def _hints(target: Callable[..., Any]) -> dict[str, Any]:
-    try:
-        made = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
-        return get_type_hints(made, include_extras=True)
-    except NameError:  # a name that only type checkers know
-        return {}
+    made = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
+    return get_type_hints(made, include_extras=True)
 
 
 def _plain(hint: Any) -> bool:

@@ -6,21 +6,25 @@ import math
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import CONF, ROOT, Tracking, checked
+from skin.config import ROOT, checked, fingerprint, plain
+from skin.errors import InputError
 from skin.refusal import refusal
 
 if TYPE_CHECKING:
+    from mlflow.entities import Run
+
     from skin.tracking import Store
 
 __all__ = ["Progress", "Sweep", "jobs"]
@@ -33,13 +37,16 @@ def jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, 
         overrides: of the command line; the later one of a key holds.
         parameters: ``hydra.sweeper.params``.
     """
+    # Only a loader knows the options that glob(...) means.
+    loader = GlobalHydra.instance().config_loader() if GlobalHydra.instance().is_initialized() else None
     lines = [f"{key}={value}" for key, value in parameters.items()] + overrides
-    choices: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides(lines):
-        swept = override.is_sweep_override()
-        values = list(override.sweep_string_iterator()) if swept else [override.get_value_element_as_str()]
-        choices[override.get_key_element()] = values
-    return [dict(zip(choices, values, strict=True)) for values in product(*choices.values())]
+    (found,) = BasicSweeper.split_arguments(OverridesParser.create(loader).parse_overrides(lines), None)
+    return [_chosen(job) for job in found]
+
+
+def _chosen(overrides: Iterable[str]) -> dict[str, str]:
+    """Return the keys and values of overrides."""
+    return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
 
 
 class Progress:
@@ -75,22 +82,26 @@ class Sweep(Callback):
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
-    closed at exit.
+    closed at exit. A parent that has no children by then, because each job was finished before or refused, is
+    deleted.
     """
 
     def __init__(self) -> None:
         self._store: Store | None = None
-        self._parent = ""
-        self._failed = 0
+        self._parent: Run | None = None
+        self._resume = True
         self._jobs: list[dict[str, str]] = []
+        self._fingerprints: list[str] = []
         self._swept: list[str] = []
         self._progress = Progress([])
         self._began = 0.0
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the parent run and tell the jobs about it."""
+        if "tracking" not in config:
+            return
         try:
-            store = self._open(config)
+            self._open(config)
         except Exception as error:
             refused = refusal(error)
             if refused is None:
@@ -99,49 +110,48 @@ class Sweep(Callback):
             print(refused, file=sys.stderr)
             sys.exit(2)
 
-        from skin.run import SWEPT
-
-        _share_cores(config.hydra.launcher)
-        atexit.register(self._close)
+    def _open(self, config: DictConfig) -> None:
+        """Make the folder that Hydra writes to, and the parent run."""
+        settings = checked(_without_hydra(config)).tracking
         # Swept or not, Hydra lists only what belongs to jobs here.
         self._jobs = jobs(list(config.hydra.overrides.task), config.hydra.sweeper.params or {})
         self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
-        os.environ[SWEPT] = " ".join(self._swept)
-        self._progress = Progress([_seconds(store, job) for job in self._jobs])
-
-    def _open(self, config: DictConfig) -> "Store":
-        """Make the folder that Hydra writes to, and the parent run."""
-        settings = _tracking(config)
+        composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.run import PARENT
+        from skin.run import PARENT, SWEPT
         from skin.tracking import Store
+        from skin.variants import title
 
         self._store = store = Store.open(settings)
-        name = config.hydra.runtime.choices.get("sweep") or "sweep"
-        self._parent = store.create(name, {"sweep": name}).info.run_id
-        os.environ[PARENT] = self._parent
-        return store
+        name = config.hydra.runtime.choices.get("sweep") or title(self._jobs, self._swept) or "sweep"
+        self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
+        atexit.register(self._close)
+        os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
+        _share_cores(config.hydra.launcher)
+        self._fingerprints = [fingerprint(job) if job else "" for job in composed]
+        self._progress = Progress([_seconds(store, job) if job else None for job in composed])
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
         self._began = time.monotonic()
         if self._parent:
-            print(f"{self._label(config)} …{self._rest()}", flush=True)
+            left = self._progress.left()
+            rest = "" if left is None else f" about {_clock(left)} left"
+            print(f"{self._label(config)} …{rest}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
         if not self._parent:
             return
-        number, seconds = int(config.hydra.job.num), time.monotonic() - self._began
+        seconds, skipped = time.monotonic() - self._began, job_return._return_value is False
         if job_return.status == JobStatus.FAILED:
-            self._failed += 1
             print(f"{self._label(config)} failed: {job_return._return_value}", file=sys.stderr, flush=True)
-        elif job_return._return_value is False:
+        elif skipped:
             print(f"{self._label(config)} was finished before", flush=True)
         else:
             print(f"{self._label(config)} took {_clock(seconds)}", flush=True)
-        self._progress.finish(number, seconds, job_return._return_value is False)
+        self._progress.finish(self._jobs.index(_chosen(config.hydra.overrides.task)), seconds, skipped)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
@@ -150,22 +160,52 @@ class Sweep(Callback):
     def _close(self) -> None:
         """End the parent run, once: FINISHED only if every job came to its end."""
         store, self._store = self._store, None
-        if store is None:
+        if store is None or self._parent is None:
             return
-        whole = self._failed == 0 and sum(self._progress._expected) == 0
         # A database that refuses was told of before, and nobody hears an exit; the next start closes the run.
         with suppress(Exception):
-            store.client.set_terminated(self._parent, "FINISHED" if whole else "FAILED")
+            self._conclude(store, self._parent)
+
+    def _conclude(self, store: "Store", parent: "Run") -> None:
+        """Log what the jobs found, whenever they were finished; delete a parent without children."""
+        from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
+
+        from skin.variants import log
+
+        own = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
+        keys = [key for key in self._swept if key != "seed"]
+        found: dict[tuple[str, ...], list[Run]] = {}
+        for job, identity in zip(self._jobs, self._fingerprints, strict=True):
+            # One that was finished before counts, unless it was to be repeated.
+            runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else own)
+            found.setdefault(tuple(job[key] for key in keys), []).extend(runs[:1])
+        whole = sum(map(len, found.values())) == len(self._jobs)
+        store.client.set_terminated(parent.info.run_id, "FINISHED" if whole else "FAILED")
+        if not store.find(**own):
+            store.client.delete_run(parent.info.run_id)
+        elif done := {values: runs for values, runs in found.items() if runs}:
+            log(store, parent, keys, done)
 
     def _label(self, config: DictConfig) -> str:
-        number = int(config.hydra.job.num)
-        job = self._jobs[number]
+        job = _chosen(config.hydra.overrides.task)
         chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
-        return f"[{number + 1}/{len(self._jobs)}] {chosen}"
+        return f"[{config.hydra.job.num + 1}/{len(self._jobs)}] {chosen}"
 
-    def _rest(self) -> str:
-        left = self._progress.left()
-        return "" if left is None else f" about {_clock(left)} left"
+
+def _without_hydra(config: DictConfig) -> DictConfig:
+    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+
+
+def _composed(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
+    """Return the configuration of a job; None where it will be refused."""
+    words = [f"{key}={value}" for key, value in job.items()]
+    whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
+    try:
+        made = checked(_without_hydra(whole))
+        plain(made)
+    except InputError:
+        return None
+    return made
 
 
 def _share_cores(launcher: DictConfig) -> None:
@@ -180,31 +220,23 @@ def _share_cores(launcher: DictConfig) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores // count)))
 
 
-def _tracking(config: DictConfig) -> Tracking:
-    """Return the settings that all jobs share; a multirun's own configuration has them too."""
-    whole = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    return checked(whole).tracking
-
-
-def _seconds(store: "Store", job: dict[str, str]) -> float | None:
+def _seconds(store: "Store", config: DictConfig) -> float | None:
     """Return how long the last finished run of the same row and simulator took, s.
 
-    Where there is none, the published table tells: its seconds per epoch times the epochs of the row, and a
-    third more for the evaluation.
+    Where there is none, the published table tells: its seconds per epoch times the epochs, and a third more
+    for the evaluation.
     """
-    row, simulator = job.get("experiment", "custom"), job.get("simulator", "fem")
-    finished = store.find("FINISHED", row=row, simulator=simulator)
+    finished = store.find("FINISHED", row=config.row, simulator=config.data.name)
     if finished:
         info = finished[0].info
         return (info.end_time - info.start_time) / 1e3
-    published, experiment = ROOT / "docs" / "results" / "table.csv", CONF / "experiment" / f"{row}.yaml"
-    if not published.is_file() or not experiment.is_file():
+    published, wanted = ROOT / "docs" / "results" / "table.csv", (config.row, config.data.name)
+    if not published.is_file():
         return None
     with published.open(newline="") as file:
         for line in csv.DictReader(file):
-            if (line["row"], line["simulator"]) == (row, simulator) and line["seconds_per_epoch"]:
-                epochs = OmegaConf.select(OmegaConf.load(experiment), f"epochs.{simulator}", default=1)
-                return 5 + 1.3 * epochs * float(line["seconds_per_epoch"])
+            if (line["row"], line["simulator"]) == wanted and line["seconds_per_epoch"]:
+                return 5 + 1.3 * config.trainer.max_epochs * float(line["seconds_per_epoch"])
     return None
 
 

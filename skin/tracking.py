@@ -127,10 +127,11 @@ class Store:
             self.client.set_terminated(run.info.run_id, status)
 
     def log_metrics(self, run: Run, values: dict[str, float]) -> None:
-        """Log final metrics, in one transaction; what is not defined (NaN) is left out."""
+        """Log final metrics, 1000 in one transaction; what is not defined (NaN) is left out."""
         now = int(1000 * time.time())
         metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
-        self.client.log_batch(run.info.run_id, metrics, synchronous=True)
+        for start in range(0, len(metrics), 1000):
+            self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
 
 
 def _where() -> str:

@@ -28,7 +28,7 @@ reload
 trained
 hardware
 plot
-console
+console variants
 run
 sweep
 commands

@@ -114,7 +114,7 @@ def test_the_head_is_as_wide_as_the_task():
 def test_what_an_epoch_logs(monkeypatch):
     network = classifier(hidden=())
     logged = {}
-    monkeypatch.setattr(network, "log", lambda name, value: logged.update({name: value.item()}))
+    monkeypatch.setattr(network, "log", lambda name, value, **_: logged.update({name: value.item()}))
     with torch.no_grad():
         network.head[0].weight.zero_()
         network.head[0].bias.copy_(torch.tensor([1.0, 1.0, -1.0, -1.0]))

@@ -28,7 +28,7 @@ class Numbered:
 
 
 class Trainer:
-    current_epoch = 0
+    current_epoch, world_size, global_rank = 0, 1, 0
 
 
 @pytest.fixture
@@ -49,6 +49,20 @@ def numbers(batches):
 
 def flat(batches):
     return [number for batch in numbers(batches) for number in batch]
+
+
+def test_processes_share_each_batch(make):
+    alone = numbers(make().train_dataloader())
+    parts = []
+    for rank in range(2):
+        data = make()
+        data.trainer.world_size, data.trainer.global_rank = 2, rank
+        parts.append(numbers(data.train_dataloader()))
+        assert flat(data.val_dataloader()) == list(range(23))
+    assert [sorted(one + other) for one, other in zip(*parts, strict=True)][:-1] == [
+        sorted(batch) for batch in alone[:-1]
+    ]
+    assert parts[0][-1] == parts[1][-1] == alone[-1]  # three gestures are too few for two processes
 
 
 def test_an_epoch_shows_every_gesture_once(make):

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import CONF, Evaluation, Tracking, checked, plain
+from skin.config import CONF, ROOT, Evaluation, Tracking, checked, plain
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.reload import TAG, changed, find, operating_point, restore
@@ -238,3 +238,27 @@ def test_a_run_without_its_files_is_refused(store):
     config = checked(composed(*SKIN, "learner=rules"))
     with pytest.raises(InputError, match=r"has no rules\.json in "):
         restore(store, store.client.get_run(run.info.run_id), build_learner(config), None)
+
+
+@pytest.mark.slow
+def test_a_run_of_an_earlier_version_is_evaluated(run, tmp_path):
+    """Its configuration lacks what was added later."""
+    stored = OmegaConf.load(ROOT / "tests" / "earlier_run.yaml")
+    stored.device.update(gestures=64, test_gestures=32)
+    config = checked(stored)
+    learner = build_learner(config)
+    data = build_data(config, build_device(config))
+    data.touches("train")
+    learner.build(data)
+    tracking = Tracking(f"sqlite:///{tmp_path}/m.db", f"{tmp_path}/a", "skin", True, None)
+    store = Store.open(tracking)
+    with store.run("old", {"learned": "weights.pt"}) as trained:
+        store.client.log_text(trained.info.run_id, OmegaConf.to_yaml(stored), "config.yaml")
+        store.client.log_artifact(trained.info.run_id, str(learner.save(tmp_path)))
+    small = ["devices=1", "layouts=1", "gestures=32", "safe_gestures=64"]
+    done = run(tmp_path, "evaluate", "run=latest", *(f"evaluation.{one}" for one in small))
+    assert done.returncode == 0, done.stderr
+    assert "stores no alarm threshold" in done.stderr
+    assert [one.info.run_name for one in store.find("FINISHED", evaluated=trained.info.run_id)] == [
+        "evaluation of old"
+    ]

@@ -1,11 +1,13 @@
 """A run counts as finished only with all its results."""
 
 import re
+import sqlite3
 
 import pytest
 
 import skin.run
 from skin.config import ROOT, checked
+from skin.errors import InputError
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -49,6 +51,8 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
     assert seen == ["RUNNING"]
     (run,) = Store.open(config.tracking).find("FINISHED")
     assert run.data.metrics["parameters"] == 196
+    choices = {group: run.data.params[group] for group in ("representation", "model", "fusion", "learner")}
+    assert choices == {"representation": "graph", "model": "gcn", "fusion": "linked", "learner": "network"}
     assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
     assert skin.run.train(config) is False
     page = (ROOT / "docs" / "mlflow.md").read_text()
@@ -68,3 +72,59 @@ def test_a_run_is_found_by_what_simulated_it_and_not_by_the_name_of_its_data(con
 @pytest.mark.parametrize("device", ["recording", "serial", "cost"])
 def test_a_device_without_simulator_stands_in_its_place(device, configured):
     assert skin.run.tags(configured(f"device={device}"))["simulator"] == device
+
+
+def test_no_threads_are_refused(configured):
+    with pytest.raises(InputError, match=r"tracking\.threads=0 must be at least 1, or null"):
+        skin.run.train(checked(configured("tracking.threads=0")))
+
+
+def logged(folder):
+    """Return name, status and number of training losses of every run."""
+    with sqlite3.connect(folder / "m.db") as database:
+        found = database.execute(
+            "select name, status, (select count(*) from metrics where metrics.run_uuid = runs.run_uuid "
+            "and key = 'train_loss') from runs where name not like 'sweep%' order by name"
+        ).fetchall()
+    database.close()
+    return found
+
+
+@pytest.mark.slow
+def test_two_processes_make_one_run(run, tmp_path):
+    """The second one, which Lightning starts as the command again, neither logs nor prints."""
+    two = ["trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu"]
+    done = run(tmp_path, "train", *SMALL, *two)
+    assert done.returncode == 0, done.stderr
+    ((name, *others),) = logged(tmp_path)
+    assert others == ["FINISHED", 1]
+    assert "devices=2 strategy=ddp" in name
+    assert done.stdout.count("overall/accuracy") == 1
+    assert len([line for line in done.stderr.splitlines() if line.startswith("dangerous")]) == 1
+    assert "GLOBAL_RANK" not in done.stderr
+    again = run(tmp_path, "train", *SMALL)  # on one process
+    assert "did this before" in again.stdout
+
+
+@pytest.mark.slow
+def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
+    two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
+    done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two)
+    assert done.returncode == 0, done.stderr
+    assert [others for name, *others in logged(tmp_path)] == [["FINISHED", 1]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["trainer.strategy=ddp_fork"], "give trainer.strategy=ddp or ddp_spawn"),
+        (["-m", "trainer.strategy=ddp"], "add trainer.strategy=ddp_spawn"),
+    ],
+)
+def test_processes_that_cannot_train_together_are_refused(run, tmp_path, given, said):
+    done = run(tmp_path, "train", *given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out")
+    assert done.returncode in (1, 2)
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not logged(tmp_path)

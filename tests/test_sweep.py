@@ -1,13 +1,21 @@
 """A sweep counts its jobs as Hydra does, tells the time left, goes on after a failure, and resumes."""
 
+import json
 import sqlite3
 import subprocess
 import sys
+from pathlib import Path
+from statistics import fmean, stdev
 
 import pytest
+from hydra import initialize_config_dir
 
-from skin.config import ROOT
+from skin.config import CONF, ROOT, Tracking
 from skin.sweep import Progress, jobs
+from skin.tracking import Store
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
 SMALL = [
     "experiment=rules",
@@ -37,6 +45,25 @@ def test_the_command_line_wins_over_the_sweeps_file():
     assert {job["simulator"] for job in found} == {"fem"}
 
 
+@pytest.mark.parametrize(
+    ("override", "values"),
+    [
+        ("seed=range(0,3)", ["0", "1", "2"]),
+        ("seed=choice(4,2)", ["4", "2"]),
+        ("seed=sort(4,2)", ["2", "4"]),
+        ("model.widths=[32,32],[32,128]", ["[32,32]", "[32,128]"]),
+        ("+device.calibration='a,b.yaml',c.yaml", ["'a,b.yaml'", "c.yaml"]),
+    ],
+)
+def test_every_way_to_write_values_is_hydras(override, values):
+    assert [list(job.values()) for job in jobs([override], {})] == [[value] for value in values]
+
+
+def test_a_glob_means_the_options_of_its_group():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert jobs(["simulator=glob(*)"], {}) == [{"simulator": name} for name in ("fem", "naive", "solid")]
+
+
 def test_nothing_known_gives_no_estimate():
     assert Progress([None, None]).left() is None
 
@@ -64,11 +91,11 @@ def sweep(folder, *overrides):
 
 
 def runs(folder):
-    """Return (name, status, parent) of every run, oldest first."""
+    """Return (name, status, parent) of every run that the UI shows, oldest first."""
     with sqlite3.connect(folder / "m.db") as database:
         found = database.execute(
             "select name, status, (select value from tags where tags.run_uuid = runs.run_uuid "
-            "and key = 'mlflow.parentRunId') from runs order by start_time"
+            "and key = 'mlflow.parentRunId') from runs where lifecycle_stage = 'active' order by start_time"
         ).fetchall()
     database.close()
     return found
@@ -79,7 +106,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
     with begin(tmp_path, *sweep(tmp_path, "seed=0,1,2")) as first:
         next(line for line in first.lines() if line.startswith("[2/3]"))
     assert [one[:2] for one in runs(tmp_path)][:2] == [
-        ("sweep", "RUNNING"),
+        ("seed=0,1,2", "RUNNING"),
         ("rules naive seed 0", "FINISHED"),
     ]
     again = run(tmp_path, *sweep(tmp_path, "seed=0,1,2"), store=False)
@@ -93,7 +120,7 @@ def test_a_sweep_that_was_killed_goes_on_where_it_was(run, begin, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_its_scores(run, tmp_path):
-    given = ["train", *SMALL, "device.offset=0.2", "layout=grid"]
+    given = ["train", *SMALL, "device.offset=0.2", "layout=grid", "model=mlp"]
     first = run(tmp_path, *given)
     assert first.returncode == 0, first.stderr
     with sqlite3.connect(tmp_path / "m.db") as database:
@@ -103,6 +130,8 @@ def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_it
     assert name.startswith("rules naive ")
     assert name.endswith(" offset=0.2 layout=grid seed 0")
     assert (params["device.offset"], params["layout"], params["seed"]) == ("0.2", "grid", "0")
+    assert params["learner"] == "rules"
+    assert not {"representation", "model", "fusion"} & set(params)  # rules use none of them
     again = run(tmp_path, *given)
     assert again.returncode == 0, again.stderr
     assert "did this before" in again.stdout
@@ -118,6 +147,86 @@ def test_a_bad_job_fails_and_the_others_run(run, tmp_path):
     assert "offset" in done.stderr
     assert [one[:2] for one in runs(tmp_path) if one[2]] == [("rules naive offset=0.1 seed 0", "FINISHED")]
     assert [status for name, status, parent in runs(tmp_path) if not parent] == ["FAILED"]
+
+
+def parents(folder):
+    """Return the parent runs of sweeps, newest first, and a function that reads the table of one."""
+    store = Store.open(Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None))
+
+    def table(run):
+        path = store.client.download_artifacts(run.info.run_id, "variants.json", str(folder))
+        content = json.loads(Path(path).read_text())
+        return [dict(zip(content["columns"], row, strict=True)) for row in content["data"]]
+
+    return [run for run in store.find() if "sweep" in run.data.tags], table
+
+
+@pytest.mark.slow
+def test_a_parent_tells_mean_and_deviation_over_seeds_of_runs_old_and_new(run, tmp_path):
+    for seeds in ("0,1", "1,0", "shuffle(0,1,2)"):
+        done = run(tmp_path, *sweep(tmp_path, f"seed={seeds}"), store=False)
+        assert done.returncode == 0, done.stderr
+    labels = [line for line in done.stdout.splitlines() if line.endswith("finished before")]
+    assert sorted(line.split()[1] for line in labels) == ["seed=0", "seed=1"]
+    (second, first), table = parents(tmp_path)  # the one in between trained nothing
+    assert (first.info.run_name, first.info.status) == ("seed=0,1", "FINISHED")
+    children = {one[0]: one[2] for one in runs(tmp_path) if one[2]}
+    assert children == {
+        "rules naive seed 0": first.info.run_id,
+        "rules naive seed 1": first.info.run_id,
+        "rules naive seed 2": second.info.run_id,
+    }
+    store = Store.open(Tracking(f"sqlite:///{tmp_path}/m.db", f"{tmp_path}/a", "skin", True, None))
+    name = "same/overall/accuracy"
+    values = [one.data.metrics[name] for one in store.find("FINISHED", row="rules")]
+    for parent, count in ((first, 2), (second, 3)):
+        metrics = parent.data.metrics
+        assert metrics["n"] == count
+        assert metrics[f"mean/{name}"] == pytest.approx(fmean(values[-count:]))
+        assert metrics[f"sd/{name}"] == pytest.approx(stdev(values[-count:]))
+        (row,) = table(parent)
+        assert row["n"] == count
+        assert row[f"mean/{name}"] == pytest.approx(metrics[f"mean/{name}"])
+        assert len(row["runs"].split()) == count
+
+
+@pytest.mark.slow
+def test_a_parent_has_a_row_per_variant(run, tmp_path):
+    swept = ["model=mlp", "device.gain_spread=0.05,0.1", "model.widths=[8,8],[8,16]", "seed=0"]
+    done = run(tmp_path, *sweep(tmp_path, *swept), store=False)
+    assert done.returncode == 0, done.stderr
+    (parent,), table = parents(tmp_path)
+    assert parent.info.run_name == "device.gain_spread=0.05,0.1 × model.widths=[8,8],[8,16]"
+    rows = table(parent)
+    assert [(row["device.gain_spread"], row["model.widths"], row["n"]) for row in rows] == [
+        ("0.05", "[8,8]", 1),
+        ("0.05", "[8,16]", 1),
+        ("0.1", "[8,8]", 1),
+        ("0.1", "[8,16]", 1),
+    ]
+    assert not parent.data.metrics  # a list is no name of a metric
+
+
+@pytest.mark.slow
+def test_parallel_jobs_end_in_a_finished_parent(run, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    parallel = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    done = run(tmp_path, *sweep(tmp_path, "device.gain_spread=0.05,0.1", *parallel), store=False)
+    assert done.returncode == 0, done.stderr
+    (parent,), _ = parents(tmp_path)
+    assert parent.info.status == "FINISHED"
+    for value in (0.05, 0.1):
+        assert parent.data.metrics[f"n/device.gain_spread {value}"] == 1
+        assert f"mean/same/overall/accuracy/device.gain_spread {value}" in parent.data.metrics
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [["device.offset=-1,-2"], ["seed=x,y"], ["model=cn", "seed=0,1"]])
+def test_a_sweep_that_trains_nothing_leaves_no_parent(run, tmp_path, given):
+    done = run(tmp_path, *sweep(tmp_path, *given), store=False)
+    assert done.returncode in (1, 2)
+    assert given[0].split("=")[1].split(",")[0] in done.stderr
+    assert not (tmp_path / "m.db").exists() or not runs(tmp_path)
 
 
 def test_what_no_job_could_accept_is_refused_once():

@@ -1,16 +1,18 @@
 """Learning by gradient descent."""
 
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
+from annotated_types import Ge, Le, Lt
 from torch import Tensor
 
+from skin.config import PARENT
 from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
 from skin.learner.base import AbstractLearner
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from pytorch_lightning import Callback, Trainer
     from pytorch_lightning.loggers import Logger
 
-    from skin.classifier import MakeOptimizer, TouchClassifier
+    from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
 __all__ = ["Network"]
@@ -50,18 +52,18 @@ class Network(AbstractLearner):
         self,
         model: Callable[..., Any],
         fusion: Callable[..., AbstractFusion],
-        optimizer: "MakeOptimizer",
+        optimizer: Callable[..., Any],
         trainer: dict[str, Any],
-        hidden: Sequence[int] = (32,),
+        hidden: Sequence[Annotated[int, Ge(1)]] = (32,),
         activation: str = "relu",
-        warmup: float | None = None,
-        dropout: float = 0.0,
+        warmup: Annotated[float, Ge(0), Le(1)] | None = None,
+        dropout: Annotated[float, Ge(0), Lt(1)] = 0.0,
         seed: int = 0,
     ) -> None:
         self._fusion = partial(fusion, model)
         self._optimizer, self._trainer = optimizer, dict(trainer)
         self._hidden, self._activation, self._seed = hidden, activation, seed
-        self._warmup, self._dropout = warmup, dropout
+        self._warmup, self._dropout = None if warmup is None else float(warmup), dropout
         self._data: TouchData | None = None
         self._classifier: TouchClassifier | None = None
 
@@ -81,6 +83,8 @@ class Network(AbstractLearner):
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train on the training split; validation chooses the epoch.
 
+        Where several processes train together, only the first has what was learned.
+
         Raises:
             InputError: the choices do not fit each other or the data.
         """
@@ -88,19 +92,21 @@ class Network(AbstractLearner):
 
         from skin.learner._clock import Clock
 
-        clock = Clock()
         with torch.random.fork_rng(), TemporaryDirectory() as folder:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
+            clock = Clock(Path(folder) / "seconds.json")
             trainer = self._trainer_of(logger, [best, clock], folder)
             with warnings.catch_warnings():
                 # Lightning 2.6 asks torch 2.13 for a deprecated class
                 warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
                 trainer.fit(classifier, datamodule=data)
+            if not trainer.is_global_zero:
+                return
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
             classifier.load_state_dict(weights["state_dict"])
-        self.seconds_per_epoch = median(clock.seconds)
+            self.seconds_per_epoch = clock.median()
 
     def _trainer_of(
         self, logger: "Logger | None", callbacks: "list[Callback]", folder: str | None = None
@@ -115,11 +121,11 @@ class Network(AbstractLearner):
 
         settings = {"enable_progress_bar": False, "num_sanity_val_steps": 0} | self._trainer
         epochs, theirs = settings.get("max_epochs"), settings.pop("logger", None)
-        if not isinstance(epochs, int) or epochs < 1:
+        if type(epochs) is not int or epochs < 1:
             raise InputError(f"trainer.max_epochs={epochs} must be a whole number from 1 up")
         loggers = [one for one in (logger, *(theirs if isinstance(theirs, list) else [theirs])) if one]
         try:
-            return Trainer(
+            trainer = Trainer(
                 **settings | {"callbacks": [*callbacks, *(settings.get("callbacks") or [])]},
                 logger=loggers or False,
                 enable_model_summary=False,
@@ -127,6 +133,8 @@ class Network(AbstractLearner):
             )
         except (TypeError, ValueError, MisconfigurationException) as error:
             raise InputError(f"pytorch_lightning.Trainer refuses trainer: {sentence(error)}") from error
+        _check(trainer)
+        return trainer
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that the model takes."""
@@ -194,3 +202,29 @@ class Network(AbstractLearner):
         self._data, self._classifier = data, classifier
         self.parameters = sum(p.numel() for p in classifier.parameters() if p.requires_grad)
         return classifier
+
+
+def _check(trainer: "Trainer") -> None:
+    """Refuse what Lightning takes and this program cannot do.
+
+    Raises:
+        InputError: naming what it can.
+    """
+    from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
+
+    launcher = trainer.strategy.launcher
+    if isinstance(launcher, _SubprocessScriptLauncher) and PARENT in os.environ:
+        raise InputError(
+            f"trainer.devices={trainer.num_devices} would start a whole sweep again for each process: add "
+            "trainer.strategy=ddp_spawn"
+        )
+    if isinstance(launcher, _MultiProcessingLauncher) and launcher.is_interactive_compatible:
+        raise InputError(
+            "trainer.strategy starts processes as forks, which must not use the database of runs: give "
+            "trainer.strategy=ddp or ddp_spawn"
+        )
+    if trainer.precision not in ("32-true", "16-mixed", "bf16-mixed"):
+        raise InputError(
+            f"trainer.precision={trainer.precision} would change the touches too: give 32-true, 16-mixed or "
+            "bf16-mixed"
+        )

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from benchmarks import layers
+from experiments.benchmarks import layers
 from skin.model._pooling import POOLINGS
 
 

@@ -65,6 +65,12 @@ def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_de
         (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
         (["learner.activation=sine"], "activation=relu, elu or silu"),
         (["fusion.head=sum"], "set fusion.head to one of"),
+        (["learner.hidden=[8,0]"], r"learner.hidden=\[8, 0\] must be greater than or equal to 1"),
+        (["learner.hidden=8"], "learner.hidden=8 must be a list"),
+        (["learner.dropout=1"], "learner.dropout=1 must be less than 1"),
+        (["learner.warmup=-0.1"], "learner.warmup=-0.1 must be greater than or equal to 0"),
+        (["trainer.max_epochs=1.5"], "trainer.max_epochs=1.5 must be a whole number from 1 up"),
+        (["trainer.precision=bf16-true"], "give 32-true, 16-mixed or bf16-mixed"),
     ],
 )
 def test_choices_that_do_not_fit_are_refused(overrides, words, configured, made_up_device):
@@ -115,3 +121,27 @@ def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_devi
     for name in ("ours", "theirs"):
         lines = next((tmp_path / name).rglob("metrics.csv")).read_text().splitlines()
         assert len(lines) == 3  # validation and training of the first epoch, in which it stops
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["representation=image", "model=cnn"],
+        ["representation=graph", "model=gcn", "model.norm=batch", "fusion=early"],
+        ["representation=graph", "model=pyg"],
+        ["representation=measured", "model=mlp", "fusion.head=residual"],
+        ["representation=graph", "model=transformer", "fusion.head=transformer"],
+    ],
+)
+def test_it_trains_with_half_of_the_bits(configured, made_up_device, overrides):
+    config = configured(*overrides, "trainer.max_epochs=1", "trainer.precision=bf16-mixed")
+    learner = build_learner(config)
+    learner.fit(TouchData(made_up_device, instantiate(config.representation), 32))
+    found = learner.probabilities(made_up_device.touches("test"))
+    assert found.dtype == torch.float32
+    assert found.isfinite().all()
+
+
+def test_a_learning_rate_may_fall_from_the_start(configured, made_up_device):
+    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1", "learner.warmup=0")
+    build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))

@@ -10,10 +10,11 @@ from skin.config import ROOT
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
 errors interrupt paths
+settings
 refusal identity labels rng material model lag sensors trust
 config recording body
 command
-files foreign description layout summary plausible settings
+files foreign description layout summary plausible
 storage touch tracking
 simulator
 contact

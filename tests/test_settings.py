@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live.settings import Settings
-from skin.settings import check
+from skin.settings import RISING, check, checked, configured
 
 
 class Thing:
@@ -24,6 +24,7 @@ class Thing:
         name: str = "",
         on: bool = False,
         copies: Mapping[str, int] | None = None,
+        span: Annotated[tuple[float, float], RISING] = (1, 10),
     ) -> None:
         pass
 
@@ -50,6 +51,16 @@ def test_what_fits_is_taken():
         ({"widths": 8}, "thing.widths=8 must be a list"),
         ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a valid integer"),
         ({"name": 1}, "thing.name=1 must be a valid string"),
+        ({"count": 2.0}, "thing.count=2.0 must be a whole number"),
+        ({"count": True}, "thing.count=True must be a whole number"),
+        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] is text, and must be a number"),
+        ({"share": -1j}, "thing.share=.*: as in thing.share=0.5$"),
+        (
+            {"span": [2, 1]},
+            r"thing.span=\[2, 1\] must be a range .*: as in thing.span=\[1,10\]$",
+        ),
+        ({"span": [2]}, r"thing.span=\[2\] has too few entries"),
+        ({"span": [1, 2, 3]}, r"thing.span=\[1, 2, 3\] has too many entries"),
         ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
         ({"zzz": 1}, "thing has no setting zzz: it has count"),
     ],
@@ -57,6 +68,27 @@ def test_what_fits_is_taken():
 def test_what_does_not_fit_is_refused_by_name(wrong, said):
     with pytest.raises(InputError, match=f"^{said}"):
         check(Thing, FIT | wrong, "thing")
+
+
+def test_settings_that_are_all_are_missed_by_name():
+    with pytest.raises(InputError, match=r"^thing needs made, got count$"):
+        configured(Thing, {"count": 1}, "thing")
+    with pytest.raises(InputError, match=r"^thing has no setting mad: did you mean made"):
+        configured(Thing, {"mad": 1}, "thing")
+
+
+def test_a_checked_class_refuses_what_a_script_gives_it():
+    @checked("pair")
+    class Pair:
+        def __init__(self, first: Annotated[int, Ge(1)], second: float = 0.5) -> None:
+            self.sum = first + second
+
+    assert Pair(1, second=2).sum == 3
+    for given in ({"first": 0}, {"first": 1.5}, {"first": 1, "second": "x"}):
+        with pytest.raises(InputError, match=r"^pair[.]"):
+            Pair(**given)
+    with pytest.raises(TypeError, match="third"):
+        Pair(1, third=2)
 
 
 SMALL = ["simulator=naive", "data.gestures=20"]

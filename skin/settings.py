@@ -50,6 +50,8 @@ def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, wh
     Raises:
         InputError: naming the setting, its value and what is valid.
     """
+    if not isinstance(settings, Mapping):
+        raise InputError(f"{name} must be settings by name, got {settings!r}")
     parameters = signature(target).parameters
     hints = _hints(target)
     required = [key for key, its in parameters.items() if its.default is its.empty]

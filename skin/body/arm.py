@@ -5,14 +5,16 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from pydantic import PositiveFloat
 
-from skin.body._given import positive
 from skin.body.base import AbstractBody
 from skin.errors import InputError
+from skin.settings import checked
 
 __all__ = ["Arm"]
 
 
+@checked("body")
 @dataclass(frozen=True)
 class Arm(AbstractBody):
     """Layers glued around a hard core, over a part of its circumference: a sheet rolled up (docs/adr/0010).
@@ -35,19 +37,13 @@ class Arm(AbstractBody):
     """
 
     size: tuple[float, float] = field(init=False)
-    radius: float = field(kw_only=True)
-    length: float = field(kw_only=True)
-    angle: float = field(kw_only=True)
+    radius: PositiveFloat = field(kw_only=True)
+    length: PositiveFloat = field(kw_only=True)
+    angle: PositiveFloat = field(kw_only=True)
 
     flat: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        for name, example in (("radius", "0.05"), ("length", "0.16"), ("angle", "3.2")):
-            if not positive(value := getattr(self, name)):
-                unit = "an angle in rad" if name == "angle" else "a length in m"
-                raise InputError(
-                    f"body.{name} must be {unit} above 0, got {value!r}: as in body.{name}={example}"
-                )
         if self.angle >= 2 * math.pi:
             raise InputError(
                 f"body.angle={self.angle:g} rad is a full turn: a sleeve that closes has no edge, and "

@@ -4,13 +4,15 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Ge
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
-from skin.body._given import Layer, cells_of, layers_of, size_of
+from skin.body._given import Layer, layers_of
 from skin.body._memory import require_memory
-from skin.body._variation import along, check_variation, factors
+from skin.body._variation import along, factors
 
 if TYPE_CHECKING:
     from skin.sensors import Sensors
@@ -47,18 +49,17 @@ class AbstractBody(ABC):
             unknown material, a variation below 0, or more cells than memory allows.
     """
 
-    size: tuple[float, float]
-    cells: tuple[int, int]
+    size: tuple[PositiveFloat, PositiveFloat]
+    cells: tuple[Annotated[int, Ge(2)], Annotated[int, Ge(2)]]
     layers: tuple[Layer, ...]
-    variation: float = 0.0
-    variation_seed: int = 0
+    variation: NonNegativeFloat = 0.0
+    variation_seed: NonNegativeInt = 0
 
     flat: ClassVar[bool]
 
     def __post_init__(self) -> None:
-        check_variation(self.variation, self.variation_seed)
-        object.__setattr__(self, "size", size_of(self.size))
-        object.__setattr__(self, "cells", cells_of(self.cells))
+        object.__setattr__(self, "size", tuple(map(float, self.size)))
+        object.__setattr__(self, "cells", tuple(self.cells))
         object.__setattr__(self, "layers", layers_of(self.layers))
         require_memory(
             _BYTES_PER_CELL * math.prod(self.cells),

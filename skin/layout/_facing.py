@@ -1,12 +1,15 @@
 """Which way sensors face: unit vectors in the local frame (x, y, into the skin)."""
 
 import math
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
 
-from skin.errors import InputError
+__all__ = ["Tilt", "rosette"]
 
-__all__ = ["rosette"]
+Tilt = Annotated[float, Ge(0), Lt(math.pi / 2)]
+"""Angle between the normals of a sensor and of the surface, rad."""
 
 _WAYS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
@@ -21,16 +24,7 @@ def rosette(rows: int, columns: int, tilt: float) -> np.ndarray:
         rows: number of rows (along y).
         columns: number of columns (along x).
         tilt: angle between the sensors' normals and the surface's, rad, from 0 to below pi / 2.
-
-    Raises:
-        InputError: another tilt.
     """
-    number = isinstance(tilt, int | float) and not isinstance(tilt, bool)
-    if not number or not 0 <= tilt < math.pi / 2:
-        raise InputError(
-            f"layout.tilt must be an angle in rad from 0 to below pi/2 = 1.5708, got {tilt!r}: "
-            "as in layout.tilt=0.5236, which is 30 degrees"
-        )
     row, column = np.divmod(np.arange(rows * columns), columns)
     lean = math.sin(tilt) * _WAYS[(column + 2 * row) % 4]
     # Without a tilt, -0.0 would be another key to stored operators than 0.0.

@@ -1,15 +1,16 @@
 """Check that sensors fit where a layout puts them."""
 
-import math
-from collections.abc import Sequence
-
 import numpy as np
+from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.sensors import Sensors
 
-__all__ = ["place"]
+__all__ = ["Footprint", "place"]
+
+Footprint = tuple[PositiveFloat, PositiveFloat]
+"""Extent (x, y) over which a sensor feels, m."""
 
 # Two sensors closer than this in the plane are at one place, m.
 _APART = 1e-6
@@ -20,7 +21,7 @@ def place(
     x: np.ndarray,
     y: np.ndarray,
     depth: np.ndarray | float | None,
-    footprint: Sequence[float],
+    footprint: Footprint,
     normals: np.ndarray | None = None,
 ) -> Sensors:
     """Return sensors at x and y, each (S,), m, and depth, of each or of all; None: ``body.sensor_depth``.
@@ -28,23 +29,17 @@ def place(
     Their normals (S, 3), unit vectors, are those of the surface if none are given.
 
     Raises:
-        InputError: a footprint that is not two positive lengths, a depth that is no number, a sensor outside
+        InputError: a depth that is no number, a sensor outside
             the body or deeper than it, or two sensors at one place in the plane, whatever their depths:
             images and graphs are flat.
     """
-    lengths = [float(extent) for extent in footprint]
-    if len(lengths) != 2 or not all(math.isfinite(extent) and extent > 0 for extent in lengths):
-        raise InputError(
-            f"layout.footprint must be two positive lengths (x, y) in m, got {list(footprint)}: "
-            "as in layout.footprint=[0.01,0.01]"
-        )
     depths = np.asarray(body.sensor_depth if depth is None else depth)
     if depths.dtype.kind not in "if":
         raise InputError(f"layout.depth must be a length in m or null, got {depth!r}: as in 0.004")
     positions = np.column_stack([x, y, np.broadcast_to(depths, x.shape)])
     _inside(body, positions)
     _apart(positions)
-    extent = lengths[0], lengths[1]
+    extent = float(footprint[0]), float(footprint[1])
     return Sensors(positions, extent) if normals is None else Sensors(positions, extent, normals)
 
 

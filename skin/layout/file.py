@@ -2,17 +2,18 @@
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout._place import place
+from skin.layout._place import Footprint, place
 from skin.layout.base import AbstractLayout
 from skin.paths import candidates
 from skin.sensors import Sensors
+from skin.settings import checked
 
 __all__ = ["File"]
 
@@ -24,6 +25,7 @@ _FACING = ("normal_x", "normal_y", "normal_z")
 _PLACE = ("x_m", "y_m", "depth_m")
 
 
+@checked("layout")
 class File(AbstractLayout):
     """Sensors of a CSV file with the columns ``x_m``, ``y_m`` and optionally ``depth_m``, all m.
 
@@ -42,9 +44,7 @@ class File(AbstractLayout):
             without a length, with its line.
     """
 
-    def __init__(
-        self, path: str, footprint: Sequence[float] = (0.01, 0.01), depth: float | None = None
-    ) -> None:
+    def __init__(self, path: str, footprint: Footprint = (0.01, 0.01), depth: float | None = None) -> None:
         self.path = _find(path)
         self.places = _read(self.path)
         self.footprint = footprint

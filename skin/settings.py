@@ -25,7 +25,8 @@ _FINITE = ConfigDict(allow_inf_nan=False)
 _INNER = {"contact", "fusion", "model", "simulator"}
 _SCALARS = {int, float, bool, str, Path, NoneType, Ellipsis}
 _COLLECTIONS = {Union, UnionType, Sequence, Mapping, list, tuple, dict}
-_LENGTHS = {"missing": "has too few entries", "too_long": "has too many entries"}
+_FEW = "has too few entries"
+_LENGTHS = {"missing": _FEW, "too_short": _FEW, "too_long": "has too many entries"}
 
 
 def _rising(given: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -68,7 +69,8 @@ def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, wh
         if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
             default = _written(parameters[key].default)
             example = f": as in {name}.{key}={default}" if default else ""
-            raise InputError(f"{name}.{key}={value} {wrong}{example}")
+            shown = list(value) if isinstance(value, tuple) else value
+            raise InputError(f"{name}.{key}={shown} {wrong}{example}")
     if whole and (missing := [key for key in required if key not in settings]):
         raise InputError(f"{name} needs {' and '.join(missing)}, got {', '.join(settings) or 'nothing'}")
 

@@ -121,7 +121,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         ([*SERIAL, "device.tare=inf"], "device.tare=inf must be a finite number"),
         ([*SERIAL, "device.limits=[a,b]"], "device.limits=.* must be a valid number"),
         ([*SERIAL, "device.limits=[1023,0]"], r"device.limits must be \[smallest, largest\]"),
-        ([*SERIAL, "device.limits=[1]"], r"device.limits must be \[smallest, largest\]"),
+        ([*SERIAL, "device.limits=[1]"], r"device.limits=\[1\] has too few entries"),
     ],
 )
 def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides, said):

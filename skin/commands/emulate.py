@@ -27,9 +27,11 @@ def main(config: DictConfig) -> None:
     from skin.hardware.emulator.emulator import Emulator, Settings
     from skin.hardware.emulator.faults import Faults
     from skin.hardware.emulator.outlet import outlet
+    from skin.settings import configured
 
     groups = plain(config)
-    settings, faults = Settings.of(groups["emulate"]), Faults.of(groups["faults"])
+    settings = configured(Settings, groups["emulate"], "emulate")
+    faults = configured(Faults, groups["faults"], "faults")
     device = build_device(config)
     if not isinstance(device, Simulated):
         raise InputError("only simulated gestures can be emulated: leave out device=")

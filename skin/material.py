@@ -82,7 +82,7 @@ class Material:
         """
         if isinstance(given, Material):
             return given
-        constants = {"name": given} if isinstance(given, str) else given
+        constants: Any = {"name": given} if isinstance(given, str) else given
         if not isinstance(constants, Mapping) or "name" not in constants:
             raise InputError(f"a material is a name or {{name, young, poisson}}, got {given!r}; {_known()}")
         name = str(constants["name"])

@@ -1,13 +1,16 @@
 """How a sequence of embeddings becomes one."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from skin.model._attention import encoder
 
-__all__ = ["HEADS"]
+__all__ = ["HEADS", "Head"]
+
+Head = Literal["mean", "max", "conv", "lstm", "gru", "attention+gru", "residual", "transformer"]
 
 
 class Mean(nn.Module):
@@ -125,7 +128,7 @@ class Residual(nn.Module):
         return torch.cat([states.amax(dim=-1), states.mean(dim=-1)], dim=1)
 
 
-HEADS: dict[str, Callable[[int, int], nn.Module]] = {
+HEADS: dict[Head, Callable[[int, int], nn.Module]] = {
     "mean": Mean,
     "max": Max,
     "conv": Convolution,

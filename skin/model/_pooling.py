@@ -1,11 +1,14 @@
 """How the nodes of a graph become one vector."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-__all__ = ["POOLINGS"]
+__all__ = ["POOLINGS", "Pooling"]
+
+Pooling = Literal["max", "mean", "attention", "set2set"]
 
 STEPS = 3  # of Set2Set
 
@@ -72,7 +75,7 @@ class Set2Set(nn.Module):
         return torch.cat([query, read], dim=-1)
 
 
-POOLINGS: dict[str, Callable[[int], nn.Module]] = {
+POOLINGS: dict[Pooling, Callable[[int], nn.Module]] = {
     "max": Max,
     "mean": Mean,
     "attention": Attention,

@@ -8,12 +8,14 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.material import MATERIALS
 from skin.sensors import Sensors
+from skin.settings import checked
 from skin.simulator import _store
 from skin.simulator._elastic import Elastic
 from skin.simulator._footprint import quadrature
@@ -32,6 +34,7 @@ _SOURCES = [
 _INWARDS = 2
 
 
+@checked("simulator")
 class Solid(AbstractSimulator):
     """Layers of nearly incompressible elastic solid, glued to something hard.
 
@@ -62,7 +65,7 @@ class Solid(AbstractSimulator):
         self,
         body: AbstractBody,
         sensors: Sensors,
-        divisions: int = 3,
+        divisions: PositiveInt = 3,
         poisson: Mapping[str, float] | None = None,
         cache: str | Path | None = None,
     ) -> None:
@@ -175,11 +178,6 @@ def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) 
     Raises:
         InputError: as of :class:`Solid`.
     """
-    if type(divisions) is not int or divisions < 1:
-        raise InputError(
-            f"simulator.divisions must be a whole number of at least 1, got {divisions}: as in "
-            "simulator.divisions=3"
-        )
     ratios = _ratios(body, poisson)
     depths, young, ratio = [0.0], [], []
     for number in reversed(range(len(body.layers))):

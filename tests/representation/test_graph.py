@@ -86,11 +86,14 @@ def test_normalised_by_hand():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"edges": "ring"}, "representation.edges=knn or delaunay"),
+        ({"edges": "ring"}, "representation.edges=ring must be 'knn' or 'delaunay'"),
         ({"count": 0}, "representation.count=6"),
-        ({"weight": "density"}, "representation.weight=exp, distance, stiffness or none"),
+        (
+            {"weight": "density"},
+            "representation.weight=density must be 'exp', 'distance', 'stiff",
+        ),
         ({"weight": "stiffness"}, "set representation.body="),
-        ({"positions": "moving"}, "representation.positions=layout or deformed"),
+        ({"positions": "moving"}, "representation.positions=moving must be 'layout' or 'deformed'"),
         ({"positions": "deformed", "weight": "none"}, "changes nothing at representation.weight=none"),
     ],
 )

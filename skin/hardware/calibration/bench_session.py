@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -85,7 +85,8 @@ def read(path: str | Path, indenter: str, radius: float, unit: str | None = None
         table = table.append_column("time", [time])
     rows = gauges.of_table(table, str(path), indenter, radius) if inside else None
     try:
-        return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+        known: Any = unit or about.get("unit", "N")
+        return Session(time, raw, known, rows, about.get("bits"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -97,10 +97,9 @@ class TouchData(pl.LightningDataModule):
 
     def frames(self, touches: Touches) -> Batch:
         """Return the frames of touches and their labels (B, L), on the touches' device."""
-        if touches.labels is None:
-            raise InputError("touches without labels cannot be learnt from: record them with labels")
+        labels = touches.known_labels
         representation = self.representation_for(touches.positions.cpu()).to(touches.readings.device)
-        return representation.show(touches), touches.labels
+        return representation.show(touches), labels
 
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""

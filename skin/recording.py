@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from skin.errors import InputError
 from skin.labels import Task
 
 __all__ = ["Recording", "Touches", "digest", "join"]
@@ -74,6 +75,17 @@ class Touches:
             None if self.motion is None else self.motion[index],
             None if self.saturated is None else self.saturated[index],
         )
+
+    @property
+    def known_labels(self) -> Tensor:
+        """The labels, (B, L).
+
+        Raises:
+            InputError: nobody knows them.
+        """
+        if self.labels is None:
+            raise InputError("touches without labels cannot be learnt from: record them with labels")
+        return self.labels
 
     def to(self, device: torch.device | str) -> "Touches":
         """Return these touches with every tensor on ``device``."""

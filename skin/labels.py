@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
 import torch
-from annotated_types import Gt, Lt
+from annotated_types import Gt, Lt, MinLen
 from torch import Tensor
 
-from skin.settings import checked
+from skin.settings import ONCE, checked
 
 __all__ = [
     "OPPOSITE",
@@ -42,7 +42,7 @@ class Task:
         ValueError: a gate that is no label, or a gate or a direction beside labels that are not binary.
     """
 
-    names: tuple[str, ...]
+    names: Annotated[tuple[str, ...], MinLen(1), ONCE]
     kind: Literal["binary", "exclusive"] = "binary"
     gate: str | None = None
     direction: bool = False

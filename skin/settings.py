@@ -17,14 +17,15 @@ from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
 from skin.errors import InputError
 
-__all__ = ["RISING", "check", "check_groups", "checked", "configured"]
+__all__ = ["ONCE", "RISING", "check", "check_groups", "checked", "configured"]
 
 _Made = TypeVar("_Made")
 
 _FINITE = ConfigDict(allow_inf_nan=False)
 _INNER = {"contact", "fusion", "model", "simulator"}
-_SCALARS = {int, float, bool, str, Path, NoneType, Ellipsis}
+_SCALARS = {int, float, bool, str, dict, Path, NoneType, Ellipsis}
 _COLLECTIONS = {Union, UnionType, Sequence, Mapping, list, tuple, dict}
+_LONG = 80  # characters of a value, in a message
 _FEW = "has too few entries"
 _LENGTHS = {"missing": _FEW, "too_short": _FEW, "too_long": "has too many entries"}
 
@@ -35,8 +36,16 @@ def _rising(given: tuple[Any, Any]) -> tuple[Any, Any]:
     return given
 
 
+def _once(given: Sequence[str]) -> Sequence[str]:
+    if len(set(given)) < len(given):
+        raise ValueError("must hold each name once")
+    return given
+
+
 RISING = AfterValidator(_rising)
 """Makes a pair a range: ``Annotated[tuple[float, float], RISING]``."""
+ONCE = AfterValidator(_once)
+"""Makes a list one of different names."""
 
 
 def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, whole: bool = False) -> None:
@@ -69,7 +78,8 @@ def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, wh
         if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
             default = _written(parameters[key].default)
             example = f": as in {name}.{key}={default}" if default else ""
-            shown = list(value) if isinstance(value, tuple) else value
+            shown = str(list(value) if isinstance(value, tuple) else value)
+            shown = shown if len(shown) <= _LONG else f"{shown[:_LONG]}..."
             raise InputError(f"{name}.{key}={shown} {wrong}{example}")
     if whole and (missing := [key for key in required if key not in settings]):
         raise InputError(f"{name} needs {' and '.join(missing)}, got {', '.join(settings) or 'nothing'}")

@@ -4,8 +4,7 @@ import numpy as np
 from pydantic import PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.layout._facing import Tilt, rosette
-from skin.layout._grid import grid
+from skin.layout._grid import Tilt, grid, rosette
 from skin.layout._place import Footprint, place
 from skin.layout.base import AbstractLayout
 from skin.sensors import Sensors

@@ -7,8 +7,7 @@ from annotated_types import Ge, Lt
 from pydantic import NonNegativeInt, PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.layout._facing import Tilt, rosette
-from skin.layout._grid import grid
+from skin.layout._grid import Tilt, grid, rosette
 from skin.layout._place import Footprint, place
 from skin.layout.base import AbstractLayout
 from skin.sensors import Sensors

@@ -13,11 +13,10 @@ from skin.errors import InputError
 from skin.sensors import Sensors
 from skin.settings import checked
 from skin.simulator._assembly import Constraint, Structure
-from skin.simulator._frames import flatten
 from skin.simulator._operator import Operator, cached
 from skin.simulator._store import folder
 from skin.simulator._strain import largest, squeeze
-from skin.simulator.base import AbstractSimulator, Response
+from skin.simulator.base import AbstractSimulator, Response, flatten
 
 __all__ = ["PlatesAndBeams", "Reading"]
 

@@ -19,10 +19,9 @@ from skin.settings import checked
 from skin.simulator import _store
 from skin.simulator._elastic import Elastic
 from skin.simulator._footprint import quadrature
-from skin.simulator._frames import flatten
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator._strain import largest, solid_rows
-from skin.simulator.base import AbstractSimulator, Response
+from skin.simulator.base import AbstractSimulator, Response, flatten
 
 __all__ = ["Solid", "hexahedra", "readings"]
 

@@ -22,6 +22,7 @@ Draws = dict[str, np.ndarray]
 
 _From0 = Annotated[tuple[NonNegativeFloat, PositiveFloat], RISING]
 _Above0 = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
+_Tap = Annotated[tuple[PositiveInt, Annotated[int, Ge(2)]], RISING]  # one that slides lasts 2 frames
 _Frames = Annotated[tuple[PositiveInt, PositiveInt], RISING]
 
 
@@ -48,7 +49,7 @@ class GestureSettings:
     )
     small_area: _From0 = (0.01, 0.30)
     big_area: _From0 = (0.30, 0.70)
-    tap: _Frames = (1, 3)
+    tap: _Tap = (1, 3)
     press: _Frames = (4, 20)
     safe_peak: _Above0 = (10e3, 90.5e3)
     dangerous_peak: _Above0 = (90.5e3, 180e3)
@@ -94,10 +95,6 @@ class GestureSettings:
                     f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: touch.thresholds and "
                     "touch.window decide"
                 )
-        if self.tap[1] < 2:
-            raise InputError(
-                f"a touch slides over at least 2 frames, got touch.tap={list(self.tap)}: use [1,3]"
-            )
         if self.path > self.speed[1]:
             raise InputError(
                 f"touch.path={self.path} m is longer than the fastest touch moves in a frame "

@@ -7,34 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from skin.model._attention import encoder
+from skin.model._pooling import Reduced
 
 __all__ = ["HEADS", "Head"]
 
 Head = Literal["mean", "max", "conv", "lstm", "gru", "attention+gru", "residual", "transformer"]
-
-
-class Mean(nn.Module):
-    """The mean over time."""
-
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (B, E) of x (B, T, E)."""
-        return x.mean(dim=1)
-
-
-class Max(nn.Module):
-    """The maximum over time."""
-
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (B, E) of x (B, T, E)."""
-        return x.amax(dim=1)
 
 
 class Convolution(nn.Module):
@@ -129,8 +106,8 @@ class Residual(nn.Module):
 
 
 HEADS: dict[Head, Callable[[int, int], nn.Module]] = {
-    "mean": Mean,
-    "max": Max,
+    "mean": lambda width, hidden: Reduced(width, torch.mean, 1),
+    "max": lambda width, hidden: Reduced(width, torch.amax, 1),
     "conv": Convolution,
     "lstm": lambda width, hidden: Recurrent(nn.LSTM(width, hidden, batch_first=True)),
     "gru": lambda width, hidden: Recurrent(nn.GRU(width, hidden, batch_first=True)),

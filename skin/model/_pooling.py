@@ -1,40 +1,35 @@
 """How the nodes of a graph become one vector."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-__all__ = ["POOLINGS", "Pooling"]
+__all__ = ["POOLINGS", "Pooling", "Reduced"]
 
 Pooling = Literal["max", "mean", "attention", "set2set"]
 
 STEPS = 3  # of Set2Set
 
 
-class Max(nn.Module):
-    """The maximum over the nodes."""
+class Reduced(nn.Module):
+    """What torch's ``amax`` or ``mean`` makes of one dimension; it has no weights.
 
-    def __init__(self, width: int) -> None:
+    Args:
+        width: E, of the last dimension.
+        reduce: as ``torch.amax``.
+        dim: the dimension.
+    """
+
+    def __init__(self, width: int, reduce: Callable[..., Tensor], dim: int) -> None:
         super().__init__()
-        self.width = width
+        self.width, self._reduce, self._dim = width, reduce, dim
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (N, E) of nodes x (S, N, E)."""
-        return x.amax(dim=0)
-
-
-class Mean(nn.Module):
-    """The mean of the nodes."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (N, E) of nodes x (S, N, E)."""
-        return x.mean(dim=0)
+        """Return x without the dimension."""
+        return self._reduce(x, dim=self._dim)
 
 
 class Attention(nn.Module):
@@ -76,8 +71,8 @@ class Set2Set(nn.Module):
 
 
 POOLINGS: dict[Pooling, Callable[[int], nn.Module]] = {
-    "max": Max,
-    "mean": Mean,
+    "max": partial(Reduced, reduce=torch.amax, dim=0),
+    "mean": partial(Reduced, reduce=torch.mean, dim=0),
     "attention": Attention,
     "set2set": Set2Set,
 }

@@ -1,6 +1,6 @@
 """Silicones in SI units, each number with its source."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,6 +11,9 @@ from skin.errors import InputError
 from skin.settings import checked, configured
 
 __all__ = ["MATERIALS", "Material", "Relaxation"]
+
+
+Ratio = Annotated[float, Gt(-1), Lt(1)]
 
 
 @checked("relaxation")
@@ -50,7 +53,7 @@ class Material:
 
     name: str
     young: PositiveFloat
-    poisson: Annotated[float, Gt(-1), Lt(1)]
+    poisson: Ratio
     relaxation: Relaxation | None = None
 
     @property
@@ -82,18 +85,7 @@ class Material:
         """
         if isinstance(given, Material):
             return given
-        constants: Any = {"name": given} if isinstance(given, str) else given
-        if not isinstance(constants, Mapping) or "name" not in constants:
-            raise InputError(f"a material is a name or {{name, young, poisson}}, got {given!r}; {_known()}")
-        name = str(constants["name"])
-        known = _BY_KEY.get(_key(name))
-        own = {key: value for key, value in constants.items() if key != "name" and value is not None}
-        whole = {"name": name} | own if known is None else vars(known) | own
-        if missing := [key for key in ("young", "poisson") if key not in whole]:
-            raise InputError(_missing(name, missing))
-        if "relaxation" in own:
-            whole["relaxation"] = configured(Relaxation, own["relaxation"], f"material {name}.relaxation")
-        return configured(cls, whole, f"material {name}")
+        return configured(_material, {"name": given} if isinstance(given, str) else given, "material")
 
 
 MATERIALS = (
@@ -115,12 +107,26 @@ def _key(name: str) -> str:
 _BY_KEY = {_key(material.name): material for material in MATERIALS}
 
 
+def _material(
+    name: str, young: PositiveFloat | None = None, poisson: Ratio | None = None, relaxation: Any = None
+) -> Material:
+    known = _BY_KEY.get(_key(name))
+    if known is not None:
+        name, young, poisson = known.name, young or known.young, known.poisson if poisson is None else poisson
+    if young is None or poisson is None:
+        raise InputError(_missing(name, young, poisson))
+    if relaxation is not None:
+        relaxation = configured(Relaxation, relaxation, f"material {name}.relaxation")
+    return Material(name, young, poisson, relaxation)
+
+
 def _known() -> str:
     return "known materials: " + ", ".join(material.name for material in MATERIALS)
 
 
-def _missing(name: str, missing: Sequence[str]) -> str:
-    mend = f"give {' and '.join(missing)}, as in {{name: {name}, young: 100e3, poisson: 0.49}}"
+def _missing(name: str, young: float | None, poisson: float | None) -> str:
+    need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
+    mend = f"give {need}, as in {{name: {name}, young: 100e3, poisson: 0.49}}"
     if _key(name) == "ecoflexgel":
         return f"EcoFlex Gel has no constants of its own: the report's measurement was unreliable; {mend}"
     return f"unknown material {name}: {_known()}; or {mend}"

@@ -120,7 +120,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         ([*SERIAL, "device.scale=abc"], "device.scale=abc must be a valid number"),
         ([*SERIAL, "device.tare=inf"], "device.tare=inf must be a finite number"),
         ([*SERIAL, "device.limits=[a,b]"], "device.limits=.* must be a valid number"),
-        ([*SERIAL, "device.limits=[1023,0]"], r"device.limits must be \[smallest, largest\]"),
+        ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
         ([*SERIAL, "device.limits=[1]"], r"device.limits=\[1\] has too few entries"),
     ],
 )

@@ -8,7 +8,7 @@ from math import inf
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from skin.errors import InputError
 from skin.settings import RISING, checked
@@ -37,6 +37,13 @@ class Streamed(Protocol):
         """Return a stream in one piece; ``whole.touches`` are its touches."""
 
 
+def _ordered(limits: Limits) -> Limits:
+    known = [limit for limit in limits if limit is not None]
+    if sorted(set(known)) != known:
+        raise ValueError("must be [smallest, largest]")
+    return limits
+
+
 @checked("device")
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -62,18 +69,13 @@ class Settings:
 
     baudrate: PositiveInt = 115200
     format: Format = "auto"
-    limits: tuple[float | None, float | None] | None = None
+    limits: Annotated[Limits, AfterValidator(_ordered)] | None = None
     timeout: PositiveFloat = 5.0
     queue: PositiveInt = 4096
     reconnect: bool = False
     backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
     silence: NonNegativeFloat | None = 5.0
     realtime: bool = True
-
-    def __post_init__(self) -> None:
-        known = [limit for limit in self.limits or () if limit is not None]
-        if sorted(set(known)) != known:
-            raise InputError(f"device.limits must be [smallest, largest], got {list(known)}")
 
 
 def open_skin(

@@ -81,7 +81,7 @@ def test_a_large_arm_is_a_sheet():
         ({"length": -1}, "body.length=-1 must be greater than 0"),
         ({"length": "long"}, "body.length=long must be a valid number"),
         ({"angle": float("nan")}, "body.angle=nan must be a finite number"),
-        ({"angle": 2 * np.pi}, r"body.angle=6.28319 rad is a full turn:.*give less than 6.283"),
+        ({"angle": 2 * np.pi}, "body.angle=6.283.* must be less than 6.283"),
         ({"radius": 0.015}, "layers of 0.015 m together leave no core within body.radius=0.015 m"),
         ({"cells": [1, 8]}, "body.cells=.* must be greater than or equal to 2"),
         ({"layers": []}, "at least one layer"),

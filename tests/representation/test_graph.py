@@ -259,5 +259,5 @@ def test_late_fusion_takes_a_graph_per_frame():
 @pytest.mark.parametrize("fusion", [Early, Linked])
 def test_the_other_fusions_refuse_a_graph_per_frame(fusion):
     built = fusion(lambda kind, shape: Gcn(kind, shape, [6]), "graph", (9, 1), 5)
-    with pytest.raises(InputError, match="use fusion=late"):
+    with pytest.raises(InputError, match="one graph per frame needs fusion=late"):
         built(Graph(PLACES, BODY.size, positions="deformed").show(touches(moves())))

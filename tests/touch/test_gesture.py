@@ -32,7 +32,7 @@ def test_the_shipped_configuration_is_the_default_difficulty():
         ({"press": [3, 20]}, r"touch.press=\[3, 20\] must lie between 4 and 30"),
         ({"press": [4, 31]}, r"touch.press"),
         ({"tap": [1, 4]}, r"touch.tap"),
-        ({"tap": [1, 1]}, r"slides over at least 2 frames"),
+        ({"tap": [1, 1]}, r"touch.tap=.* must be greater than or equal to 2: as in touch.tap=\[1,3\]"),
         ({"safe_peak": [0, 90e3]}, r"touch.safe_peak=.* must be greater than 0"),
         ({"safe_peak": [0, 0]}, r"touch.safe_peak"),
         ({"safe_peak": [float("nan"), 90e3]}, r"touch.safe_peak"),

@@ -95,10 +95,9 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
     Raises:
         InputError: the column is missing or holds something else than numbers.
     """
-    if name not in table.column_names:
-        raise InputError(f"{where}: no column {name}, found {', '.join(table.column_names)}")
     try:
         # A copy, because Arrow's memory cannot be written to and torch warns of that.
         return np.array(table[name].cast(pa.float64()).to_numpy())
-    except pa.ArrowException as error:
-        raise InputError(f"{where}: column {name} must hold numbers: {error}") from error
+    except (KeyError, pa.ArrowException) as error:
+        found = ", ".join(table.column_names)
+        raise InputError(f"{where}: the column {name} must hold numbers, found {found}: {error}") from error

@@ -15,8 +15,7 @@ def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
     Without variation they are 1 to the last bit.
     """
     spread = math.sqrt(math.log1p(variation**2))
-    drawn = generator(Stream.MODULUS, seed).standard_normal(shape)
-    values = np.exp(spread * drawn - spread**2 / 2)
+    values = np.exp(spread * generator(Stream.MODULUS, seed).standard_normal(shape) - spread**2 / 2)
     values.setflags(write=False)
     return values
 

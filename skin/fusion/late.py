@@ -51,5 +51,4 @@ class Late(AbstractFusion):
         x, adjacency = frames.x, frames.adjacency
         if adjacency is not None and adjacency.ndim > 2:
             adjacency = adjacency.flatten(0, 1)
-        embeddings = self.model(x.flatten(0, 1), adjacency)
-        return self.head(embeddings.unflatten(0, x.shape[:2]))
+        return self.head(self.model(x.flatten(0, 1), adjacency).unflatten(0, x.shape[:2]))

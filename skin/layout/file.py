@@ -8,8 +8,7 @@ import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout._place import Footprint, place
-from skin.layout.base import AbstractLayout
+from skin.layout.base import AbstractLayout, Footprint, place
 from skin.paths import candidates
 from skin.sensors import Sensors
 from skin.settings import checked
@@ -46,8 +45,7 @@ class File(AbstractLayout):
     def __init__(self, path: str, footprint: Footprint = (0.01, 0.01), depth: float | None = None) -> None:
         self.path = _find(path)
         self.places = _read(self.path)
-        self.footprint = footprint
-        self.depth = depth
+        self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""

@@ -5,8 +5,7 @@ from pydantic import PositiveInt
 
 from skin.body.base import AbstractBody
 from skin.layout._grid import Tilt, grid, rosette
-from skin.layout._place import Footprint, place
-from skin.layout.base import AbstractLayout
+from skin.layout.base import AbstractLayout, Footprint, place
 from skin.sensors import Sensors
 from skin.settings import checked
 
@@ -39,8 +38,7 @@ class Grid(AbstractLayout):
     ) -> None:
         self.centres = grid(rows, columns)
         self.normals = rosette(rows, columns, tilt)
-        self.footprint = footprint
-        self.depth = depth
+        self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""

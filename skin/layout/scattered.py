@@ -8,8 +8,7 @@ from pydantic import NonNegativeInt, PositiveInt
 
 from skin.body.base import AbstractBody
 from skin.layout._grid import Tilt, grid, rosette
-from skin.layout._place import Footprint, place
-from skin.layout.base import AbstractLayout
+from skin.layout.base import AbstractLayout, Footprint, place
 from skin.sensors import Sensors
 from skin.settings import checked
 
@@ -48,10 +47,8 @@ class Scattered(AbstractLayout):
         self.centres = grid(rows, columns)
         self.normals = rosette(rows, columns, tilt) if normals is None else normals
         self.pitch = np.array([1 / columns, 1 / rows])
-        self.jitter = jitter
-        self.seed = seed
-        self.footprint = footprint
-        self.depth = depth
+        self.jitter, self.seed = jitter, seed
+        self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""

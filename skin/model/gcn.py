@@ -109,15 +109,14 @@ class _InstanceNorm(nn.Module):
     Not torch's, which refuses a graph of one node.
     """
 
-    def __init__(self, width: int, eps: float = 1e-5) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
-        self.eps = eps
 
     def forward(self, x: Tensor) -> Tensor:
         """Return nodes (S, N, F) of nodes x (S, N, F)."""
         variance, mean = torch.var_mean(x, dim=0, correction=0)
-        return (x - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias
+        return (x - mean) * (variance + 1e-5).rsqrt() * self.weight + self.bias
 
 
 def _norm(name: Norm, width: int) -> nn.Module:

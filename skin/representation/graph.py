@@ -12,8 +12,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.recording import Touches
-from skin.representation._channels import channels
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
 
 __all__ = ["Graph", "adjacency", "neighbours", "normalised", "self_share", "typical_distance"]

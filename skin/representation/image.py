@@ -6,9 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.representation._channels import channels
 from skin.representation._pixels import Pixels, pixel_of
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
 
 __all__ = ["Image"]

@@ -11,9 +11,8 @@ from scipy.spatial import QhullError
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.representation._channels import channels
 from skin.representation._pixels import Pixels, centres
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
 
 __all__ = ["Interpolation", "weights"]

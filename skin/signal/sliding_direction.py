@@ -18,8 +18,7 @@ def bearings(touches: Touches) -> dict[str, Tensor]:
     Each vector stands as it is and with length 1: its cosines are the label itself where it points rightly.
     """
     x = above_idle(touches)
-    places = touches.positions[..., :2].to(x.dtype)
-    at = places.expand(len(x), x.shape[1], x.shape[2], 2)
+    at = touches.positions[..., :2].to(x.dtype).expand(*x.shape, 2)
     vectors = {"order of the sensors": _order(x, at)} | _lean(x, at)
     for power in (1, 2):
         push = (x - _FORCE).clamp(min=0) ** power

@@ -104,8 +104,7 @@ class Solid(AbstractSimulator):
     def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m."""
         count = self._sensors
-        moves = self._rows(pressure, drag, slice(count, 5 * count))
-        inwards, _, x, y = moves.chunk(4, dim=-1)
+        inwards, _, x, y = self._rows(pressure, drag, slice(count, 5 * count)).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:

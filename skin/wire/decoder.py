@@ -178,8 +178,7 @@ class _Quality:
         self._good += good
         self._bad += bad
         if now - self._since >= _SPAN:
-            most = self._bad > max(self._good, _FEW)
-            self.trouble = self._sentence() if most else ""
+            self.trouble = self._sentence() if self._bad > max(self._good, _FEW) else ""
             self._since, self._good, self._bad = now, 0, 0
 
     def _sentence(self) -> str:

@@ -86,9 +86,7 @@ class Emulator:
         faults.fits(len(device.sensors))
         self.device, self.outlet, self.settings, self.faults = device, outlet, settings, faults
         self.converter = Converter(settings.bits, float(device.constants.clip.max()))
-        self._told = told
-        self.binary = binary
-        self.frames = 0
+        self._told, self.binary, self.frames = told, binary, 0
         self._number = self._zero = 0
         self._held: np.ndarray | None = None
         self._silent_until = -1

@@ -68,8 +68,7 @@ def lines(board: Board, console: Console) -> None:
     """Print what is said whenever it changes, until the board is closed."""
     before = ""
     while True:
-        look = board.look()
-        said = _sentence(look)
+        said = _sentence(board.look())
         if said != before:
             console.print(said, markup=False, highlight=False, soft_wrap=True)
             before = said

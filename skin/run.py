@@ -67,7 +67,7 @@ def train(config: DictConfig) -> bool:
         if threads < 1:
             raise InputError(f"tracking.threads={threads} must be at least 1, or null")
         torch.set_num_threads(threads)
-    if rank_zero_only.rank:
+    if rank_zero_only.rank:  # type: ignore[attr-defined]
         _join(config)
         return True
     store, identity = Store.open(config.tracking), tags(config)

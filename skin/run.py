@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.utils import get_object
 from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
@@ -34,6 +33,7 @@ from skin.option import option
 from skin.plot.figures import confusions, save
 from skin.recording import Touches, digest
 from skin.reload import TAG
+from skin.settings import imported
 from skin.tracking import Store
 
 __all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "simulator", "tags", "train"]
@@ -119,12 +119,13 @@ def tags(config: DictConfig) -> dict[str, str]:
 
 def simulator(config: DictConfig) -> str:
     """Return the name of the simulator that touches come from; without one, of the device."""
-    return _option(config.device.simulator if "simulator" in config.device else config.device)
+    name = "simulator" if "simulator" in config.device else "device"
+    return _option(config.device.simulator if name == "simulator" else config.device, name)
 
 
-def _option(part: DictConfig) -> str:
+def _option(part: DictConfig, name: str) -> str:
     """Return the name of the option that a part of a configuration builds."""
-    return option(get_object(part["_target_"]))
+    return option(imported(part["_target_"], name))
 
 
 def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
@@ -141,7 +142,7 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)
     used = [group for group in groups if group in config and group not in unused]
-    choices = {group: _option(config[group]) for group in used}
+    choices = {group: _option(config[group], group) for group in used}
     scalars = {"seed": config.seed, "row": config.row}
     if "simulator" in config.device:
         scalars |= {

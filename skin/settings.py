@@ -17,7 +17,7 @@ from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 from skin.errors import InputError
 from skin.trust import resolved
 
-__all__ = ["ONCE", "RISING", "check", "check_groups", "checked", "configured"]
+__all__ = ["ONCE", "RISING", "check", "check_groups", "checked", "configured", "imported"]
 
 _Made = TypeVar("_Made")
 
@@ -135,10 +135,19 @@ def check_groups(config: Mapping[str, Any]) -> None:
         # A learner holds its model: people set it by the name of the group.
         inner = name.split(".")[-1]
         shown = inner if inner in _INNER else name
-        check(_imported(part["_target_"], shown), part, shown)
+        check(imported(part["_target_"], shown), part, shown)
 
 
-def _imported(target: str, name: str) -> Callable[..., Any]:
+def imported(target: str, name: str) -> Callable[..., Any]:
+    """Return a class or function by its dotted name.
+
+    Args:
+        target: the name.
+        name: of the part of the configuration that has it as ``_target_``.
+
+    Raises:
+        InputError: it cannot be imported.
+    """
     try:
         return resolved(target)
     except ImportError as error:
@@ -160,7 +169,10 @@ def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 def _hints(target: Callable[..., Any]) -> dict[str, Any]:
     made = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
-    return get_type_hints(made, include_extras=True)
+    try:
+        return get_type_hints(made, include_extras=True)
+    except NameError:  # classes of others may use names that only type checkers know
+        return {}
 
 
 def _plain(hint: Any) -> bool:

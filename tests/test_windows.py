@@ -26,7 +26,7 @@ def test_every_module_is_imported_and_every_verb_shows_its_help(windows):
     done = windows()
     assert done.returncode == 0, done.stderr
     for verb in verbs():
-        assert f"skin {verb} " in done.stdout
+        assert f"    skin {verb}" in done.stdout
 
 
 def test_a_run_is_trained(windows):

@@ -106,7 +106,7 @@ def test_the_training_of_the_page_runs(home, run, monkeypatch):
     follow(COMMANDS[1], "body.cells=[15,10]", "simulator.divisions=1", *few)
     follow(COMMANDS[2].replace("seconds=30", "seconds=1"), "live.touch=0.3", "live.web_port=0")
     said = follow(COMMANDS[3].replace("gestures=2000", "gestures=1000"), f"out={home}/found")
-    assert said.startswith("within 10 % of their thresholds lie ")
+    assert ": within 10 % of their thresholds lie " in said
     with sqlite3.connect(home / "m.db") as database:
         states = database.execute("select name, status from runs order by start_time").fetchall()
     database.close()

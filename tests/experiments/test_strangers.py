@@ -93,16 +93,16 @@ def refused(done, marker, *words):
 
 CASES = {
     # where the payload is built, and by which command
-    "a function of a library": ("live.py", lambda bait, marker: {
+    "a function of a library": ("live run={}", lambda bait, marker: {
         "body": {"_target_": "pandas.read_pickle", "filepath_or_buffer": str(bait)}}),
-    "a function of the standard library": ("embeddings.py", lambda bait, marker: {
+    "a function of the standard library": ("study study=embeddings study.run={}", lambda bait, marker: {
         "layout": {"_target_": "shutil.copyfile", "src": str(bait), "dst": str(marker)}}),
-    "deep in a list, with arguments by place": ("margins.py", lambda bait, marker: {
+    "deep in a list, with arguments by place": ("study study=margins study.run={}", lambda bait, marker: {
         "learner": {"_target_": "skin.learner.ensemble.Ensemble", "members": {"a": [
             [{"_target_": "os.mkdir", "_args_": [str(marker)]}]]}}}),
-    "a module that torch.optim imports": ("stream.py", lambda bait, marker: {
+    "a module that torch.optim imports": ("study study=streams study.run={}", lambda bait, marker: {
         "layout": {"_target_": "torch.optim.optimizer.torch.load", "f": str(bait), "weights_only": False}}),
-    "a module that a module of skin imports": ("evaluate.py", lambda bait, marker: {
+    "a module that a module of skin imports": ("evaluate run={}", lambda bait, marker: {
         "layout": {"_target_": "skin.tracking.os.mkdir", "path": str(marker)}}),
     "a name made by interpolation": (None, lambda bait, marker: {
         "row": "os.mkdir", "body": {"_target_": "${row}", "_args_": [str(marker)]}}),
@@ -116,7 +116,7 @@ CASES = {
 def test_a_run_builds_only_parts_of_the_package(case, run, folder, put, bait, marker):
     command, change = CASES[case]
     identity = put(change(bait, marker))
-    refused(run(folder, command, f"run={identity}"), marker, "trust=true", identity)
+    refused(run(folder, *command.format(identity).split()), marker, "trust=true", identity)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -48,10 +48,10 @@ check: $(READY)  ## lint, format and types
 	$(BIN)/mypy
 
 bench: $(READY)  ## speed and memory, into results/bench.json
-	$(BIN)/python experiments/bench.py
+	$(BIN)/skin bench
 
 physics: $(READY)  ## check every law of mechanics against an independent solution
-	$(BIN)/python experiments/verify_physics.py
+	$(BIN)/skin validate
 
 $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt
 	$(PYTHON) -m venv $(PEERS)
@@ -61,7 +61,7 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 	touch $@
 
 peers: $(READY) $(PEERS)/.ready  ## LightGBM and aeon's ROCKETs on the same touches (SEEDS=3)
-	$(BIN)/python experiments/peers.py --seeds $(SEEDS)
+	$(BIN)/skin peers -m row=lightgbm,minirocket,multirocket_hydra 'seed=range($(SEEDS))'
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	@echo "runs: http://127.0.0.1:5000/#/experiments"
@@ -69,8 +69,8 @@ ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 
 reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
-	$(BIN)/python experiments/reproduce_table.py --budget $(BUDGET) --seeds $(SEEDS) \
-		$(if $(SIMULATORS),--simulators $(SIMULATORS))
+	$(BIN)/skin table table.budget=$(BUDGET) table.seeds=$(SEEDS) \
+		$(if $(SIMULATORS),'table.simulators=[$(SIMULATORS)]')
 
 clean:  ## remove what the targets made, but keep results and runs
 	rm -rf $(VENV) $(PEERS) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

@@ -1,52 +1,6 @@
-"""Check every law of mechanics against an independent solution: python experiments/verify_physics.py
-
-physics.quick=true takes seconds; physics.laws=[hertz,punch] checks some. Exit code 1 if a law does not hold.
-"""
+"""Replaced by `skin validate`; the next release removes this file."""
 
 import sys
-from pathlib import Path
-
-from skin.command import command
-from skin.config import ROOT, DictConfig, plain
-from skin.files import results
-
-
-@command("physics")
-def main(config: DictConfig) -> None:
-    """Check laws, print a line for each, and write physics.md, its pictures and physics.json."""
-    from rich.console import Console
-    from rich.progress import track
-
-    from validation.index import chosen
-    from validation.page import publish
-
-    settings = plain(config)["physics"]
-    laws = chosen(settings["laws"])
-    outcomes = []
-    shown = sys.stderr.isatty()
-    for law in track(laws, "checking laws", console=Console(stderr=True), disable=not shown):
-        outcome = law.check(settings["quick"])
-        outcomes.append((law, outcome))
-        failed = [finding for finding in outcome.findings if not finding.ok]
-        print(f"{law.name}: {'FAILS' if failed else 'holds'}, {len(outcome.findings)} numbers", flush=True)
-        for one in failed:
-            print(f"  {one.case}: {one.ours:.6g}, must be {one.reference:.6g}")
-            print(f"  error {one.error:.2g}, tolerance {one.tolerance:g}", flush=True)
-    if config.out is not None or settings["laws"] == "all":
-        page, data = _places(config.out, settings["quick"])
-        publish(page, data, outcomes)
-        print(f"{page / 'physics.md'}, {data}")
-    if any(not finding.ok for _, outcome in outcomes for finding in outcome.findings):
-        sys.exit(1)
-
-
-def _places(out: str | None, quick: bool) -> tuple[Path, Path]:
-    """Return the folder of the page and the path of the findings."""
-    if out is None and not quick:
-        return ROOT / "docs", results(None) / "physics.json"
-    folder = Path(out).expanduser() if out else results(None) / "quick"
-    return folder, folder / "physics.json"
-
 
 if __name__ == "__main__":
-    main()
+    sys.exit("experiments/verify_physics.py is now: skin validate")

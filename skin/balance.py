@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.labels import OPPOSITE
 from skin.recording import Recording
@@ -29,12 +28,13 @@ def announce(device: AbstractDevice, recording: Recording | None = None, shown: 
     Raises:
         InputError: as :func:`check`.
     """
-    if not isinstance(device, Simulated):
+    if device.simulation is None:
         return
-    found = balance(recording or device.recording(None, complete=False), device.sampler.shapes.names)
+    sampler = device.simulation.sampler
+    found = balance(recording or device.recording(None, complete=False), sampler.shapes.names)
     if shown:
         print(*lines(found), sep="\n", file=sys.stderr)
-    check(found, device.sampler.settings)
+    check(found, sampler.settings)
 
 
 def balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, Any]:

@@ -25,11 +25,11 @@ def build_device(config: DictConfig) -> AbstractDevice:
     check_groups({name: groups[name] for name in ("body", "layout", "device")})
     check(groups)
     body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
-    mechanics = groups["device"].get("simulator")
-    if mechanics and not mechanics["_target_"].endswith(".Naive"):
-        warn_of_surface(body, layout.sensors(body))
     # Not as arguments of instantiate: it would take the dataclass of the body for a configuration.
-    return instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
+    device: AbstractDevice = instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
+    if device.simulation is not None and device.simulation.model.mechanical:
+        warn_of_surface(body, device.simulation.sensors)
+    return device
 
 
 def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":

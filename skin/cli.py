@@ -1,22 +1,25 @@
-"""The command ``skin VERB overrides...``: a verb is a module of ``skin.commands``."""
+"""The command ``skin VERB overrides...``: a verb is a module of ``skin.commands``, or of an entry point.
+
+Other packages add verbs in the entry-point group ``skin.verbs``: name = module with a function ``main``.
+"""
 
 import ast
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 __all__ = ["main", "verbs"]
 
-_FOLDER = Path(__file__).parent / "commands"
-
 
 def verbs() -> dict[str, str]:
-    """Return each verb with the first line of its documentation, without importing anything."""
-    paths = sorted(path for path in _FOLDER.glob("*.py") if not path.stem.startswith("_"))
-    texts = {path.stem: ast.get_docstring(ast.parse(path.read_text())) or "" for path in paths}
-    return {name: text.split("\n")[0] for name, text in texts.items()}
+    """Return the module of each verb."""
+    own = sorted(path.stem for path in (Path(__file__).parent / "commands").glob("[!_]*.py"))
+    others = {found.name: found.module for found in entry_points(group="skin.verbs")}
+    return {name: f"skin.commands.{name}" for name in own} | dict(sorted(others.items()))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -31,18 +34,43 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verb, *rest = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
     known = verbs()
     if verb in ("-h", "--help"):
-        width = max(map(len, known))
-        print("usage: skin VERB [OVERRIDE=VALUE ...]\n")
-        print(*(f"  {name:{width}}  {text}" for name, text in known.items()), sep="\n")
-        print("\n`skin VERB --help` lists the settings of a verb. Overrides have Hydra's syntax.")
+        print(_help(known))
     elif verb == "--version":
         from skin import __version__
 
         print(f"skin {__version__}")
-    elif verb in known:
-        import_module(f"skin.commands.{verb}").main(rest)
-    else:
+    elif verb not in known:
         near = get_close_matches(verb, known, 1)
         said = f": did you mean {near[0]}?" if near else f": {', '.join(known)}"
-        print(f"skin has no verb {verb}{said}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(_refused(f"skin has no verb {verb}{said}"))
+    elif _source(known[verb]) is None:
+        sys.exit(_refused(f"skin {verb} needs files that an installed package lacks: clone the repository"))
+    else:
+        import_module(known[verb]).main(rest)
+
+
+def _help(known: Mapping[str, str]) -> str:
+    """Return the first line of the documentation of each verb, of which none is imported."""
+    sources = {name: _source(module) for name, module in known.items()}
+    width = max(map(len, known))
+    lines = [
+        f"  {name:{width}}  {(ast.get_docstring(ast.parse(path.read_text())) or '').split(chr(10))[0]}"
+        for name, path in sources.items()
+        if path
+    ]
+    usage, syntax = "usage: skin VERB [OVERRIDE=VALUE ...]", "Overrides have Hydra's syntax."
+    return "\n".join([usage, "", *lines, "", f"`skin VERB --help` lists the settings of a verb. {syntax}"])
+
+
+def _source(module: str) -> Path | None:
+    """Return the file of a module, without importing it; None where it is not installed."""
+    try:
+        spec = find_spec(module)
+    except ModuleNotFoundError:
+        return None
+    return Path(spec.origin) if spec and spec.origin else None
+
+
+def _refused(reason: str) -> int:
+    print(reason, file=sys.stderr)
+    return 2

@@ -13,7 +13,6 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir, version
 from hydra._internal.utils import _run_hydra, get_args_parser  # what hydra.main itself calls, with sys.argv
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -96,10 +95,12 @@ def _help(about: str, name: str, asked: Any) -> str:
     words = [*asked.overrides, f"hydra.searchpath=[{','.join(map(str, folders[1:]))}]"]
     with initialize_config_dir(str(CONF), version_base=_VERSION):
         config = compose(name, words, return_hydra_config=True)
-        loader = GlobalHydra.instance().config_loader()
         choices = config.hydra.runtime.choices.items()
         chosen = {group: option for group, option in choices if not group.startswith("hydra/")}
-        options = {group: loader.get_group_options(group) for group in chosen}
+    options = {
+        group: sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
+        for group in chosen
+    }
     width = max(map(len, chosen), default=0)
     lines = [
         f"  {group:{width}}  {', '.join(f'[{one}]' if one == chosen[group] else one for one in known)}"

@@ -106,14 +106,9 @@ class Config:
     labels: list[str] | None = None
     shape: str | None = None
     index: int | None = None
-    rows: Any = None
-    stream: dict[str, Any] | None = None
-    embeddings: dict[str, Any] | None = None
-    moving: dict[str, Any] | None = None
     session: str | None = None
     presses: str | None = None
     calibrate: dict[str, Any] | None = None
-    dead: dict[str, Any] | None = None
     port: str | None = None
     link: str | None = None
     seconds: float | None = None
@@ -125,9 +120,12 @@ class Config:
     faults: dict[str, Any] | None = None
     record: dict[str, Any] | None = None
     compare: dict[str, Any] | None = None
-    direction: dict[str, Any] | None = None
-    physics: dict[str, Any] | None = None
-    holds: dict[str, Any] | None = None
+    study: dict[str, Any] | None = None
+    smoke: bool | None = None
+    table: dict[str, Any] | None = None
+    validate: dict[str, Any] | None = None
+    bench: dict[str, Any] | None = None
+    peers: dict[str, Any] | None = None
 
 
 def checked(config: DictConfig) -> DictConfig:

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import get_object
 from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
@@ -30,12 +31,13 @@ from skin.evaluation.show import report as show
 from skin.evaluation.show import table
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
+from skin.option import option
 from skin.plot.figures import confusions, save
 from skin.recording import Touches, digest
 from skin.reload import TAG
 from skin.tracking import Store
 
-__all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "tags", "train"]
+__all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "simulator", "tags", "train"]
 
 SWEPT = "SKIN_SWEPT"
 """Environment variable by which a sweep tells its jobs which settings it sweeps."""
@@ -117,14 +119,23 @@ def _join(config: DictConfig) -> None:
 
 
 def tags(config: DictConfig) -> dict[str, str]:
-    """Return the tags by which a run is found again; without a simulator, its device stands in its place."""
-    device = config.device["_target_"].split(".")[-2]
+    """Return the tags by which a run is found again."""
     return {
         "fingerprint": fingerprint(config),
         "row": config.row,
-        "simulator": config.data.name if "simulator" in config.device else device,
+        "simulator": simulator(config),
         "seed": str(config.seed),
     }
+
+
+def simulator(config: DictConfig) -> str:
+    """Return the name of the simulator that touches come from; without one, of the device."""
+    return _option(config.device.simulator if "simulator" in config.device else config.device)
+
+
+def _option(part: DictConfig) -> str:
+    """Return the name of the option that a part of a configuration builds."""
+    return option(get_object(part["_target_"]))
 
 
 def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
@@ -140,11 +151,8 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
     store.client.set_tag(run, "data_hash", digest(touches))
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)
-    choices = {
-        group: config[group]["_target_"].split(".")[-2]
-        for group in groups
-        if group in config and group not in unused
-    }
+    used = [group for group in groups if group in config and group not in unused]
+    choices = {group: _option(config[group]) for group in used}
     scalars = {"seed": config.seed, "row": config.row}
     if "simulator" in config.device:
         scalars |= {

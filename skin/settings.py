@@ -11,13 +11,14 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from hydra.utils import get_object
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from skin.errors import InputError
+from skin.trust import resolved
 
 __all__ = ["check", "check_groups"]
 
+_LIBRARIES = ("torch.", "torch_geometric.")  # which check their own settings
 _FINITE = ConfigDict(allow_inf_nan=False)
 _INNER = {"contact", "fusion", "model", "simulator"}
 _SCALARS = {int, float, bool, str, Path, NoneType, Ellipsis}
@@ -55,26 +56,38 @@ def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str) ->
 
 
 def check_groups(config: Mapping[str, Any]) -> None:
-    """Check all parts of a configuration that build something of this package.
+    """Check all parts of a configuration that build something, except classes of libraries.
 
     Args:
         config: in plain containers.
 
     Raises:
-        InputError: as :func:`check`.
+        InputError: as :func:`check`, or a class that cannot be imported.
     """
     for name, part in _parts(config, ""):
         # A learner holds its model: people set it by the name of the group.
         inner = name.split(".")[-1]
-        check(get_object(part["_target_"]), part, inner if inner in _INNER else name)
+        shown = inner if inner in _INNER else name
+        check(_imported(part["_target_"], shown), part, shown)
+
+
+def _imported(target: str, name: str) -> Callable[..., Any]:
+    try:
+        return resolved(target)
+    except ImportError as error:
+        raise InputError(
+            f"{name}._target_={target} cannot be imported: {error}: correct the name, or add the folder of "
+            "its module to PYTHONPATH"
+        ) from error
 
 
 def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield every mapping with a ``_target_`` in this package, the innermost first, with its name."""
+    """Yield every mapping with a ``_target_`` that is no library's, the innermost first, with its name."""
     if isinstance(value, Mapping):
         for key, one in value.items():
             yield from _parts(one, f"{name}.{key}" if name else str(key))
-        if str(value.get("_target_", "")).startswith("skin."):
+        target = value.get("_target_")
+        if target is not None and not str(target).startswith(_LIBRARIES):
             yield name, value
 
 

@@ -18,7 +18,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import ROOT, checked, fingerprint, plain
+from skin.config import ROOT, checked, plain
 from skin.errors import InputError
 from skin.refusal import refusal
 
@@ -119,7 +119,7 @@ class Sweep(Callback):
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.run import PARENT, SWEPT
+        from skin.run import PARENT, SWEPT, tags
         from skin.tracking import Store
         from skin.variants import title
 
@@ -129,8 +129,10 @@ class Sweep(Callback):
         atexit.register(self._close)
         os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
         _share_cores(config.hydra.launcher)
-        self._fingerprints = [fingerprint(job) if job else "" for job in composed]
-        self._progress = Progress([_seconds(store, job) if job else None for job in composed])
+        identities = [tags(job) if job else {} for job in composed]
+        self._fingerprints = [one.get("fingerprint", "") for one in identities]
+        told = zip(composed, identities, strict=True)
+        self._progress = Progress([_seconds(store, job, one) if job else None for job, one in told])
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
@@ -220,22 +222,22 @@ def _share_cores(launcher: DictConfig) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores // count)))
 
 
-def _seconds(store: "Store", config: DictConfig) -> float | None:
+def _seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]) -> float | None:
     """Return how long the last finished run of the same row and simulator took, s.
 
     Where there is none, the published table tells: its seconds per epoch times the epochs, and a third more
     for the evaluation.
     """
-    finished = store.find("FINISHED", row=config.row, simulator=config.data.name)
-    if finished:
+    same = {name: tags[name] for name in ("row", "simulator")}
+    if finished := store.find("FINISHED", **same):
         info = finished[0].info
         return (info.end_time - info.start_time) / 1e3
-    published, wanted = ROOT / "docs" / "results" / "table.csv", (config.row, config.data.name)
+    published = ROOT / "docs" / "results" / "table.csv"
     if not published.is_file():
         return None
     with published.open(newline="") as file:
         for line in csv.DictReader(file):
-            if (line["row"], line["simulator"]) == wanted and line["seconds_per_epoch"]:
+            if same.items() <= line.items() and line["seconds_per_epoch"]:
                 return 5 + 1.3 * config.trainer.max_epochs * float(line["seconds_per_epoch"])
     return None
 

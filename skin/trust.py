@@ -7,7 +7,7 @@ from typing import Any
 
 from skin.errors import InputError
 
-__all__ = ["GROUPS", "vet"]
+__all__ = ["GROUPS", "resolved", "vet"]
 
 GROUPS = (
     "body",
@@ -91,7 +91,7 @@ def _allowed(name: Any) -> bool:
     if package is None:
         return False
     try:
-        found = _resolved(name)
+        found = resolved(name)
     except Exception:  # whatever resolving raises, there is no such class
         return False
     if not inspect.isclass(found) or inspect.isabstract(found):
@@ -100,8 +100,12 @@ def _allowed(name: Any) -> bool:
     return issubclass(found, bases) and f"{found.__module__}.".startswith(f"{package}.")
 
 
-def _resolved(name: str) -> Any:
-    """Return what a dotted name stands for, as Hydra would; its own function logs what it does not find."""
+def resolved(name: str) -> Any:
+    """Return what a dotted name stands for, as Hydra would; its own function logs what it does not find.
+
+    Raises:
+        ImportError: there is no such module, class or function.
+    """
     first, *others = name.split(".")
     found, path = import_module(first), first
     for part in others:

@@ -33,6 +33,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from skin.config import ROOT
+from skin.device.base import AbstractDevice
 from skin.labels import TOUCH
 from skin.recording import Touches
 
@@ -284,7 +285,7 @@ def run(begin) -> Callable[..., subprocess.CompletedProcess]:
     return run
 
 
-class MadeUpDevice:
+class MadeUpDevice(AbstractDevice):
     """Yields random touches of 12 sensors and 10 frames whose labels a simple network can learn."""
 
     task, size, rate = TOUCH, (0.16, 0.12), 10.0

@@ -118,6 +118,7 @@ def _become(job: dict[str, Any], made: dict[str, str]) -> None:
         os.dup2(file, number)
         os.close(file)
     signal.alarm(job["seconds"])
+    sys.path[1:1] = filter(None, job["environment"].get("PYTHONPATH", "").split(os.pathsep))
     script, *arguments = job["command"]
     sys.argv = [script, *arguments]
     code = 0

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from skin.config import ROOT
+from skin.config import CONF, ROOT
 
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
-errors interrupt paths
+errors interrupt paths option
 refusal identity labels rng material model lag sensors trust
 config recording body
 command
@@ -74,6 +74,15 @@ def test_a_package_imports_only_what_is_above_it(package):
             targets = {target.split(".")[1] for target in imports(path) if target in ALL and "." in target}
             wrong |= {(name, target) for target in targets - {package} if LEVEL[target] >= LEVEL[package]}
     assert not wrong
+
+
+def test_nothing_outside_of_their_package_imports_a_device():
+    """The interface says what a device can do, so that a device of one's own can do it too."""
+    devices = {f"skin.device.{path.stem}" for path in (CONF / "device").glob("*.yaml")}
+    assert len(devices) >= 4
+    for name, path in ALL.items():
+        if not name.startswith("skin.device."):
+            assert not imports(path) & devices, name
 
 
 def test_the_library_needs_nothing_of_the_experiments():

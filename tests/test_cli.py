@@ -8,7 +8,8 @@ import pytest
 from skin.cli import main, verbs
 from skin.config import ROOT
 
-VERBS = sorted(verbs())
+VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
+OTHERS = ["bench", "peers", "study", "table", "validate"]
 MOVED = ["animate", "calibrate", "compare", "emulate", "listen"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
@@ -20,7 +21,7 @@ def test_the_verbs_are_listed_without_imports():
     *lines, heavy = done.stdout.splitlines()
     assert not heavy
     listed = [line.split(maxsplit=1) for line in lines if line.startswith("  ")]
-    assert [name for name, _ in listed] == VERBS
+    assert [name for name, _ in listed] == list(verbs())
     assert all(text.endswith(".") for _, text in listed)
 
 
@@ -32,6 +33,30 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     assert ("fusion" in text) == (verb in ("train", "evaluate", "live", "compare"))
     assert "[serial]" in text if verb in ("listen", "record") else "[simulated]" in text
     assert "hydra" not in text
+
+
+@pytest.mark.parametrize("verb", OTHERS)
+def test_a_verb_of_the_repository_shows_its_settings(verb, capsys):
+    main([verb, "--help"])
+    text = capsys.readouterr().out
+    assert f"skin {verb}" in text
+    assert f"{verb}:" in text
+    assert verbs()[verb] == f"experiments.commands.{verb}"
+
+
+def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):
+    """As in an installed package, whose entry points are there, and whose experiments are not."""
+    (tmp_path / "x-1.dist-info").mkdir()
+    (tmp_path / "x-1.dist-info" / "METADATA").write_text("Name: x\nVersion: 1\n")
+    points = "[skin.verbs]\nstudies = nowhere.commands.study\n"
+    (tmp_path / "x-1.dist-info" / "entry_points.txt").write_text(points)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from skin.cli import main; main(['studies'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr == "skin studies needs files that an installed package lacks: clone the repository\n"
+    code = code.replace("'studies'", "")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "studies" not in done.stdout
 
 
 def test_help_knows_overrides_and_mistakes(capsys):

@@ -63,6 +63,17 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
         assert all(f"`{part}`" in page for part in parts), name
 
 
+def test_a_run_is_found_by_what_simulated_it_and_not_by_the_name_of_its_data(configured):
+    assert skin.run.tags(configured("simulator=solid", "data=fem"))["simulator"] == "solid"
+    for simulator in ("naive", "fem", "solid"):
+        assert skin.run.tags(configured(f"simulator={simulator}"))["simulator"] == simulator
+
+
+@pytest.mark.parametrize("device", ["recording", "serial", "cost"])
+def test_a_device_without_simulator_stands_in_its_place(device, configured):
+    assert skin.run.tags(configured(f"device={device}"))["simulator"] == device
+
+
 def test_no_threads_are_refused(configured):
     with pytest.raises(InputError, match=r"tracking\.threads=0 must be at least 1, or null"):
         skin.run.train(checked(configured("tracking.threads=0")))

@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live.settings import Settings
-from skin.settings import check
+from skin.settings import check, check_groups
 
 
 class Thing:
@@ -59,6 +59,26 @@ def test_what_does_not_fit_is_refused_by_name(wrong, said):
         check(Thing, FIT | wrong, "thing")
 
 
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ({"_target_": f"{__name__}.Thing", "count": 0}, "model.count=0 must be greater"),
+        (
+            {"_target_": "absent.Thing"},
+            "model._target_=absent.Thing cannot be imported: No module named 'absent'",
+        ),
+        ({"_target_": "skin.model.mlp.Mpl"}, "model._target_=skin.model.mlp.Mpl cannot be imported"),
+    ],
+)
+def test_classes_of_others_are_checked_too(part, said):
+    with pytest.raises(InputError, match=f"^{said}"):
+        check_groups({"learner": {"model": part}})
+
+
+def test_classes_of_libraries_check_themselves():
+    check_groups({"learner": {"optimizer": {"_target_": "torch.optim.Adam", "no": "such setting"}}})
+
+
 SMALL = ["simulator=naive", "data.gestures=20"]
 SERIAL = ["device=serial", "device.port=/dev/null"]
 
@@ -82,6 +102,15 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
             "representation.pixels=x must be a valid integer",
         ),
         (["device.noise=abc"], "device.noise=abc must be a valid number"),
+        (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
+        (["device.clip=0"], "device.clip=0 must be greater than 0"),
+        (["device.stuck=0.5"], "device.stuck=0.5 must be a valid integer"),
+        (["device.dead=[4,2]"], "device.dead must be a number from 0 up or a range"),
+        (["device.track=camera"], "device.track=camera must be 'none', 'oracle' or 'estimated'"),
+        (
+            ["+device.noize=1"],
+            "device has no setting noize: did you mean noise[?] it has .*gain_spread, offset",
+        ),
         (["layout=grid", "layout.rows=1.5"], "layout.rows=1.5 must be a valid integer"),
         (["body.cells=9"], "body.cells=9 must be a list"),
         (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a valid integer"),

@@ -7,14 +7,10 @@ import json
 import os
 import sys
 import tempfile
-from pathlib import Path
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from hydra.utils import instantiate
 
-from benchmarks.setting import configuration, peak_memory, seconds
+from experiments.benchmarks.setting import configuration, peak_memory, seconds
 
 __all__ = ["measure"]
 

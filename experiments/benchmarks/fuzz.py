@@ -12,16 +12,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 from random import Random
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.pieces import FORMATS, Spoken, binary, damaged, line, senseless
+from experiments.benchmarks.pieces import FORMATS, Spoken, binary, damaged, line, senseless
 from skin.signal.frame import Frame
 from skin.wire.decoder import Decoder
 

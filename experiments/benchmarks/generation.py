@@ -6,17 +6,12 @@ python experiments/benchmarks/generation.py fem 3
 import json
 import sys
 import time
-from pathlib import Path
 from statistics import median
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
-from benchmarks.setting import configuration, peak_memory
+from experiments.benchmarks.setting import configuration, peak_memory
 from skin.build import build_device
-from skin.device.simulated import Simulated
 
 __all__ = ["measure"]
 
@@ -29,8 +24,8 @@ def measure(simulator: str, repeats: int) -> dict[str, float]:
     The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
     readings, imperfections.
     """
-    device = build_device(configuration(f"simulator={simulator}", f"data.gestures={GESTURES}"))
-    assert isinstance(device, Simulated)
+    config = configuration(f"simulator={simulator}", f"data.gestures={GESTURES}")
+    device = build_device(config).simulated("gestures are generated")
     taken = []
     for seed in range(repeats + 1):
         began = time.perf_counter()

@@ -6,19 +6,14 @@ python experiments/benchmarks/live.py 1000 --run latest  # what a run has learnt
 
 import argparse
 import json
-import sys
 import time
-from pathlib import Path
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 import torch
 
-from benchmarks.setting import configuration
+from experiments.benchmarks.setting import configuration
 from skin.build import build_data, build_device, build_learner
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.hardware.live.engine import Detection, Engine
 from skin.learner.network import Network
 from skin.signal.frame import Frame
@@ -58,10 +53,9 @@ def measure(
     }
 
 
-def _untrained(row: str) -> tuple[Simulated, Engine]:
+def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
     config = configuration("simulator=naive", f"experiment={row}", "data.gestures=10")
-    device, learner = build_device(config), build_learner(config)
-    assert isinstance(device, Simulated)
+    device, learner = build_device(config).simulated("the stream is simulated"), build_learner(config)
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
@@ -69,7 +63,7 @@ def _untrained(row: str) -> tuple[Simulated, Engine]:
     return device, Engine(learner, device.task, positions, device.window, device.rate, Detection(_TOUCH))
 
 
-def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
+def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
     from skin.hardware.live import start
     from skin.hardware.live.verdict import Patience
     from skin.reload import changed, find
@@ -82,11 +76,10 @@ def _trained(run: str, uri: str | None) -> tuple[Simulated, Engine]:
     found = find(store, run)
     known = stored(store, found)
     of = trained(store, found, changed(known, config, []), known)
-    assert isinstance(of.device, Simulated)
-    return of.device, start.engine(of, Patience(), _TOUCH)
+    return of.device.simulated("the stream is simulated"), start.engine(of, Patience(), _TOUCH)
 
 
-def _stream(device: Simulated, engine: Engine, count: int) -> list[Frame]:
+def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:
     """Return frames at 100 Hz after those that fill the window, which the engine has then seen."""
     held = round(RATE / device.rate)
     ahead = held * device.window

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 
-from benchmarks.setting import configuration, seconds
+from experiments.benchmarks.setting import configuration, seconds
 from skin.build import build_device
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.simulator import _pynite
 from skin.simulator._assembly import Structure
 from skin.simulator._factors import factorised
@@ -63,10 +63,8 @@ def pynite_seconds_per_frame(repeats: int) -> float | None:
     return seconds(lambda: _pynite.solve(next(models)), repeats)
 
 
-def _device() -> Simulated:
-    device = build_device(configuration("simulator=fem"))
-    assert isinstance(device, Simulated)
-    return device
+def _device() -> AbstractSimulated:
+    return build_device(configuration("simulator=fem")).simulated("mechanics are simulated")
 
 
 def _pressures() -> np.ndarray:

@@ -12,10 +12,7 @@ from collections import deque
 from pathlib import Path
 from time import monotonic, sleep
 
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from benchmarks.browser import Browser, installed
+from experiments.benchmarks.browser import Browser, installed
 
 __all__ = ["measure"]
 

@@ -16,10 +16,7 @@ from omegaconf import DictConfig
 
 from skin.config import CONF, checked
 
-__all__ = ["ROWS", "configuration", "machine", "peak_memory", "seconds", "versions"]
-
-ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
-"""What is trained, and has a plain twin."""
+__all__ = ["configuration", "machine", "peak_memory", "seconds", "versions"]
 
 
 def configuration(*overrides: str) -> DictConfig:

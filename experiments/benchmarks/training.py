@@ -2,8 +2,8 @@
 
 import torch
 
-from benchmarks.reference_models import PLAIN, train_epoch
-from benchmarks.setting import configuration, seconds
+from experiments.benchmarks.reference_models import PLAIN, train_epoch
+from experiments.benchmarks.setting import configuration, seconds
 from skin.build import build_data, build_device, build_learner
 from skin.console import quiet
 from skin.datamodule import TouchData

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skin.config import Evaluation
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.operating_point import gestures
 from skin.evaluation.report import columns
@@ -28,7 +28,7 @@ SETS = "sets.json"
 ABOUT = "about.json"
 
 
-def export(device: Simulated, settings: Evaluation, folder: Path) -> None:
+def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
     """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
     ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
@@ -97,7 +97,7 @@ class Foreign:
         return torch.stack(columns, dim=1).to(torch.float32)
 
 
-def _export(touches: Touches, device: Simulated, folder: Path, name: str) -> str:
+def _export(touches: Touches, device: AbstractSimulated, folder: Path, name: str) -> str:
     """Write one set and return its digest."""
     recording = Recording(touches, device.task, device.size, device.sensors.footprint)
     write(recording, folder / "touches" / f"{name}.parquet")

@@ -2,7 +2,7 @@
 
 .venv-peers/bin/python experiments/peers/learn.py minirocket FOLDER
 
-FOLDER is what experiments/peers.py exports: nothing of this project is imported here, Parquet is all that
+FOLDER is what `skin peers` exports: nothing of this project is imported here, Parquet is all that
 comes in and goes out. Trees stop, and scores become probabilities, by the validation split; nothing else is
 seen before the answers.
 """

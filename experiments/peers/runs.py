@@ -7,12 +7,10 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from peers.exchange import ABOUT, Foreign, export
+from experiments.peers.exchange import ABOUT, Foreign, export
 from skin.balance import announce
 from skin.build import build_device
 from skin.config import fingerprint, plain
-from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.evaluation.operating_point import choose
 from skin.evaluation.report import evaluate
 from skin.run import conclude, describe, tags
@@ -39,12 +37,11 @@ def learn(
         InputError: the device has no unseen devices and layouts: it is not simulated.
         subprocess.CalledProcessError: the peer failed.
     """
-    device, source = build_device(config), _source(config)
+    source, identity = _source(config), tags(config)
+    device = build_device(config).simulated("peers are compared on simulated touches")
     announce(device)
-    where = folder / f"{config.data.name}-{config.seed}-{fingerprint(source)}"
-    if not isinstance(device, Simulated):
-        raise InputError("peers are compared on simulated touches: leave device=simulated")
-    with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config)) as run:
+    where = folder / f"{identity['simulator']}-{config.seed}-{fingerprint(source)}"
+    with store.run(f"{config.row} {identity['simulator']} {config.seed}", identity) as run:
         describe(
             store, run.info.run_id, OmegaConf.create({"row": config.row, **source}), device.touches("train")
         )

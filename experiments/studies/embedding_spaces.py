@@ -1,6 +1,7 @@
 """Figure 5 of the report, the table of what embeddings tell, and the verdicts."""
 
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from statistics import fmean, stdev
 
 import numpy as np
@@ -9,13 +10,36 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 
-from skin.plot.figures import COLOURS
-from studies.embedding.probe import FRAME, Found
-from studies.study import conclude, paired, verdict
+from experiments.studies.comparison import conclude, paired, verdict
+from experiments.studies.embedding.probe import FRAME, Found
+from experiments.studies.tables import markdown
+from skin.files import write
+from skin.plot.figures import COLOURS, save
 
-__all__ = ["lines", "planes", "spaces", "statements"]
+__all__ = ["lines", "planes", "publish", "spaces", "statements", "text"]
 
+_ABOUT = """
+The labels: accuracy on held-out touches of an SVM (radial basis functions on standardised vectors, cost
+chosen by cross-validation on the training touches). Graph embeddings and "readings, one frame" see the
+strongest frame of a touch alone, the encoder and "readings, window" all: one frame does not tell how long
+or where to. Layout: the same SVM on touches of several scattered layouts, whose graphs differ in
+morphology; beside it the share of an embedding's variance there that the layout explains, and the share
+that the best label does. On one layout all graphs have one morphology: labelled by degree, as Graph2Vec
+usually is, they are all equal.
+"""
 _Figure = Callable[[Found], float]
+
+
+def text(found: Sequence[Found], names: Sequence[str]) -> str:
+    """Return the table and the verdicts, as Markdown."""
+    table = markdown(lines(found, names), "What an SVM reads in embeddings, accuracy in per cent")
+    return f"{table}{_ABOUT}\n" + "".join(f"- {line}\n" for line in statements(found, names))
+
+
+def publish(found: Sequence[Found], names: Sequence[str], title: str, path: Path) -> list[Path]:
+    """Write the table and figure 5 of the report, of the first seed, to ``path`` with .md and .png."""
+    figure = spaces([one for one in found if one.seed == found[0].seed], names)
+    return [write(text(found, names), path.with_suffix(".md")), save(figure, path.with_suffix(".png"))]
 
 
 def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:

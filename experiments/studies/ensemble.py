@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import torch
 from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from skin.build import build_data, build_device, build_learner
@@ -19,32 +17,12 @@ from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
 from skin.recording import Touches, digest
 from skin.reload import restore
-from skin.run import conclude, describe, tags
+from skin.run import conclude, describe, simulator, tags
 from skin.tracking import Store
-from studies.table import percent
 
-__all__ = ["WAYS", "Outcome", "average", "combine", "decisions", "disagreement", "show", "vote"]
+__all__ = ["WAYS", "average", "combine", "decisions", "disagreement", "vote"]
 
 Way = Callable[[Tensor, Task], Tensor]
-_DIFFER, _LEFT_OUT = "/disagreement", "left_out_"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What an ensemble is worth.
-
-    Attributes:
-        members: row -> metrics, of the rows that took part.
-        ensembles: row -> metrics, one per way; ``same/<label>/disagreement`` and ``same/any/disagreement``
-            are the shares of test gestures on which the members are not of one mind.
-        missing: rows without a finished run.
-        left_out: column -> the members that have no part in it, each with its reason.
-    """
-
-    members: dict[str, dict[str, float]]
-    ensembles: dict[str, dict[str, float]]
-    missing: tuple[str, ...]
-    left_out: dict[str, str]
 
 
 class _Known:
@@ -103,69 +81,37 @@ WAYS: dict[str, Way] = {"ensemble_vote": vote, "ensemble_average": average}
 
 
 def combine(
-    store: Store,
-    members: Sequence[DictConfig],
-    ways: Mapping[str, DictConfig],
-    say: Callable[[str], None] = lambda doing: None,
-) -> Outcome:
+    store: Store, members: Mapping[str, tuple[DictConfig, Run]], ways: Mapping[str, DictConfig]
+) -> dict[str, Run]:
     """Evaluate ensembles of finished runs on every column and log each as a run of its own.
 
     What an ensemble of the same runs found before is not found again. Its run has the fingerprint of its
-    configuration, by which the results table finds it, and the tag ``members`` with the ids of their runs.
+    configuration, by which the results table finds it, the tag ``members`` with the ids of their runs, and
+    the tags ``left_out_<column>`` with the members that have no part in a column. The metrics
+    ``same/<label>/disagreement`` and ``same/any/disagreement`` are the shares of test gestures on which the
+    members differ.
 
     Args:
         store: of the members' runs and the ensembles'.
-        members: configurations of one seed and simulator, one per row.
+        members: name -> configuration and finished run, of one seed and simulator.
         ways: name in ``WAYS`` -> configuration of that seed and simulator, with the ensemble's ``row``.
-        say: is told what happens.
 
     Raises:
-        InputError: fewer than two members have a finished run.
+        InputError: there are fewer than two members.
     """
-    runs = {config.row: _finished(store, config) for config in members}
-    present = {row: run for row, run in runs.items() if run is not None}
-    missing = tuple(row for row, run in runs.items() if run is None)
-    if len(present) < 2:
+    if len(members) < 2:
         raise InputError(
-            f"an ensemble needs two finished rows, got {', '.join(present) or 'none'} without "
-            f"{', '.join(missing)}: skin train experiment={(missing or ('ROW',))[0]} makes one"
+            f"an ensemble needs two finished runs, got {', '.join(members) or 'none'}: skin train makes them"
         )
-    identity = " ".join(run.info.run_id for run in present.values())
-    done = {name: _finished(store, config, members=identity) for name, config in ways.items()}
-    if not all(done.values()):
-        chosen = [(config, present[config.row]) for config in members if config.row in present]
-        asked = _ask(store, chosen, build_device(next(iter(ways.values()))), say)
-        for name, config in ways.items():
-            say(f"evaluating {config.row}")
-            done[name] = _log(store, config, asked, WAYS[name], identity)
-    ensembles = {ways[name].row: run for name, run in done.items() if run is not None}
-    return Outcome(
-        {row: run.data.metrics for row, run in present.items()},
-        {row: run.data.metrics for row, run in ensembles.items()},
-        missing,
-        _left_out(next(iter(ensembles.values()))),
-    )
-
-
-def show(outcome: Outcome, title: str, console: Console | None = None) -> None:
-    """Print members and ensembles, overall accuracies in per cent, and how often the members differ."""
-    console = console or Console()
-    named = ("same", "holdout", "device_shift", "unseen_layout")
-    table = Table("", *named, title=title)
-    for row, metrics in (outcome.members | outcome.ensembles).items():
-        shares = (metrics.get(f"{column}/overall/accuracy") for column in named)
-        table.add_row(row, *("cannot" if share is None else percent(str(share)) for share in shares))
-    console.print(table)
-    best = max(outcome.members, key=lambda row: outcome.members[row]["same/overall/accuracy"])
-    found = next(iter(outcome.ensembles.values()))
-    differ = ", ".join(
-        f"{name.split('/')[1]} {percent(str(share))}" for name, share in found.items() if _DIFFER in name
-    )
-    lines = [f"best member: {best}", f"share of test gestures on which the members differ: {differ} %"]
-    lines += [f"without {', '.join(outcome.missing)}: no finished run"] if outcome.missing else []
-    lines += [f"{column} without {reasons}" for column, reasons in outcome.left_out.items()]
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    identity = " ".join(run.info.run_id for _, run in members.values())
+    done = {
+        name: store.find("FINISHED", fingerprint=fingerprint(config), members=identity)
+        for name, config in ways.items()
+    }
+    if all(done.values()):
+        return {name: found[0] for name, found in done.items()}
+    asked = _ask(store, list(members.values()), build_device(next(iter(ways.values()))))
+    return {name: _log(store, config, asked, WAYS[name], identity) for name, config in ways.items()}
 
 
 @dataclass(frozen=True)
@@ -177,21 +123,14 @@ class _Asked:
     left_out: dict[str, str]
 
 
-def _ask(
-    store: Store,
-    members: Sequence[tuple[DictConfig, Run]],
-    device: AbstractDevice,
-    say: Callable[[str], None],
-) -> _Asked:
+def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: AbstractDevice) -> _Asked:
     """Bring every member back and ask it about every column, of which it takes all sets or none."""
-    say("drawing touches")
     settings = members[0][0].evaluation
     sets = {column: _drawn(drawn) for column, drawn in columns(device, settings).items()}
     sets["alarm"] = [gestures(device, settings)]
     answers: dict[str, list[Tensor]] = {}
     left_out: dict[str, str] = {}
     for config, run in members:
-        say(f"asking {config.row}")
         learner = build_learner(config)
         restore(store, run, learner, build_data(config, device))
         for column, drawn in sets.items():
@@ -216,8 +155,8 @@ def _drawn(sets: Iterator[Touches]) -> list[Touches]:
 def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: str) -> Run:
     """Evaluate one ensemble, log its run and return it."""
     device, known = asked.device, _Known(asked.chances, asked.device.task, way)
-    about = {"members": identity} | {f"{_LEFT_OUT}{column}": who for column, who in asked.left_out.items()}
-    with store.run(f"{config.row} {config.data.name} {config.seed}", tags(config) | about) as run:
+    about = {"members": identity} | {f"left_out_{column}": who for column, who in asked.left_out.items()}
+    with store.run(f"{config.row} {simulator(config)} seed {config.seed}", tags(config) | about) as run:
         groups = ("representation", "model", "fusion", "learner", "optimizer", "trainer", "epochs")
         kept = {key: value for key, value in plain(config).items() if key not in groups}
         describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))
@@ -225,17 +164,7 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
         report = evaluate(known, device, config.evaluation, point)
         chances = asked.chances[digest(next(columns(device, config.evaluation)["same"]))]
         differ = disagreement(chances, device.task)
-        conclude(store, run, report, device.task, {f"same/{name}{_DIFFER}": x for name, x in differ.items()})
+        conclude(
+            store, run, report, device.task, {f"same/{name}/disagreement": x for name, x in differ.items()}
+        )
     return store.client.get_run(run.info.run_id)
-
-
-def _finished(store: Store, config: DictConfig, **further: str) -> Run | None:
-    """Return the newest finished run of a configuration."""
-    found = store.find("FINISHED", fingerprint=fingerprint(config), **further)
-    return found[0] if found else None
-
-
-def _left_out(run: Run) -> dict[str, str]:
-    """Return column -> who was left out, as the run's tags tell."""
-    found = {name: text for name, text in run.data.tags.items() if name.startswith(_LEFT_OUT)}
-    return {name.removeprefix(_LEFT_OUT): text for name, text in found.items()}

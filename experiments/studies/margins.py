@@ -1,18 +1,16 @@
 """Files and one line on the errors of a learner by margin."""
 
-import csv
-import io
 import math
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.studies.tables import as_csv, markdown
 from skin.evaluation.margins import ALARM, Faint, Margins, Span
 from skin.files import write
 from skin.labels import OPPOSITE, TOUCH
 from skin.plot.figures import COLOURS, save
-from studies.table import markdown
 
 __all__ = ["line", "publish"]
 
@@ -96,18 +94,18 @@ def _span(one: Span | Faint) -> str:
 
 def _csv(found: Margins) -> str:
     """Return every figure as ``label,by,low,high,touches,said,wrong``."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["label", "by", "low", "high", "touches", "said", "wrong"])
-    for name, each in found.spans.items():
-        writer.writerows(
-            [name, "threshold", one.low, one.high, one.count, one.said, one.wrong] for one in each
-        )
-    for name in TOUCH.names:
-        writer.writerows(
-            [name, "reading", one.low, one.high, one.count, "", one.wrong[name]] for one in found.faint
-        )
-    return buffer.getvalue()
+    head = ["label", "by", "low", "high", "touches", "said", "wrong"]
+    spans = [
+        [name, "threshold", one.low, one.high, one.count, one.said, one.wrong]
+        for name, each in found.spans.items()
+        for one in each
+    ]
+    faint = [
+        [name, "reading", one.low, one.high, one.count, "", one.wrong[name]]
+        for name in TOUCH.names
+        for one in found.faint
+    ]
+    return as_csv([head, *spans, *faint])
 
 
 def _figure(found: Margins, title: str) -> Figure:

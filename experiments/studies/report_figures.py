@@ -10,7 +10,8 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from skin.device.simulated import Simulated
+from experiments.studies.table import Cell
+from skin.device.base import AbstractSimulated
 from skin.evaluation.metrics import confusion
 from skin.plot import figures
 from skin.plot.surface import deflection, surface
@@ -20,7 +21,6 @@ from skin.representation.interp import Interpolation
 from skin.simulator.naive import Naive
 from skin.touch.sampler import Movie
 from skin.tracking import Store
-from studies.table import Cell
 
 __all__ = ["draw_runs", "draw_skin"]
 
@@ -48,7 +48,7 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
     return paths
 
 
-def draw_skin(device: Simulated, folder: Path, name: str = "fem") -> list[Path]:
+def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> list[Path]:
     """Draw figures 2, 3, 4, 10 and 11 from the gestures of a skin whose simulator has a name."""
     recording = device.recording("test", complete=False)
     touches, drawn = recording.touches, recording.parameters
@@ -80,7 +80,7 @@ def draw_skin(device: Simulated, folder: Path, name: str = "fem") -> list[Path]:
     ]
 
 
-def _hand(device: Simulated, folder: Path) -> list[Path]:
+def _hand(device: AbstractSimulated, folder: Path) -> list[Path]:
     """Draw both faces of the top layer under a big press of the hand, or of whatever presses without one."""
     movie, chosen = _press(device, [True, False, True, False])
     frame = movie.index[chosen, int(movie.scale[chosen].argmax())]
@@ -96,7 +96,7 @@ def _hand(device: Simulated, folder: Path) -> list[Path]:
     return paths
 
 
-def _press(device: Simulated, labels: Sequence[bool]) -> tuple[Movie, int]:
+def _press(device: AbstractSimulated, labels: Sequence[bool]) -> tuple[Movie, int]:
     """Return 64 gestures with given labels, and which of them is a hand's, or the first without a hand."""
     movie = device.sampler.sample(64, np.random.default_rng(0), np.tile(labels, (64, 1)))
     names = device.sampler.shapes.names
@@ -104,7 +104,7 @@ def _press(device: Simulated, labels: Sequence[bool]) -> tuple[Movie, int]:
     return movie, int((movie.parameters["shape"] == shape).int().argmax())
 
 
-def _overview(device: Simulated, folder: Path) -> Path:
+def _overview(device: AbstractSimulated, folder: Path) -> Path:
     """Draw a big, sliding, dangerous press of the hand, or of whatever presses where there is no hand."""
     movie, chosen = _press(device, [True] * 4)
     readings = device.model.respond(movie).readings[chosen]

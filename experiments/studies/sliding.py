@@ -1,17 +1,16 @@
 """Files and one line on an evaluation on streams."""
 
-import csv
-import io
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from experiments.studies.tables import as_csv, markdown
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.sliding import Sliding
 from skin.files import write
 from skin.plot.figures import COLOURS, save
-from studies.table import markdown
 
 __all__ = ["line", "publish"]
 
@@ -86,24 +85,20 @@ def _tables(found: Sliding) -> dict[str, list[list[str]]]:
 
 def _csv(found: Sliding) -> str:
     """Return every figure as ``measure,name,at,value``."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["measure", "name", "at", "value"])
+    table: list[Sequence[object]] = [["measure", "name", "at", "value"]]
     for one in found.bins:
-        writer.writerow(["windows", "", one.name, one.count])
-        writer.writerows(["accuracy", name, one.name, f"{v:.4f}"] for name, v in one.accuracy.items())
-        writer.writerows(["majority", name, one.name, f"{v:.4f}"] for name, v in one.majority.items())
+        table.append(["windows", "", one.name, one.count])
+        table += (["accuracy", name, one.name, f"{v:.4f}"] for name, v in one.accuracy.items())
+        table += (["majority", name, one.name, f"{v:.4f}"] for name, v in one.majority.items())
     for gate, counts in found.gates.items():
         cells = ("idle said idle", "idle said touched", "touched said idle", "touched said touched")
-        writer.writerows(
-            [gate_cell, gate, "", int(n)] for gate_cell, n in zip(cells, counts.flatten(), strict=True)
-        )
+        table += ([gate_cell, gate, "", int(n)] for gate_cell, n in zip(cells, counts.flatten(), strict=True))
     for gate, alarms in found.alarms.items():
-        writer.writerows([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
-    writer.writerow(["threshold, N", "threshold", "", f"{found.threshold:.4f}"])
-    writer.writerow(["stream, h", "", "", found.hours])
-    writer.writerows(["window", "overall", window, value] for window, value in found.lengths.items())
-    return buffer.getvalue()
+        table += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
+    table.append(["threshold, N", "threshold", "", f"{found.threshold:.4f}"])
+    table.append(["stream, h", "", "", found.hours])
+    table += (["window", "overall", window, value] for window, value in found.lengths.items())
+    return as_csv(table)
 
 
 def _figure(found: Sliding, title: str) -> Figure:

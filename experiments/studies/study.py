@@ -1,34 +1,22 @@
-"""Studies: the report's statements about variants, and the runs that test them."""
+"""Studies: what is trained, on what it is tried, and the statements that this decides (``conf/study``)."""
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from statistics import fmean, stdev
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from annotated_types import Ge, MinLen
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig
 
-from skin.config import CONF, ROOT, checked
+from skin.config import CONF, checked, overrides, plain
 from skin.errors import InputError
+from skin.settings import check
 from skin.sweep import jobs
 
-__all__ = [
-    "SMOKE",
-    "STATEMENTS",
-    "Paired",
-    "Statement",
-    "Study",
-    "Variant",
-    "choose",
-    "conclude",
-    "paired",
-    "read",
-    "verdict",
-]
+__all__ = ["SMOKE", "Statement", "Study", "Variant", "given", "sweeps", "variants", "words"]
 
-STATEMENTS = ROOT / "data" / "report_statements.yaml"
 SMOKE = (
     "data.gestures=80",
     "device.test_gestures=48",
@@ -39,20 +27,20 @@ SMOKE = (
     "tracking.experiment=smoke",
 )
 """Overrides that shrink every run to a second; its scores are to be ignored."""
-FEWEST = 3
-"""Paired seeds below which every verdict is ``undecided``."""
+_OWN = ("study", "smoke", "out")
+_NAMED = ("experiment", "simulator", "row")
 
 
 @dataclass(frozen=True)
 class Statement:
-    """A sentence of the report that runs can test; ``data/report_statements.yaml`` explains the fields."""
+    """A sentence that runs can test; ``conf/study.yaml`` explains the fields."""
 
     id: str
-    section: str
     says: str
     one: Mapping[str, str]
     metric: str
     claim: str
+    section: str = ""
     others: Sequence[Mapping[str, str]] = ()
     level: float | None = None
     by: float = 0.0
@@ -63,8 +51,8 @@ class Variant:
     """The configurations of one variant.
 
     Attributes:
-        name: what tells it from the others of its sweep.
-        chosen: the overrides of its sweep, as key -> value.
+        name: what tells it from the others of its study.
+        chosen: the settings that its study gives it, as key -> value.
         configs: seed -> configuration.
     """
 
@@ -75,160 +63,115 @@ class Variant:
 
 @dataclass(frozen=True)
 class Study:
-    """Statements about the variants that some sweeps train.
+    """A comparison of runs; ``conf/study.yaml`` explains the fields.
 
-    Attributes:
-        name: as the command takes it.
-        about: what is varied.
-        sweeps: files of ``conf/sweep``.
-        minutes: estimated cost of three seeds on two idle cores.
-        statements: what the report says.
-        costly: whether ``all`` leaves it out.
-        self_share: whether its table shows how much of a node's row is the node itself.
+    Raises:
+        InputError: a setting that cannot be used.
     """
 
     name: str
     about: str
-    sweeps: Sequence[str]
-    minutes: float
-    statements: Sequence[Statement]
-    costly: bool = False
-    self_share: bool = False
+    seeds: Annotated[Sequence[Annotated[int, Ge(0)]], MinLen(1)]
+    trainings: Sequence[Any] = ()
+    common: Mapping[str, Any] = field(default_factory=dict)
+    train: bool = True
+    ensembles: Sequence[str] = ()
+    rows: str | Sequence[str] | None = None
+    run: str | None = None
+    conditions: Mapping[str, Any] = field(default_factory=dict)
+    test: Mapping[str, Any] = field(default_factory=dict)
+    devices: Annotated[int, Ge(0)] = 0
+    numbered: Sequence[str] = ()
+    measure: Any = None
+    metrics: Sequence[str] = ()
+    differences: str | None = None
+    statements: Sequence[Statement] = ()
+    minutes: float | None = None
 
-    def __str__(self) -> str:
-        cost = f"about {self.minutes:g} min with 3 seeds" + (", not among all" if self.costly else "")
-        said = (f"  {one.section}  {one.says}" for one in self.statements)
-        return "\n".join([f"{self.name}: {self.about} ({cost})", *said])
-
-    def variants(self, overrides: Sequence[str]) -> list[Variant]:
-        """Return every variant with its configurations, in the order of the sweeps.
-
-        Args:
-            overrides: of the command line, seeds among them.
+    @classmethod
+    def of(cls, config: DictConfig) -> "Study":
+        """Return the study of a configuration of ``skin study``.
 
         Raises:
-            InputError: an override leaves more than one configuration for a variant and seed.
+            InputError: none is chosen, or a setting that it does not have or take.
         """
-        made = [each for sweep in self.sweeps for each in _composed(sweep, overrides)]
-        common = set.intersection(*(set(chosen.items()) for chosen, _ in made))
-        return [
-            Variant(" ".join(_short(*item) for item in chosen.items() if item not in common), chosen, configs)
-            for chosen, configs in made
-        ]
+        name = HydraConfig.get().runtime.choices.get("study")
+        if not name:
+            known = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
+            raise InputError(f"which study? choose one of {known}, as in study=norm")
+        settings = {"name": name} | plain(config)["study"]
+        check(cls, settings, "study")
+        if settings["measure"]:
+            part = settings["measure"]
+            check(get_object(part["_target_"]), part, "study.measure")
+            settings["measure"] = instantiate(part)
+        return cls(**settings | {"statements": [Statement(**one) for one in settings["statements"]]})
 
 
-@dataclass(frozen=True)
-class Paired:
-    """A difference or a ratio over seeds that two variants share.
+def given() -> list[str]:
+    """Return the overrides of the command line that are for trainings, or change finished runs' devices.
 
-    Attributes:
-        mean: of one - other, or of one / other.
-        error: standard error of that mean; infinite with a single seed.
-        seeds: how many pairs there are.
+    What the default training does not have must be added (``+``), though a study's trainings may have it.
     """
-
-    mean: float
-    error: float
-    seeds: int
+    found = [one for one in overrides() if _key(one).split(".")[0] not in _OWN]
+    return [f"++{one.lstrip('+')}" if one.startswith("+") else one for one in found]
 
 
-def read(path: Path = STATEMENTS) -> dict[str, Study]:
-    """Return the studies of a file by name."""
-    stored: Any = OmegaConf.to_container(OmegaConf.load(path))
-    return {
-        name: Study(name=name, **fields | {"statements": [Statement(**one) for one in fields["statements"]]})
-        for name, fields in stored.items()
-    }
+def words(settings: Mapping[str, Any]) -> list[str]:
+    """Return settings as overrides; a list is swept."""
+    return [f"{key}={_text(value)}" for key, value in settings.items()]
 
 
-def choose(studies: Mapping[str, Study], names: Sequence[str]) -> list[Study]:
-    """Return the studies of those names; ``all`` stands for every one that is not costly.
-
-    Raises:
-        InputError: no name, or an unknown one.
-    """
-    known = f"give all or some of {', '.join(studies)}"
-    if not names:
-        raise InputError(f"which study? {known}")
-    for name in names:
-        if name not in (*studies, "all"):
-            raise InputError(f"there is no study {name}: {known}")
-    every = "all" in names
-    return [study for name, study in studies.items() if name in names or (every and not study.costly)]
+def sweeps(study: Study, smoke: bool = False) -> Iterator[tuple[Mapping[str, Any], list[str]]]:
+    """Yield each sweep that trains a study's variants: its own settings, and all of its overrides."""
+    last = [*words(study.common), f"seed={_text(study.seeds)}", *(SMOKE if smoke else ()), *given()]
+    rows = {} if study.rows is None else {"experiment": study.rows}
+    fixed = {_key(one) for one in last}
+    for block in study.trainings:
+        own = {key: value for key, value in (block | rows).items() if key not in fixed}
+        yield own, [*words({key: value for key, value in own.items() if key != "name"}), *last]
 
 
-def paired(one: Mapping[str, float], other: Mapping[str, float], ratio: bool = False) -> Paired | None:
-    """Compare two sets of figures seed by seed; None where they share no seed.
-
-    The error is the sample deviation of the differences (or ratios) by the root of their number, as in a
-    paired t-test.
-
-    Args:
-        one: seed -> figure.
-        other: seed -> figure.
-        ratio: take one / other instead of one - other.
-    """
-    pairs = [(one[seed], other[seed]) for seed in one if seed in other]
-    each = [first / second if ratio else first - second for first, second in pairs]
-    if not each:
-        return None
-    error = stdev(each) / math.sqrt(len(each)) if len(each) > 1 else math.inf
-    return Paired(fmean(each), error, len(each))
+def variants(study: Study, smoke: bool = False) -> list[Variant]:
+    """Return every variant that a study trains, with its configurations."""
+    found = [one for block, line in sweeps(study, smoke) for one in _variants(block, line)]
+    shared = set.intersection(*(set(named.items()) for named, _ in found)) if found else set()
+    return [
+        replace(one, name=" ".join(_short(*item) for item in named.items() if item not in shared))
+        for named, one in found
+    ]
 
 
-def verdict(claim: str, found: Paired | None, by: float = 0.0) -> str:
-    """Return ``agree``, ``disagree`` or ``undecided``.
-
-    A claim is an interval in which the difference (for ``ratio``: the ratio) must lie. The verdict is
-    ``agree`` if the mean with two standard errors on either side lies wholly inside, ``disagree`` if it lies
-    wholly outside, else, and always with fewer than three paired seeds, ``undecided``.
-
-    Args:
-        claim: ``greater`` (0 to infinity), ``less`` (minus infinity to 0), ``alike`` (-by to by),
-            ``no better`` (minus infinity to by), ``about`` or ``ratio`` (by / 2 to 2 by).
-        found: the comparison, None without paired seeds.
-        by: in the unit of the comparison.
-    """
-    least, most = {
-        "greater": (0.0, math.inf),
-        "less": (-math.inf, 0.0),
-        "alike": (-by, by),
-        "no better": (-math.inf, by),
-        "about": (by / 2, 2 * by),
-        "ratio": (by / 2, 2 * by),
-    }[claim]
-    if found is None or found.seeds < FEWEST:
-        return "undecided"
-    low, high = found.mean - 2 * found.error, found.mean + 2 * found.error
-    if least < low and high < most:
-        return "agree"
-    return "disagree" if high < least or low > most else "undecided"
-
-
-def conclude(verdicts: Sequence[str]) -> str:
-    """Return the verdict of a statement about several others: it holds only if it holds against each."""
-    if "disagree" in verdicts:
-        return "disagree"
-    return "agree" if verdicts and set(verdicts) == {"agree"} else "undecided"
-
-
-def _composed(sweep: str, overrides: Sequence[str]) -> list[tuple[dict[str, str], dict[str, DictConfig]]]:
-    """Return what a sweep chooses for each variant, and seed -> configuration."""
-    parameters = OmegaConf.load(CONF / "sweep" / f"{sweep}.yaml").hydra.sweeper.params
-    found: dict[tuple[str, ...], dict[str, DictConfig]] = {}
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for job in jobs([f"sweep={sweep}", *overrides], parameters):
-            configs = found.setdefault(tuple(job[key] for key in parameters), {})
-            config = checked(compose("train", [f"{key}={value}" for key, value in job.items()]))
-            if str(config.seed) in configs:
-                raise InputError(
-                    f"sweep={sweep} has several configurations of one variant and seed {config.seed}: "
-                    "give every setting that the study is not about one value"
-                )
-            configs[str(config.seed)] = config
-    return [(dict(zip(parameters, values, strict=True)), configs) for values, configs in found.items()]
+def _variants(block: Mapping[str, Any], line: Sequence[str]) -> list[tuple[dict[str, str], Variant]]:
+    """Return each variant of a sweep, with what may name it."""
+    name, found = block.get("name"), dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
+    for job in jobs(list(line), {}):
+        chosen = {key: job[key] for key in block if key != "name"}
+        named = {
+            key: value
+            for key, value in chosen.items()
+            if isinstance(block[key], list) or (not name and key in _NAMED)
+        }
+        config = checked(compose("train", [f"{key}={value}" for key, value in job.items()]))
+        start = {"name": name} if name else {}
+        _, variant = found.setdefault(
+            tuple(chosen.values()), (start | named, Variant("", start | chosen, {}))
+        )
+        variant.configs[str(config.seed)] = config
+    return list(found.values())
 
 
 def _short(key: str, value: str) -> str:
-    """Return a choice for a person: rows and simulators by their name alone."""
-    return value if key in ("experiment", "simulator") else f"{key.rpartition('.')[2]}={value}"
+    """Return a choice for a person: names, rows and simulators stand for themselves."""
+    return value if key in ("name", *_NAMED) else f"{key.rpartition('.')[2]}={value}"
+
+
+def _text(value: Any) -> str:
+    """Return a value as an override has it."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(_text, value))
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").split("=")[0]

@@ -1,7 +1,6 @@
 """The results table: our numbers from MLflow beside the report's."""
 
 import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +9,10 @@ from statistics import fmean, stdev
 from mlflow.entities import Run
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.table import Table
 
-from skin.config import fingerprint
+from experiments.studies import tables
+from experiments.studies.runs import finished
+from experiments.studies.tables import percent
 from skin.tracking import Store
 
 __all__ = [
@@ -24,7 +24,6 @@ __all__ = [
     "as_csv",
     "collect",
     "grid",
-    "markdown",
     "report_values",
     "rows",
     "show",
@@ -34,7 +33,6 @@ ACCURACIES = ("overall", "big", "dynamic", "press", "dangerous")
 ALARM = {"dangerous_recall": "dangerous/alarm_recall", "false_alarms": "dangerous/false_alarm_rate"}
 """Label in the table -> metric; at the threshold that is stored with each run."""
 LABELS = (*ACCURACIES, *ALARM)
-_WIDEST = 200  # characters
 COLUMNS = (
     "row",
     "simulator",
@@ -83,8 +81,7 @@ def collect(store: Store, jobs: Iterable[tuple[str, str, DictConfig]]) -> list[C
     """Return the cells of jobs (row, simulator, configuration), by the fingerprint of each."""
     groups: dict[tuple[str, str], list[Run | None]] = {}
     for row, simulator, config in jobs:
-        finished = store.find("FINISHED", fingerprint=fingerprint(config))
-        groups.setdefault((row, simulator), []).append(finished[0] if finished else None)
+        groups.setdefault((row, simulator), []).append(finished(store, config))
     return [
         Cell(*key, tuple(run for run in runs if run is not None), runs.count(None))
         for key, runs in groups.items()
@@ -151,19 +148,9 @@ def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
     return table
 
 
-def markdown(table: Sequence[Sequence[str]], title: str) -> str:
-    """Return a table, its head first, as Markdown."""
-    lines = ["| " + " | ".join(line) + " |" for line in table]
-    return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
-
-
 def as_csv(lines: Sequence[dict[str, str]]) -> str:
     """Return the lines as CSV with a header."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return buffer.getvalue()
+    return tables.as_csv([COLUMNS, *([line[name] for name in COLUMNS] for line in lines)])
 
 
 def _metric(column: str, label: str) -> str:
@@ -184,14 +171,6 @@ def beside(line: dict[str, str]) -> str:
     return (percent(line["ours"], line["ours_sd"]) or "-") + (f" ({reported})" if reported else "")
 
 
-def percent(value: str, deviation: str = "") -> str:
-    """Return a share in per cent, with its deviation if there is one; what is no number stays as it is."""
-    if value in ("", "failed", "cannot"):
-        return value
-    spread = f" ± {100 * float(deviation):.1f}" if deviation else ""
-    return f"{100 * float(value):.1f}{spread}"
-
-
 def show(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:
     """Print the results table, narrow enough for 80 columns with one seed; the report's overall in brackets.
 
@@ -200,24 +179,14 @@ def show(lines: Sequence[dict[str, str]], title: str, console: Console | None = 
         title: of the table.
         console: where to print; None takes standard output.
     """
-    table = Table(title=title, box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for head in ("row", "data"):
-        table.add_column(head, no_wrap=True)
-    for head in ("overall", "big", "dyn.", "press", "dang.", "recall", "false", "dev.", "lay."):
-        table.add_column(head, no_wrap=True, justify="right")
+    head = ["row", "data", "overall", "big", "dyn.", "press", "dang.", "recall", "false", "dev.", "lay."]
+    table = [head]
     for start in range(0, len(lines), len(LABELS)):
         group = {line["label"]: line for line in lines[start : start + len(LABELS)]}
         whole = group["overall"]
-        table.add_row(
-            whole["row"],
-            whole["simulator"],
-            beside(whole),
-            *(percent(group[label]["ours"]) for label in LABELS[1:]),
-            percent(whole["device_shift"]),
-            percent(whole["unseen_layout"]),
+        table.append(
+            [whole["row"], whole["simulator"], beside(whole)]
+            + [percent(group[label]["ours"]) for label in LABELS[1:]]
+            + [percent(whole["device_shift"]), percent(whole["unseen_layout"])]
         )
-    console = console or Console()
-    # A number cut short would be another number: rather let a narrow terminal wrap.
-    needed = console.measure(table, options=console.options.update(width=_WIDEST)).maximum
-    console.width = max(console.width, needed)
-    console.print(table)
+    tables.show(table, title, console)

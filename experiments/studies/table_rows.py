@@ -1,21 +1,23 @@
 """The runs in the results table: the rows of the sweep, and those that other commands make."""
 
-from contextlib import suppress
+from collections.abc import Sequence
 
+from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
-import ensemble
-from peers import PEERS
-from skin.config import CONF
-from skin.errors import InputError
+from experiments.peers import PEERS
+from experiments.studies.ensemble import WAYS, combine
+from experiments.studies.runs import finished
+from skin.config import CONF, checked
+from skin.run import simulator
 from skin.sweep import jobs
 from skin.tracking import Store
-from studies.cli import configuration
 
 __all__ = ["Entries"]
 
 # They stand in the table as soon as a run of theirs has finished.
-OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in (*ensemble.WAYS, *PEERS)))
+OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in (*WAYS, *PEERS)))
+MEMBERS = ("linked_graph", "temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
 
 
 class Entries:
@@ -29,24 +31,28 @@ class Entries:
         others: the same of the rows that other commands make.
     """
 
-    def __init__(self, overrides: list[str]) -> None:
+    def __init__(self, overrides: Sequence[str]) -> None:
         parameters = OmegaConf.load(CONF / "sweep" / "table.yaml").hydra.sweeper.params
-        trained = [[f"{key}={value}" for key, value in job.items()] for job in jobs(overrides, parameters)]
-        self.rows = [configuration(*job) for job in trained]
+        trained = [[f"{key}={value}" for key, value in job.items()] for job in jobs([*overrides], parameters)]
+        self.rows = [_composed(*job) for job in trained]
         # Every simulator and seed once, in order: the same touches whatever learns from them.
         touches = (tuple(word for word in job if not word.startswith("experiment=")) for job in trained)
         self._touches = list(dict.fromkeys(touches))
-        self.others = [configuration(*job, other) for job in self._touches for other in OTHERS]
+        self.others = [_composed(*job, other) for job in self._touches for other in OTHERS]
 
     def vote(self, store: Store) -> None:
         """Let the report's networks decide together, wherever two of them have finished."""
-        from studies.ensemble import combine
-
         for job in self._touches:
-            members, ways = ensemble.configurations(list(job))
-            with suppress(InputError):
-                combine(store, members, ways)
+            configs = [_composed(*job, f"experiment={row}") for row in MEMBERS]
+            runs = {config.row: (config, finished(store, config)) for config in configs}
+            present = {row: (config, run) for row, (config, run) in runs.items() if run is not None}
+            if len(present) > 1:
+                combine(store, present, {way: _composed(*job, f"row={way}") for way in WAYS})
 
     def named(self, configs: list[DictConfig]) -> list[tuple[str, str, DictConfig]]:
         """Return configurations with their row and simulator."""
-        return [(config.row, config.data.name, config) for config in configs]
+        return [(config.row, simulator(config), config) for config in configs]
+
+
+def _composed(*words: str) -> DictConfig:
+    return checked(compose("train", list(words)))

@@ -6,12 +6,12 @@ import tempfile
 import numpy as np
 import torch
 
+from experiments.validation.basics import skin
 from skin.contact._grain import with_grain
 from skin.contact._unilateral import solve
 from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator.solid import Solid, hexahedra, readings
-from validation.basics import skin
 
 __all__ = ["main"]
 

@@ -5,6 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from experiments.validation.blocks import WALLS, block, held, solve
+from experiments.validation.finding import Finding, Outcome, compared
+from experiments.validation.layered import Slab
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
@@ -12,9 +15,6 @@ from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import hexahedra, readings
-from validation.blocks import WALLS, block, held, solve
-from validation.finding import Finding, Outcome, compared
-from validation.layered import Slab
 
 __all__ = [
     "SLABS",

@@ -5,14 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import scipy.sparse as sp
 
+from experiments.validation.basics import SLABS, stack
+from experiments.validation.blocks import WALLS, block, held, row_means, solve
+from experiments.validation.direct import locking
+from experiments.validation.finding import Curve, Finding, Outcome, Picture, compared
+from experiments.validation.layered import Slab, bonded_layer, patch
 from skin.sensors import Sensors
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import readings
-from validation.basics import SLABS, stack
-from validation.blocks import WALLS, block, held, row_means, solve
-from validation.direct import locking
-from validation.finding import Curve, Finding, Outcome, Picture, compared
-from validation.layered import Slab, bonded_layer, patch
 
 __all__ = ["convergence", "default_mesh", "no_locking", "thin_layer"]
 

@@ -1,8 +1,8 @@
 """The laws, in the order of the page."""
 
+from experiments.validation import basics, bonded, others, thick
+from experiments.validation.finding import Law
 from skin.errors import InputError
-from validation import basics, bonded, others, thick
-from validation.finding import Law
 
 __all__ = ["LAWS", "chosen"]
 
@@ -61,7 +61,7 @@ def chosen(names: str | list[str]) -> list[Law]:
         return list(LAWS)
     if not wanted or (unknown := [name for name in wanted if name not in known]):
         raise InputError(
-            f"physics.laws must be all or some of {', '.join(known)}, got "
-            f"{', '.join(unknown) if wanted else 'none'}: as in physics.laws=[hertz,punch]"
+            f"validate.laws must be all or some of {', '.join(known)}, got "
+            f"{', '.join(unknown) if wanted else 'none'}: as in validate.laws=[hertz,punch]"
         )
     return [known[name] for name in wanted]

@@ -13,6 +13,9 @@ import scipy.sparse as sp
 import torch
 from scipy.sparse.linalg import spsolve
 
+from experiments.validation.basics import skin
+from experiments.validation.direct import solve_frame
+from experiments.validation.finding import Finding, Outcome, compared
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.sensors import Sensors
@@ -23,9 +26,6 @@ from skin.simulator._relaxation import Relaxing
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
 from skin.simulator.solid import Solid, hexahedra, readings
-from validation.basics import skin
-from validation.direct import solve_frame
-from validation.finding import Finding, Outcome, compared
 
 __all__ = ["creep", "equation_ten", "naive", "plates_and_beams", "single_frames", "threads"]
 
@@ -143,9 +143,9 @@ def threads(quick: bool) -> Outcome:
         for count in ("1", "2"):
             path = Path(folder) / f"{count}.npz"
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-            command = [sys.executable, "-m", "validation.alone", count, cells, str(path)]
+            command = [sys.executable, "-m", "experiments.validation.alone", count, cells, str(path)]
             environment = os.environ | dict.fromkeys(names, count)
-            subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[1])
+            subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[2])
             with np.load(path) as file:
                 found.append({name: file[name] for name in file.files})
     findings = []

@@ -9,8 +9,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from experiments.validation.finding import Finding, Law, Outcome, Picture
 from skin.files import whole, write
-from validation.finding import Finding, Law, Outcome, Picture
 
 __all__ = ["as_json", "draw", "page", "publish"]
 
@@ -18,7 +18,7 @@ Results = Sequence[tuple[Law, Outcome]]
 
 _HEAD = """# Physics, proved
 
-Written by `make physics` (`python experiments/verify_physics.py`). Every law is checked against an answer
+Written by `make physics` (`skin validate`). Every law is checked against an answer
 that is not the simulator's own; one that does not hold ends the command with exit code 1. Only digits that
 are the same on every processor are printed; errors of rounding stand as an upper bound. All digits of this
 machine, for programs: `results/physics.json`.

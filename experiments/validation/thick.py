@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from experiments.validation.blocks import ALL, block, graded, held, row_means, solve
+from experiments.validation.finding import Curve, Finding, Outcome, Picture, compared
+from experiments.validation.halfspace import HalfSpace, Hertz, round_punch, square_punch
 from skin.body.sheet import Sheet
 from skin.contact._grain import with_grain
 from skin.contact._unilateral import solve as press
 from skin.simulator._hexahedra import Hexahedra
-from validation.blocks import ALL, block, graded, held, row_means, solve
-from validation.finding import Curve, Finding, Outcome, Picture, compared
-from validation.halfspace import HalfSpace, Hertz, round_punch, square_punch
 
 __all__ = ["boussinesq", "cerruti", "flat_punch", "hertz"]
 

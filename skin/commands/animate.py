@@ -23,15 +23,15 @@ def main(config: DictConfig) -> None:
     from pathlib import Path
 
     from skin.build import build_device
-    from skin.device.simulated import Simulated
     from skin.plot.animation import still, write
     from skin.plot.touches import recorded, simulated
 
     device = build_device(config)
-    if isinstance(device, Simulated):
-        scene = simulated(device, list(config.labels), config.shape, config.seed, config.view == "skin3d")
-    else:
+    if device.simulation is None:
         scene = recorded(device, config.index)
+    else:
+        field = config.view == "skin3d"
+        scene = simulated(device.simulation, list(config.labels), config.shape, config.seed, field)
     path = Path(config.out).expanduser()
     path = (still if path.suffix == ".png" else write)(scene, config.view, path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

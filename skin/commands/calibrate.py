@@ -28,7 +28,6 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
 
     from skin.build import build_device
-    from skin.device.simulated import Simulated
     from skin.hardware.calibration import bench_session, gauge
     from skin.hardware.calibration.bench import bench
     from skin.hardware.calibration.fit import fit
@@ -38,9 +37,7 @@ def main(config: DictConfig) -> None:
     from skin.signal.calibration import write
 
     settings = plain(config)["calibrate"]
-    device = build_device(config)
-    if not isinstance(device, Simulated):
-        raise InputError("a calibration fits the simulation to a skin: leave out device=")
+    device = build_device(config).simulated("a calibration fits the simulation to a skin")
     if settings["demo"]:
         print(demo(device, settings, config.session))
     shape = settings["indenter"], settings["radius"]

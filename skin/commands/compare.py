@@ -17,7 +17,7 @@ from skin.files import results
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from skin.device.simulated import Simulated
+    from skin.device.base import AbstractSimulated
     from skin.plot.press_comparison import Verdicts
     from skin.recording import Touches
 
@@ -30,15 +30,12 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.console import quiet
-    from skin.device.simulated import Simulated
     from skin.files import write
     from skin.plot import gesture_comparison, gesture_page, press_comparison
 
     quiet()
     settings = plain(config)["compare"]
-    device = build_device(config)
-    if not isinstance(device, Simulated):
-        raise InputError("the other side is the session: leave out device=")
+    device = build_device(config).simulated("the other side is the session")
     folder = results(config.out)
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
@@ -59,7 +56,10 @@ def main(config: DictConfig) -> None:
 
 
 def _verdicts(
-    config: DictConfig, device: "Simulated", both: "Sequence[Touches]", truth: list[list[bool]] | None = None
+    config: DictConfig,
+    device: "AbstractSimulated",
+    both: "Sequence[Touches]",
+    truth: list[list[bool]] | None = None,
 ) -> "Verdicts | None":
     """Return what a run says of both sides; None without a run."""
     if config.run is None:

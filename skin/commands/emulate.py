@@ -23,16 +23,13 @@ def main(config: DictConfig) -> None:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
 
     from skin.build import build_device
-    from skin.device.simulated import Simulated
     from skin.hardware.emulator.emulator import Emulator, Settings
     from skin.hardware.emulator.faults import Faults
     from skin.hardware.emulator.outlet import outlet
 
     groups = plain(config)
     settings, faults = Settings.of(groups["emulate"]), Faults.of(groups["faults"])
-    device = build_device(config)
-    if not isinstance(device, Simulated):
-        raise InputError("only simulated gestures can be emulated: leave out device=")
+    device = build_device(config).simulated("only simulated gestures can be emulated")
     signal.signal(signal.SIGTERM, _leave)
     port = outlet(config.port, config.link)
     try:

@@ -16,9 +16,9 @@ def main(config: DictConfig) -> None:
     """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
     from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
-    from skin.device.serial import Serial
     from skin.evaluation.report import evaluate
     from skin.evaluation.show import report
+    from skin.option import option
     from skin.plot.evaluation_page import publish, verdicts
     from skin.reload import changed, configuration, find, operating_point, restore
     from skin.run import conclude
@@ -31,18 +31,16 @@ def main(config: DictConfig) -> None:
     stored = configuration(store, run, config.trust)
     config = changed(stored, config, given)
     device, learner = build_device(config), build_learner(config)
-    shapes = device.blank() if isinstance(device, Serial) else device
-    restore(store, run, learner, build_data(config, shapes))
+    restore(store, run, learner, build_data(config, device.blank()))
     point = operating_point(run, learner, stored, config.evaluation)
-    if isinstance(device, Serial):
-        device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
+    touches = device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         # Every evaluation keeps its files.
-        name = f"evaluation_{config.device['_target_'].split('.')[-2]}_{evaluation.info.run_id[:8]}"
-        if isinstance(device, Serial) and device.touches("test").labels is None:
-            chances = learner.probabilities(device.touches("test"))
+        name = f"evaluation_{option(device)}_{evaluation.info.run_id[:8]}"
+        if touches.labels is None:
+            chances = learner.probabilities(touches)
             said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
             store.client.log_artifact(evaluation.info.run_id, str(path))
             print(f"{title}\n{said}\n{path}")

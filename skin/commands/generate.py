@@ -24,23 +24,17 @@ def main(config: DictConfig) -> None:
 
     from skin.balance import announce
     from skin.build import build_device
-    from skin.device.recording import Recorded
-    from skin.device.simulated import Simulated
     from skin.storage import write
     from skin.summary import line
 
     device = build_device(config)
-    if not isinstance(device, Simulated | Recorded):
-        raise InputError("only simulated touches are generated: leave out device=")
     recording = device.recording()
-    if isinstance(device, Simulated):
-        announce(device, recording)
+    announce(device, recording)
     # Where the touches go does not change them.
     source = OmegaConf.masked_copy(config, [str(key) for key in config if key != "out"])
     about = {"config_hash": fingerprint(source), "config": plain(source)}
     path = write(replace(recording, metadata=recording.metadata | about), config.out)
     # What a file says of itself may be anything.
-    said = (
-        line(recording.metadata["summary"]) if isinstance(device, Simulated) else f"{len(recording)} gestures"
-    )
+    known = device.simulation is not None
+    said = line(recording.metadata["summary"]) if known else f"{len(recording)} gestures"
     print(f"{path}: {said}")

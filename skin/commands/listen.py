@@ -22,13 +22,12 @@ def main(config: DictConfig) -> None:
     if device["port"] is None:
         raise InputError("which port? add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER")
 
-    from skin.device.serial import Serial
-    from skin.settings import check
+    from skin.settings import check_groups
     from skin.wire.diagnosis import Listener
     from skin.wire.errors import SkinDisconnected, SkinTimeout
     from skin.wire.open import open_skin
 
-    check(Serial, {key: device[key] for key in _KEYS}, "device")
+    check_groups({"device": {key: device[key] for key in ("_target_", *_KEYS)}})
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sensors = None if config.n is None else range(config.n)
     with open_skin(device["port"], sensors, **{key: device[key] for key in _KEYS}) as skin:

@@ -62,7 +62,7 @@ def _watch(config: DictConfig, live: "Settings") -> None:
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         # As late as this, because from now on frames come.
-        source = start.source(device)
+        source = device.source()
         skin = open_.enter_context(source.skin)
         places, span = of.positions.numpy(), of.window / of.rate
         board = Board(Facts(run.info.run_name, source.name, places, of.device.size, live.top, span))

@@ -25,11 +25,10 @@ def main(config: DictConfig) -> None:
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
     from skin.build import build_device
-    from skin.device.serial import Serial
     from skin.hardware.record.recorder import finish, record
 
-    device = build_device(config)
-    if not isinstance(device, Serial):
+    device = build_device(config).wired
+    if device is None:
         raise InputError("only a skin at a port is recorded: leave out device=")
     path = Path(config.out).expanduser()
     if not settings["finish"]:

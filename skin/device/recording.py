@@ -3,15 +3,17 @@
 from typing import Literal
 
 import numpy as np
-import torch
 
 from skin.body.base import AbstractBody
+from skin.device._blank import Blank
+from skin.device._split import rows
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.rng import Stream, generator
 from skin.storage import read
+from skin.wire.open import open_skin
+from skin.wire.source import Source
 
 __all__ = ["Recorded"]
 
@@ -60,7 +62,7 @@ class Recorded(AbstractDevice):
         self.path, self.split_seed = path, split_seed
         self.sensors = layout.sensors(body)
         self._compare(body)
-        self.body, self.task, self.size = body, self._recording.task, body.size
+        self.surface, self.task, self.size = body, self._recording.task, body.size
         touches = self._recording.touches
         self.rate, self.window = touches.rate, touches.readings.shape[1]
 
@@ -89,13 +91,21 @@ class Recorded(AbstractDevice):
         """Return the touches of a split; a file has no fresh ones."""
         return self.recording(split, epoch).touches
 
-    def recording(self, split: Split | None = None, epoch: int = 0) -> Recording:
+    def all_touches(self) -> Touches:
+        """Return the touches of the whole file."""
+        return self._recording.touches
+
+    def blank(self) -> AbstractDevice:
+        """Return a device that has labels, which the file may lack."""
+        return Blank.of(self.task, self.size, self._recording.touches)
+
+    def source(self) -> Source:
+        """Open the file as a stream of frames, in real time."""
+        return Source.of_newtons(self.path, open_skin(self.path, self.sensors), len(self.sensors))
+
+    def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return all that the file holds of a split; None takes the whole file."""
         if split is None or (split == "test" and self._test == "all"):
             return self._recording
-        count = len(self._recording)
-        training = round(0.8 * count)
-        middle = training + (count - training) // 2
-        bounds = {"train": (0, training), "validation": (training, middle)}
-        order = generator(Stream.SPLIT, self.split_seed).permutation(count)
-        return self._recording[torch.from_numpy(order[slice(*bounds.get(split, (middle, None)))])]
+        part: Split = "holdout" if split == "test" else split
+        return self._recording[rows(part, len(self._recording), self.split_seed)]

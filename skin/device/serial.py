@@ -11,7 +11,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.device._blank import Blank
-from skin.device.base import AbstractDevice, Split
+from skin.device.base import AbstractDevice, AbstractWired, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
@@ -26,6 +26,7 @@ from skin.wire.listener import Tap
 from skin.wire.open import Settings, open_skin
 from skin.wire.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.wire.skin import Skin
+from skin.wire.source import Source
 from skin.wire.tare import Tare, settle
 from skin.wire.text import Header
 from skin.wire.transport import open_wire
@@ -37,7 +38,7 @@ _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
 
 
 @dataclass(kw_only=True, eq=False)
-class Serial(AbstractDevice):
+class Serial(AbstractWired):
     """Yields the gestures that somebody, or the emulator, does on a skin: its only split is ``test``.
 
     Readings are N without offset: the baseline is taken off, of values that are already reduced, because the
@@ -57,9 +58,6 @@ class Serial(AbstractDevice):
         window: T, frames of the model.
         rate: of the model, Hz; None: 10.
         stream: the labels have ``touch`` too.
-
-    Attributes:
-        recording: what was read, once it was; it can be stored.
 
     Raises:
         InputError: settings that cannot be used, or a device that does not fit the model.
@@ -101,24 +99,28 @@ class Serial(AbstractDevice):
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
-        self.recording: Recording | None = None
+        self._recording: Recording | None = None
         self._known = None if self.calibration is None else read(self.calibration)
         if self._known is not None:
             self._known.fits(len(self.sensors))
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read when first asked for; labels are None where nobody knows them."""
+        return self.recording(split).touches
+
+    def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
+        """Return the gestures of ``test``, read when first asked for."""
         if split != "test":
             raise InputError(
-                f"device=serial has no {split} split: record a session with skin record, then take "
-                "device=recording"
+                f"device=serial has the split test alone, not {split or 'a budget'}: record a session with "
+                "skin record, then take device=recording"
             )
-        if self.recording is None:
-            self.recording = self._record()
-        return self.recording.touches
+        if self._recording is None:
+            self._recording = self._record()
+        return self._recording
 
     def blank(self) -> AbstractDevice:
-        """Return a device of the same shapes whose touches are 0: a run is restored without a touch."""
+        """Return a device whose touches have the same shape and are 0: a run is restored without a touch."""
         assert self.rate is not None
         empty = torch.zeros(1, self.window, len(self.sensors))
         touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)
@@ -131,15 +133,13 @@ class Serial(AbstractDevice):
         tap = Tap(partial(open_wire, self.port, self.baudrate))
         return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **self._settings), tap
 
+    def source(self) -> Source:
+        """Open the port, and wait for a skin that is unplugged."""
+        skin, _ = self.open(reconnect=True)
+        return Source(str(self.port), skin, self.taring(skin))
+
     def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
-        """Read the beginning: is the device fast enough, and what does it say untouched?
-
-        Returns:
-            all frames that came, and what values mean.
-
-        Raises:
-            InputError: no frames come, they come too slowly, or nobody knows what values mean.
-        """
+        """Return the first frames and what values mean: is the device fast enough, what is it untouched?"""
         assert self.rate is not None
         tare = self.taring(skin)
         try:
@@ -165,14 +165,7 @@ class Serial(AbstractDevice):
     def director(
         self, tap: Tap, meaning: Newtons, first: Sequence[Frame], done: Collection[int] = ()
     ) -> AbstractDirector:
-        """Return what finds the gestures of a stream.
-
-        Args:
-            tap: hears announcements.
-            meaning: of the values.
-            first: frames that came before.
-            done: numbers of gestures that are there already.
-        """
+        """Return what finds the gestures of a stream, as ``labels`` says."""
         assert self.rate is not None
         window = Window(self.window, self.rate, len(self.sensors))
         for frame in first:

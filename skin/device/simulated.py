@@ -1,41 +1,47 @@
 """A simulated skin: sampled gestures, a simulator, and device imperfections."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from torch import Tensor
 
 from skin import __version__
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
+from skin.device._split import parts, rows
 from skin.device._threads import in_threads
-from skin.device._tracking import tracker
-from skin.device._truth import true_model, true_readings, true_sensors
-from skin.device.base import AbstractDevice, Split
+from skin.device._tracking import Tracker, estimated, oracle
+from skin.device._truth import misplaced, modelled, refuse_relaxation
+from skin.device.base import AbstractSimulated, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches, join
 from skin.rng import Stream, generator
 from skin.sensors import Sensors
-from skin.signal.imperfection import Imperfection
+from skin.settings import check
+from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.simulator.base import AbstractSimulator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
-from skin.touch.sampler import TouchSampler, balanced
+from skin.touch.sampler import Movie, TouchSampler, balanced
 from skin.touch.stream import Strip, draw_timeline, touched
+from skin.wire.open import open_skin
+from skin.wire.source import Source
 
 __all__ = ["Simulated"]
 
 _BATCH = 1024
+_VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__}
 
 
 @dataclass(kw_only=True, eq=False)
-class Simulated(AbstractDevice):
+class Simulated(ImperfectionSettings, AbstractSimulated):
     """Yields gestures sampled from seeds alone, as a device with imperfections feels them.
 
     Training, validation and holdout are 80/10/10 of one budget of gestures; test gestures come from a stream
@@ -54,11 +60,10 @@ class Simulated(AbstractDevice):
         direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
         data_seed: what the budget is drawn from.
         seed: what the device's constants and the noise are drawn from: another number, another device.
-        gain_spread, offset, noise, ... quantum: as in :class:`skin.signal.imperfection.Imperfection`.
-        calibration: file of skin calibrate, which takes the place of all these but dead and tare.
+        gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`.
+        calibration: file of skin calibrate, which takes the place of all these but dead, tare and rate.
         randomise: every gesture is felt by a device of its own.
         position_error: standard deviation of the true sensors' places about those that touches report, m.
-        rate: frames per second, Hz.
         track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``oracle`` (what the
             simulator knows) or ``estimated`` from readings; both need sensors that move along the sheet.
 
@@ -71,52 +76,59 @@ class Simulated(AbstractDevice):
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
     contact: Callable[[AbstractBody, AbstractSimulator], AbstractContact] = Prescribed
     touch: Mapping[str, Any] | GestureSettings | None = None
-    gestures: int = 4038
-    test_gestures: int = 4000
+    gestures: Annotated[int, Ge(10)] = 4038
+    test_gestures: Annotated[int, Ge(1)] = 4000
     padded: bool = True
     fresh: bool = False
     stream: bool = False
     direction: bool = False
     data_seed: int = 0
     seed: int = 0
-    gain_spread: float = 0.05
-    offset: float = 0.1
-    noise: float = 0.05
-    clip: float = 10.0
-    dead: int | Sequence[int] = 0
-    position_error: float = 0.0
-    tare: bool = False
-    stuck: int = 0
-    saturated: int = 0
-    drift: float = 0.0
-    hysteresis: float = 0.0
-    time_constant: float = 0.0
-    quantum: float = 0.0
     calibration: str | None = None
     randomise: bool = False
-    rate: float = 10.0
-    track: str = "none"
+    position_error: Annotated[float, Ge(0)] = 0.0
+    track: Literal["none", "oracle", "estimated"] = "none"
 
     def __post_init__(self) -> None:
-        for name, least in (("gestures", 10), ("test_gestures", 1), ("position_error", 0)):
-            if not getattr(self, name) >= least:
-                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        if self.stream and self.direction:
-            raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
+        self._refuse()
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
-        true = true_sensors(self)
-        self.model = true_model(self, true)
-        contact = self.contact(self.body, self.model)
-        self.sampler = TouchSampler(self.body, self.body.footprints(true), contact, self.touch, self.padded)
+        self.true_sensors = misplaced(self.sensors, self.size, self.position_error, self.seed)
+        self.model = modelled(self.simulator, self.body, self.true_sensors, self.rate)
+        self.sampler = self._sampler(self.body, self.true_sensors, self.model)
         self.window = self.sampler.settings.window
         if self.sampler.settings.shear:
             self.model.refuse_drag()
-        self.imperfection = Imperfection.of(self)
+        self.imperfection = Imperfection.of(self, self.calibration)
         drawn = generator(Stream.CONSTANTS, self.seed)
         self.constants = self.imperfection.constants(len(self.sensors), drawn)
-        self.tracker = tracker(self.track, self)
+        self.tracker = self._tracker()
         self._kept: dict[str, Recording] = {}
+
+    def _refuse(self) -> None:
+        """Refuse settings that cannot be used, or not together."""
+        check(type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device")
+        if self.stream and self.direction:
+            raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
+        if self.stream or self.track != "none":
+            refuse_relaxation(self.body, "data.stream=true" if self.stream else f"device.track={self.track}")
+
+    def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
+        contact = self.contact(body, model)
+        return TouchSampler(body, body.footprints(sensors), contact, self.touch, self.padded)
+
+    def _tracker(self) -> Tracker:
+        """Return what tells how far sensors have moved."""
+        if self.track == "none":
+            return Tracker()
+        if self.track == "oracle":
+            return oracle(self.model, self.body.shape)
+        # As for a real skin: nobody knows where its sensors truly are or how its layers vary.
+        body = replace(self.body, variation=0.0)
+        model = self.simulator(body, self.sensors)
+        sampler = self._sampler(body, self.sensors, model)
+        randomness = generator(Stream.TRACKING, self.data_seed)
+        return estimated(model, sampler, self.imperfection, len(self.sensors), randomness)
 
     @property
     def idle(self) -> Tensor:
@@ -136,43 +148,32 @@ class Simulated(AbstractDevice):
         return self._draw(False, Stream.ALARM, count, self.data_seed).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the same touches with the applied force and the gestures' parameters.
-
-        Args:
-            split: None takes the whole budget.
-            epoch: matters to ``train`` with fresh gestures.
-            complete: with the displacements and the largest strains, too.
-        """
+        """Return the same touches with the applied force and the gestures' parameters."""
         recording = self._split(split, epoch, complete)
         return replace(recording, metadata=self._metadata(recording, split, epoch))
+
+    def source(self) -> Source:
+        """Open a stream of test gestures, in real time."""
+        return Source.of_newtons("simulator", open_skin("simulated", device=self), len(self.sensors))
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
         if split == "test":
             return self._keep("test", complete, Stream.TEST, self.test_gestures)
-        training = round(0.8 * self.gestures)
         if split == "train" and self.fresh:
-            return self._draw(complete, Stream.FRESH, training, self.data_seed, epoch)
+            count = parts(self.gestures)["train"].stop
+            return self._draw(complete, Stream.FRESH, count, self.data_seed, epoch)
         if self.stream:
             return self._streams(split, complete)
         budget = self._keep("budget", complete, Stream.BUDGET, self.gestures, self.data_seed)
-        if split is None:
-            return budget
-        middle = training + (self.gestures - training) // 2
-        bounds = {"train": (0, training), "validation": (training, middle), "holdout": (middle, None)}
-        order = generator(Stream.SPLIT, self.data_seed).permutation(self.gestures)
-        return budget[torch.from_numpy(order[slice(*bounds[split])])]
+        return budget if split is None else budget[rows(split, self.gestures, self.data_seed)]
 
     def _streams(self, split: Split | None, complete: bool) -> Recording:
         """Return the windows of a split of the budget: they overlap, so no stream is split."""
-        training = round(0.8 * self.gestures)
-        middle = (self.gestures - training) // 2
-        counts: dict[Split, int] = {"train": training, "validation": middle}
-        counts["holdout"] = self.gestures - training - middle
+        own = parts(self.gestures)
         if split is None:
-            return join([self._streams(name, complete) for name in counts])
-        return self._keep(
-            split, complete, Stream.BUDGET, counts[split], self.data_seed, [*counts].index(split)
-        )
+            return join([self._streams(name, complete) for name in own])
+        count = len(range(self.gestures)[own[split]])
+        return self._keep(split, complete, Stream.BUDGET, count, self.data_seed, [*own].index(split))
 
     def _keep(self, name: str, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
         if complete:
@@ -183,20 +184,17 @@ class Simulated(AbstractDevice):
 
     def _draw(self, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
         """Draw gestures or windows in batches; ``complete`` adds the displacements."""
-        parts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
+        cuts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
         if self.stream:
-            found = in_threads(lambda n: self._windows(parts[n], complete, stream, (*key, n)), len(parts))
-            return join(found)
+            return join(in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts)))
         wanted = balanced(count, generator(stream, *key, 0))
-        return join(
-            in_threads(lambda n: self._batch(wanted[parts[n]], complete, stream, (*key, 1 + n)), len(parts))
-        )
+        found = in_threads(lambda n: self._batch(wanted[cuts[n]], complete, stream, (*key, 1 + n)), len(cuts))
+        return join(found)
 
     @torch.no_grad()
     def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
         movie = self.sampler.sample(len(wanted), generator(stream, *key), wanted)
-        true = true_readings(self, movie, complete)
-        return self._felt(true, generator(Stream.NOISE, self.seed, stream, *key))
+        return self._felt(self._true(movie, complete), generator(Stream.NOISE, self.seed, stream, *key))
 
     @torch.no_grad()
     def _windows(self, part: slice, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
@@ -206,26 +204,33 @@ class Simulated(AbstractDevice):
         starts = np.cumsum(draw.integers(*settings.stride, count, endpoint=True)) - settings.stride[0]
         length = int(starts[-1]) + self.window
         timeline = draw_timeline(self.sampler, length, settings.gap, draw)
-        true = Strip.of(timeline, true_readings(self, timeline.movie, complete))
+        true = Strip.of(timeline, self._true(timeline.movie, complete))
         if self.randomise:
             return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
         return Strip(timeline, self._felt(true.whole, noise)).cut(torch.from_numpy(starts), self.window)
 
     @torch.no_grad()
     def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Strip:
-        """Return a test stream in one piece, to be cut as one likes; one device feels all of it.
-
-        Args:
-            frames: its length.
-            gap: [least, most] idle frames between two touches; None: as ``touch.gap``.
-            number: of the stream: another number, other gestures.
-        """
+        """Return a test stream in one piece; without ``gap``, [least, most], as ``touch.gap`` says."""
         if self.randomise:
             return self.replace(randomise=False).strip(frames, gap, number)
         key = Stream.TEST, 1, number
         timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
-        true = Strip.of(timeline, true_readings(self, timeline.movie, complete=False))
+        true = Strip.of(timeline, self._true(timeline.movie, complete=False))
         return Strip(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
+
+    def _true(self, movie: Movie, complete: bool) -> Recording:
+        """Return gestures as perfect sensors read them; ``complete`` adds displacements and strains."""
+        readings, displacement = self.model.respond(movie, displacement=complete)
+        positions = torch.from_numpy(self.sensors.positions).float()
+        valid = torch.ones_like(readings, dtype=torch.bool)
+        labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
+        touches = Touches(readings, valid, positions, labels, float(self.rate), self.tracker.known(movie))
+        strain = self.model.strain(movie.frames, movie.drag) if complete else None
+        known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
+        # A stream's windows have labels of their own.
+        about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
+        return Recording(touches, *about, movie.force, displacement, movie.parameters | known)
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings as the device tells them."""
@@ -238,12 +243,8 @@ class Simulated(AbstractDevice):
         return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
-        about = {"source": "simulated", "simulator": type(self.model).__name__, "split": split or "budget"}
-        return about | {
-            "epoch": epoch,
-            "device_seed": self.seed,
-            "data_seed": self.data_seed,
-            "shapes": list(self.sampler.shapes.names),
-            "summary": summarise(touched(recording), self.body),
-            "versions": {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__},
-        }
+        about: dict[str, Any] = {"source": "simulated", "simulator": type(self.model).__name__}
+        about |= {"split": split or "budget", "epoch": epoch, "device_seed": self.seed}
+        shapes, summary = list(self.sampler.shapes.names), summarise(touched(recording), self.body)
+        about |= {"data_seed": self.data_seed, "shapes": shapes, "summary": summary}
+        return about | {"versions": _VERSIONS}

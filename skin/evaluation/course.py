@@ -2,8 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge, Gt
 
 from skin.errors import InputError
+from skin.settings import check
 
 __all__ = ["Course"]
 
@@ -22,16 +26,12 @@ class Course:
         InputError: no stream, or no range.
     """
 
-    hours: float = 1.0
-    gap: Sequence[int] = (50, 1150)
-    stride: int = 1
-    windows: Sequence[int] = (20, 30, 60)
+    hours: Annotated[float, Gt(0)] = 1.0
+    gap: tuple[Annotated[int, Ge(1)], Annotated[int, Ge(1)]] = (50, 1150)
+    stride: Annotated[int, Ge(1)] = 1
+    windows: Sequence[Annotated[int, Ge(1)]] = (20, 30, 60)
 
     def __post_init__(self) -> None:
-        if not self.hours > 0 or self.stride < 1:
-            raise InputError(
-                "a stream needs hours above 0 and a stride from 1 up, got "
-                f"stream.hours={self.hours} stream.stride={self.stride}"
-            )
-        if len(self.gap) != 2 or not 1 <= self.gap[0] <= self.gap[1]:
-            raise InputError(f"stream.gap must be [least, most] frames from 1 up, got {list(self.gap)}")
+        check(Course, vars(self), "measure")
+        if self.gap[0] > self.gap[1]:
+            raise InputError(f"measure.gap must be [least, most] frames, got {list(self.gap)}")

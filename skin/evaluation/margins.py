@@ -9,8 +9,6 @@ from scipy.stats import binomtest
 from torch import Tensor
 
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
-from skin.errors import InputError
 from skin.evaluation.alarm import Reached
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Answers
@@ -102,12 +100,10 @@ def margins(learner: Answers, device: AbstractDevice, gestures: int, point: Oper
     Raises:
         InputError: a device that does not know how hard and where it is touched.
     """
-    if not isinstance(device, Simulated):
-        raise InputError(
-            f"only simulated touches are known well enough, {type(device).__name__} has none: "
-            "add device=simulated"
-        )
-    recording = device.replace(test_gestures=gestures, stream=False, direction=False).recording(
+    simulation = device.simulated(
+        f"only simulated touches are known well enough, {type(device).__name__} has none"
+    )
+    recording = simulation.replace(test_gestures=gestures, stream=False, direction=False).recording(
         "test", complete=False
     )
     touches, labels = recording.touches, recording.touches.labels
@@ -116,7 +112,7 @@ def margins(learner: Answers, device: AbstractDevice, gestures: int, point: Oper
     chances = learner.probabilities(touches)[:, places]
     said, known = chances > 0.5, recording.parameters
     measures = Measures(*(known[name] for name in Measures._fields))
-    shares = _shares(measures, device.sampler.settings.thresholds)
+    shares = _shares(measures, simulation.sampler.settings.thresholds)
     found = {name: spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
     found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from skin.config import Evaluation
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.alarm import Reached
 from skin.labels import Task
@@ -153,12 +152,13 @@ def gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     A simulated device draws fresh ones, until enough of them are safe; others give their validation split.
     """
     check(settings)
-    if not isinstance(device, Simulated) or LABEL not in device.task.names:
+    simulation = device.simulation
+    if simulation is None or LABEL not in device.task.names:
         return device.touches("validation")
     # Half of the sampled gestures are safe; windows of streams show a touch less often.
     count = 2 * settings.safe_gestures
     for _ in range(_MOST_DRAWS):
-        touches = device.fresh_touches(count)
+        touches = simulation.fresh_touches(count)
         assert touches.labels is not None
         _, dangerous = _column(touches.labels, touches.labels, device.task)
         if int((~dangerous).sum()) >= settings.safe_gestures:
@@ -183,7 +183,7 @@ def choose(learner: "Answers", device: AbstractDevice, settings: Evaluation) -> 
     chance, dangerous = _column(chances, touches.labels, device.task)
     if dangerous.all():
         return OperatingPoint.default(target)
-    seed = device.data_seed if isinstance(device, Simulated) else None
+    seed = None if device.simulation is None else device.simulation.data_seed
     point = OperatingPoint(lowest(chance[~dangerous], target), target, 0, 0, seed)
     return replace(point, **asdict(point.reached(chances, touches.labels, device.task)))
 

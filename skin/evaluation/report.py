@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from skin.config import Evaluation
-from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.alarm import Reached
 from skin.evaluation.metrics import confusion, metrics
@@ -69,8 +68,9 @@ def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[
     Those of ``unseen_layout`` raise InputError where the sensors make no grid that could be scattered anew.
     """
     sets = {"same": _once(device, "same"), "holdout": _once(device, "holdout")}
-    if isinstance(device, Simulated):
-        sets |= {"device_shift": _devices(device, settings), "unseen_layout": _layouts(device, settings)}
+    if (simulation := device.simulation) is not None:
+        sets["device_shift"] = _devices(simulation, settings)
+        sets["unseen_layout"] = _layouts(simulation, settings)
     return sets
 
 
@@ -115,10 +115,10 @@ def _mean(values: Sequence[float]) -> float:
 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
     """Return the test touches and, where they were simulated, how each was drawn."""
-    if isinstance(device, Simulated):
-        recording = device.recording("test", complete=False)
-        return recording.touches, recording.parameters
-    return device.touches("test"), {}
+    if device.simulation is None:
+        return device.touches("test"), {}
+    recording = device.recording("test", complete=False)
+    return recording.touches, recording.parameters
 
 
 def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterator[Touches]:
@@ -126,14 +126,14 @@ def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterato
     yield _test(device)[0] if column == "same" else device.touches("holdout")
 
 
-def _devices(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
+def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield test touches as other devices of the same kind feel them."""
     for number in range(settings.devices):
         other = device.replace(seed=_FIRST_DEVICE + number, test_gestures=settings.gestures)
         yield other.touches("test")
 
 
-def _layouts(device: Simulated, settings: Evaluation) -> Iterator[Touches]:
+def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield test touches as as many sensors at other places, as deep and leaning as these, feel them."""
     count = len(device.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)

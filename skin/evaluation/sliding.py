@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.classification import binary_confusion_matrix
 
-from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.alarm import Alarms, count_alarms
 from skin.evaluation.course import Course
@@ -106,8 +105,7 @@ def slide(
     Raises:
         InputError: a device that has no streams.
     """
-    if not isinstance(device, Simulated):
-        raise InputError(f"streams are simulated, {type(device).__name__} has none: add device=simulated")
+    device = device.simulated(f"streams are simulated, {type(device).__name__} has none")
     # One device feels the whole stream, and its baseline is known as after a tare.
     streamed = device.replace(stream=True, randomise=False)
     known, idle = streamed.touches("validation"), streamed.idle
@@ -159,7 +157,7 @@ def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin
 
 def _listen(
     learner: Answers,
-    device: Simulated,
+    device: AbstractSimulated,
     task: Task,
     all_gates: dict[str, Gate],
     course: Course,
@@ -183,7 +181,7 @@ def _listen(
     return {name: count_alarms(torch.cat(said), gesture, truth, hours) for name, said in heard.items()}
 
 
-def _length(learner: Answers, device: Simulated, window: int) -> float | str:
+def _length(learner: Answers, device: AbstractSimulated, window: int) -> float | str:
     """Return the overall accuracy on test touches in windows of another length, or why there is none.
 
     The touches are those of the other lengths, begun elsewhere; a window that the longest press does not fit

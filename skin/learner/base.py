@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from skin.errors import InputError
 from skin.recording import Touches
 
 if TYPE_CHECKING:
@@ -37,6 +38,14 @@ class AbstractLearner(ABC):
     @abstractmethod
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probability of each label, (B, L), for touches of any layout that can be taken."""
+
+    def embeddings(self, touches: Touches) -> Tensor:
+        """Return what the encoder makes of touches, (B, E).
+
+        Raises:
+            InputError: this learner has no encoder.
+        """
+        raise InputError(f"{type(self).__name__} has no encoder: give a run of a network")
 
     @abstractmethod
     def save(self, folder: Path) -> Path:

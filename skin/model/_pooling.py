@@ -1,4 +1,8 @@
-"""How the nodes of a graph become one vector."""
+"""How the nodes of a graph become one vector.
+
+PyTorch Geometric's aggregations take 2.9 (max), 1.0 to 1.5 (mean), 1.1 to 1.2 (attention) and 1.0 to 1.3
+(set2set) times as long as these, and 0.7 s to import (experiments/benchmarks/layers.py).
+"""
 
 from collections.abc import Callable
 
@@ -49,11 +53,7 @@ class Attention(nn.Module):
 
 
 class Set2Set(nn.Module):
-    """A recurrent query that reads the nodes by attention, step after step (Vinyals et al., 2016).
-
-    Not PyTorch Geometric's: that wants the nodes of all graphs in one list with their graph's index, while
-    here every graph has the same number of them; a test compares the two.
-    """
+    """A recurrent query that reads the nodes by attention, step after step (Vinyals et al., 2016)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

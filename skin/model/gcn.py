@@ -21,8 +21,8 @@ Norm = Literal["none", "layer", "batch", "instance"]
 class _Convolution(nn.Module):
     """One graph convolution A x W + b (Kipf and Welling, 2017).
 
-    Not PyTorch Geometric's DenseGCNConv: that copies and normalises the adjacency of every graph at every
-    call, while here one matrix, normalised once, serves all frames in one product.
+    One matrix, normalised once, serves all frames in one product. 1.5 to 3.0 times as fast as PyTorch
+    Geometric's DenseGCNConv, 4 to 80 times as its GCNConv (experiments/benchmarks/layers.py).
     """
 
     def __init__(self, features: int, width: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.emulator.gestures import Gesture, alike, gestures
 from skin.hardware.record import log
@@ -94,7 +94,7 @@ def marked(path: str) -> bool:
     return isinstance(about, dict) and "window" in about
 
 
-def read(device: Simulated, path: str, seed: int) -> Gestures:
+def read(device: AbstractSimulated, path: str, seed: int) -> Gestures:
     """Return the gestures of a session beside their simulation.
 
     Announced gestures are those of an emulator: the same ones are simulated, on the device that is given.
@@ -134,7 +134,7 @@ def read(device: Simulated, path: str, seed: int) -> Gestures:
     return Gestures(seen, same, device.sensors.positions, device.rate)
 
 
-def _fits(device: Simulated, about: Mapping[str, Any], path: str) -> None:
+def _fits(device: AbstractSimulated, about: Mapping[str, Any], path: str) -> None:
     if about.get("positions") != device.sensors.positions.tolist():
         raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
     found, needed = (about.get("window"), about.get("rate")), (device.window, device.rate)
@@ -154,7 +154,7 @@ def _are(drawn: Sequence[Gesture], numbers: Sequence[int], labels: Sequence[Mapp
             )
 
 
-def _felt(device: Simulated, drawn: Sequence[Gesture]) -> np.ndarray:
+def _felt(device: AbstractSimulated, drawn: Sequence[Gesture]) -> np.ndarray:
     """Return what a device says of gestures above what it says before them, (B, T, S), N."""
     true = torch.from_numpy(np.stack([one.force for one in drawn])).float()
     true = torch.nn.functional.pad(true, (0, 0, _IDLE, 0))

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration import bench_session, gauge
 from skin.hardware.calibration.bench import Bench, bench
@@ -93,7 +93,9 @@ def agreement(verdicts: Verdicts | None, things: str) -> list[str]:
     return lines
 
 
-def read(device: Simulated, path: str, presses: str | None, settings: Mapping[str, Any]) -> "Comparison":
+def read(
+    device: AbstractSimulated, path: str, presses: str | None, settings: Mapping[str, Any]
+) -> "Comparison":
     """Return the presses of a session beside their simulation.
 
     Args:
@@ -114,7 +116,7 @@ def read(device: Simulated, path: str, presses: str | None, settings: Mapping[st
     return found
 
 
-def compare(device: Simulated, bench: Bench, scale: float | None) -> Comparison:
+def compare(device: AbstractSimulated, bench: Bench, scale: float | None) -> Comparison:
     """Simulate a session's presses on a device, and compare reading by reading.
 
     Args:

@@ -7,9 +7,7 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.device.base import AbstractDevice
-from skin.device.recording import Recorded
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
 from skin.labels import TOUCH
 from skin.plot.animation import Scene
@@ -20,7 +18,9 @@ __all__ = ["recorded", "simulated"]
 
 
 @torch.no_grad()
-def simulated(device: Simulated, labels: Sequence[str], shape: str | None, seed: int, field: bool) -> Scene:
+def simulated(
+    device: AbstractSimulated, labels: Sequence[str], shape: str | None, seed: int, field: bool
+) -> Scene:
     """Draw a touch as a simulated device feels it.
 
     Args:
@@ -61,7 +61,7 @@ def recorded(device: AbstractDevice, index: int) -> Scene:
     Raises:
         InputError: there is no touch of that number.
     """
-    touches = device.recording().touches if isinstance(device, Recorded) else device.touches("test")
+    touches = device.all_touches()
     if not 0 <= index < len(touches):
         raise InputError(
             f"there are {len(touches)} touches, got index={index}: give index=0 to {len(touches) - 1}"
@@ -70,13 +70,14 @@ def recorded(device: AbstractDevice, index: int) -> Scene:
     readings = one.readings.where(one.valid, 0)[0].numpy()
     positions = np.broadcast_to(one.positions.numpy(), (1, *readings.shape, 3))[0]
     said = "" if one.labels is None else _title("", one.labels[0].bool().numpy(), device.task.names)
-    body = _round(device.body) if isinstance(device, Recorded) else None
-    return Scene(readings, positions, device.size, one.rate, f"touch {index}{said}", body=body)
+    return Scene(
+        readings, positions, device.size, one.rate, f"touch {index}{said}", body=_round(device.surface)
+    )
 
 
-def _round(body: AbstractBody) -> AbstractBody | None:
+def _round(body: AbstractBody | None) -> AbstractBody | None:
     """Return a body whose pictures need to know where it is in space."""
-    return None if body.flat else body
+    return None if body is None or body.flat else body
 
 
 def _title(name: str, holds: np.ndarray, names: Sequence[str]) -> str:

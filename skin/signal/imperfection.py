@@ -2,17 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt
 from torch import Tensor
 
 from skin.errors import InputError
 from skin.lag import lagged, rounded, unloading
+from skin.settings import check
 from skin.signal.calibration import Calibration, read
 
-__all__ = ["Constants", "Imperfection"]
+__all__ = ["Constants", "Imperfection", "ImperfectionSettings"]
 
 _IDLE_FRAMES = 30
 
@@ -51,17 +53,12 @@ class Constants(NamedTuple):
         return Constants(*(value.to(device) for value in self))
 
 
-@dataclass(frozen=True)
-class Imperfection:
-    """A device's imperfections, in the report's order (2.1.4): clip the force, then add noise and offset.
-
-    Before the clip the material answers late (hysteresis, then a lag) and the sensor has its gain; after the
-    noise readings drift and a converter rounds them. All of that is our addition to the report, and neutral
-    unless asked for.
+@dataclass(kw_only=True)
+class ImperfectionSettings:
+    """What may be set of a device's imperfections (``conf/device/simulated.yaml``).
 
     Attributes:
-        gain_spread: standard deviation of the logarithm of each sensor's gain. Our choice: the report speaks
-            of absorption but gives no spread.
+        gain_spread: standard deviation of the logarithm of each sensor's gain; the report gives none.
         offset: standard deviation of each sensor's offset, N, constant in a device.
         noise: standard deviation of the noise in every frame, N.
         clip: largest force that a sensor tells, N.
@@ -70,48 +67,55 @@ class Imperfection:
         tare: subtract the idle baseline, the mean of 30 idle frames with their noise.
         stuck: how many more say one force all the time, between 0 and ``clip``; they are invalid too.
         saturated: how many more say ``clip`` all the time; they are invalid too.
-        drift: standard deviation of each sensor's drift, N/s, from the first frame of a window or stream on.
+        drift: standard deviation of each sensor's drift, N/s, from the first frame of a window or stream.
         hysteresis: mean gap between unloading and loading, share of the peak. At a force x after a peak P the
             sensor feels x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
         time_constant: of a first-order lag behind the force, s.
         quantum: step of the converter, N.
-        calibration: what was found of a real device; takes the place of everything above but ``tare`` and
-            ``dead``, which breaks further sensors. Constants drawn for ``gestures`` come from its ranges.
         rate: frames per second, Hz.
-
-    Raises:
-        InputError: a negative number, or a clip or rate that is not above 0.
     """
 
-    gain_spread: float = 0.05
-    offset: float = 0.1
-    noise: float = 0.05
-    clip: float = 10.0
+    gain_spread: Annotated[float, Ge(0)] = 0.05
+    offset: Annotated[float, Ge(0)] = 0.1
+    noise: Annotated[float, Ge(0)] = 0.05
+    clip: Annotated[float, Gt(0)] = 10.0
     dead: int | Sequence[int] = 0
     tare: bool = False
-    stuck: int = 0
-    saturated: int = 0
-    drift: float = 0.0
-    hysteresis: float = 0.0
-    time_constant: float = 0.0
-    quantum: float = 0.0
+    stuck: Annotated[int, Ge(0)] = 0
+    saturated: Annotated[int, Ge(0)] = 0
+    drift: Annotated[float, Ge(0)] = 0.0
+    hysteresis: Annotated[float, Ge(0)] = 0.0
+    time_constant: Annotated[float, Ge(0)] = 0.0
+    quantum: Annotated[float, Ge(0)] = 0.0
+    rate: Annotated[float, Gt(0)] = 10.0
+
+
+@dataclass(kw_only=True)
+class Imperfection(ImperfectionSettings):
+    """A device's imperfections, in the report's order (2.1.4): clip the force, then add noise and offset.
+
+    Before the clip the material answers late (hysteresis, then a lag) and the sensor has its gain; after the
+    noise readings drift and a converter rounds them. All of that is our addition to the report, and neutral
+    unless asked for.
+
+    Attributes:
+        calibration: of a real device; replaces all settings but ``rate``, ``tare`` and ``dead``, which breaks
+            further sensors. Constants drawn for ``gestures`` come from its ranges.
+
+    Raises:
+        InputError: a setting of the wrong type or out of its range.
+    """
+
     calibration: Calibration | None = None
-    rate: float = 10.0
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.name not in ("calibration", "dead") and not value >= 0:
-                raise InputError(f"device.{entry.name} must be at least 0, got {value}")
         least, most = self.dead_range
         if not 0 <= least <= most:
             raise InputError(
                 f"device.dead must be a number from 0 up or a range [least, most], got {self.dead}: as in "
                 "device.dead=3 or device.dead=[0,5]"
             )
-        for name, unit in (("clip", "N"), ("rate", "Hz")):
-            if getattr(self, name) == 0:
-                raise InputError(f"device.{name} must be above 0 {unit}, got 0: as in device.{name}=10")
+        check(ImperfectionSettings, _settings(self), "device")
 
     @property
     def dead_range(self) -> tuple[int, int]:
@@ -121,11 +125,9 @@ class Imperfection:
         return (ends[0], ends[1]) if whole else (0, -1)
 
     @classmethod
-    def of(cls, settings: Any) -> "Imperfection":
-        """Return what an object asks for by attributes of these names; its ``calibration`` is a file."""
-        given = {entry.name: getattr(settings, entry.name) for entry in fields(cls)}
-        known = None if settings.calibration is None else read(settings.calibration)
-        return cls(**given | {"calibration": known})
+    def of(cls, settings: ImperfectionSettings, calibration: str | None) -> "Imperfection":
+        """Return imperfections of these settings, and of a file of ``skin calibrate`` where one is given."""
+        return cls(**_settings(settings), calibration=None if calibration is None else read(calibration))
 
     def constants(
         self, sensors: int, generator: np.random.Generator, gestures: int | None = None
@@ -147,10 +149,8 @@ class Imperfection:
             )
         idle = values["offset"] + values["noise"] / np.sqrt(_IDLE_FRAMES) * values.pop("idle")
         values["baseline"] = idle if self.tare else np.zeros(shape)
-        dead = torch.from_numpy(values.pop("dead"))
-        return Constants(
-            dead=dead, **{name: torch.from_numpy(value).float() for name, value in values.items()}
-        )
+        tensors = {name: torch.from_numpy(value).float() for name, value in values.items()}
+        return Constants(**tensors | {"dead": tensors["dead"].bool()})
 
     def _drawn(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
         """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
@@ -243,3 +243,7 @@ class Imperfection:
         if constants.quantum.any():
             said = rounded(said + constants.baseline, constants.quantum) - constants.baseline
         return said, saturated
+
+
+def _settings(of: ImperfectionSettings) -> dict[str, Any]:
+    return {entry.name: getattr(of, entry.name) for entry in fields(ImperfectionSettings)}

@@ -105,6 +105,7 @@ class Elastic:
             for first in track(parts, "solving for each surface cell", console=console, disable=not shown):
                 found[:, first : first + _AT_ONCE] = self.solve(loads[:, first : first + _AT_ONCE].toarray())
             found.flush()
+            del found  # Windows does not rename a file that is mapped
 
 
 def _reserve(path: Path) -> None:

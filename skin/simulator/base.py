@@ -6,6 +6,7 @@ from typing import ClassVar, NamedTuple
 from torch import Tensor, nn
 
 from skin.errors import InputError
+from skin.option import option
 from skin.sensors import Sensors
 from skin.touch.movie import Movie
 
@@ -33,9 +34,11 @@ class AbstractSimulator(nn.Module, ABC):
 
     Attributes:
         feels_shear: readings depend on forces along the surface too.
+        mechanical: readings depend on the layers' thickness and stiffness.
     """
 
     feels_shear: ClassVar[bool] = False
+    mechanical: ClassVar[bool] = True
 
     @abstractmethod
     def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
@@ -147,4 +150,4 @@ class AbstractSimulator(nn.Module, ABC):
 
     @property
     def _name(self) -> str:
-        return type(self).__module__.rpartition(".")[2]
+        return option(self)

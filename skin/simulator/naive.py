@@ -1,5 +1,7 @@
 """The naive skin: each sensor reads the pressure above it (report, 2.1.1)."""
 
+from typing import ClassVar
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,6 +26,8 @@ class Naive(AbstractSimulator):
     Raises:
         InputError: a sensor that does not face the surface.
     """
+
+    mechanical: ClassVar[bool] = False
 
     cell: Tensor
     area: Tensor

@@ -1,8 +1,11 @@
 """Evaluating a run again gives what its training found."""
 
 import sqlite3
+from dataclasses import replace
 
 import pytest
+
+from skin.storage import read, write
 
 SMALL = [
     "data.gestures=160",
@@ -50,3 +53,15 @@ def test_bad_input_is_one_sentence(run, folder):
     done = run(folder, "evaluate.py", "device=recording")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "device.path=" in done.stderr
+
+
+@pytest.mark.slow
+def test_touches_without_labels_get_verdicts(run, folder, tmp_path):
+    done = run(tmp_path, "generate", "simulator=naive", "n=12", "out=x.parquet", store=False)
+    assert done.returncode == 0, done.stderr
+    known = read(tmp_path / "x.parquet")
+    path = write(replace(known, touches=replace(known.touches, labels=None)), tmp_path / "y.parquet")
+    done = run(folder, "evaluate", "device=recording", f"device.path={path}", "device.test=all")
+    assert done.returncode == 0, done.stderr
+    (written,) = (folder / "results").glob("evaluation_recording_*.csv")
+    assert len(written.read_text().splitlines()) == 1 + 12

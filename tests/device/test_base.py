@@ -6,11 +6,20 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from skin.balance import announce
 from skin.build import build_device
+from skin.config import Evaluation
 from skin.device.base import AbstractDevice
+from skin.device.simulated import Simulated
+from skin.errors import InputError
+from skin.evaluation.margins import margins
+from skin.evaluation.operating_point import OperatingPoint, gestures
+from skin.evaluation.report import columns
+from skin.evaluation.sliding import slide
 from skin.storage import write
 
 CONF = Path(__file__).parents[2] / "conf"
+POINT = OperatingPoint.default(0.02)
 SMALL = ["data.gestures=50", "device.test_gestures=20", "simulator=naive"]
 
 
@@ -57,3 +66,45 @@ def test_the_budget_is_split_80_10_10_by_gesture(device):
 
 def test_fixed_touches_stay_the_same(device):
     assert torch.equal(device.touches("train").readings, device.touches("train", epoch=3).readings)
+
+
+def test_only_a_simulated_device_says_that_it_is_one(device):
+    assert device.simulation is (device if isinstance(device, Simulated) else None)
+    assert device.wired is None
+    assert len(device.recording("holdout", complete=False)) == 5
+
+
+def test_a_blank_has_labelled_touches_of_the_same_shape(device):
+    blank = device.blank()
+    assert (blank.task, blank.size) == (device.task, device.size)
+    touches, own = blank.touches("train"), device.touches("train")
+    assert touches.readings.shape[1:] == own.readings.shape[1:]
+    assert touches.labels.shape[1:] == own.labels.shape[1:]
+    assert torch.equal(touches.positions, own.positions)
+
+
+def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
+    settings = Evaluation(devices=2, layouts=2, gestures=20, false_alarm_rate=0.02)
+    assert list(columns(made_up_device, settings)) == ["same", "holdout"]
+    assert torch.equal(
+        gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
+    )
+    announce(made_up_device)
+    assert not capsys.readouterr().err
+    assert made_up_device.blank() is made_up_device
+    assert torch.equal(made_up_device.all_touches().readings, made_up_device.touches("test").readings)
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda device: device.simulated("this is simulated"), "^this is simulated: leave out device="),
+        (lambda device: device.recording(), "only simulated or recorded touches"),
+        (lambda device: device.source(), "can be watched: give device=serial"),
+        (lambda device: margins(None, device, 20, POINT), "MadeUpDevice has none: .* add device=simulated"),
+        (lambda device: slide(None, device, None, POINT), "MadeUpDevice has none: .* add device=simulated"),
+    ],
+)
+def test_what_it_does_not_know_is_refused_in_a_sentence(made_up_device, ask, said):
+    with pytest.raises(InputError, match=said):
+        ask(made_up_device)

@@ -1,17 +1,19 @@
 """A simulated device: seeds, splits, and what each setting changes."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.device._truth import true_sensors
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.labels import movie_labels
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
 from skin.rng import Stream, generator
+from skin.signal.imperfection import ImperfectionSettings
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
 from skin.touch.sampler import balanced
@@ -117,7 +119,7 @@ def test_position_error_moves_the_sensors_and_not_what_is_reported(plain):
     moved = device(position_error=0.005, **PERFECT)
     assert torch.equal(moved.touches("test").positions, plain.touches("test").positions)
     assert not torch.equal(moved.touches("test").readings, device(**PERFECT).touches("test").readings)
-    true = true_sensors(device(position_error=0.05)).positions
+    true = device(position_error=0.05).true_sensors.positions
     assert (true >= 0).all()
     assert (true[:, :2] <= BODY.size).all()
 
@@ -156,8 +158,8 @@ def test_the_summary_counts(plain):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"gestures": 9}, r"gestures must be at least 10, got 9"),
-        ({"test_gestures": 0}, r"test_gestures must be at least 1"),
+        ({"gestures": 9}, r"device.gestures=9 must be greater than or equal to 10"),
+        ({"test_gestures": 0}, r"device.test_gestures=0 must be greater than or equal to 1"),
         ({"position_error": -0.1}, r"position_error"),
         ({"rate": 0}, r"device.rate"),
         ({"dead": 25}, r"device.dead"),
@@ -193,3 +195,11 @@ def test_the_direction_of_sliding_is_a_label_that_changes_nothing_else(plain):
 def test_a_stream_tells_no_direction():
     with pytest.raises(InputError, match=r"leave out data.stream=true"):
         device(direction=True, stream=True)
+
+
+def test_every_imperfection_may_be_set_where_its_default_stands(configured):
+    device = configured("simulator=naive").device
+    defaults = {entry.name: entry.default for entry in fields(ImperfectionSettings)}
+    assert {name: device[name] for name in defaults} == defaults
+    names = {entry.name for entry in fields(Simulated)}
+    assert {name for name in device if not name.startswith("_")} == names - {"body", "layout"}

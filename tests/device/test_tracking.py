@@ -108,5 +108,5 @@ def test_sensors_that_cannot_move_are_refused_with_what_mends_it(track, simulato
 
 
 def test_an_unknown_choice_is_refused():
-    with pytest.raises(InputError, match=r"none, oracle, estimated, got camera"):
+    with pytest.raises(InputError, match=r"device.track=camera must be 'none', 'oracle' or 'estimated'"):
         device(track="camera")

@@ -139,5 +139,5 @@ def test_devices_without_streams_are_refused(made_up_device):
 
 @pytest.mark.parametrize("wrong", [{"hours": 0}, {"stride": 0}, {"gap": [5, 2]}, {"gap": [0, 2]}])
 def test_courses_that_lead_nowhere(wrong):
-    with pytest.raises(InputError, match=r"stream\."):
+    with pytest.raises(InputError, match=r"measure\."):
         Course(**wrong)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.studies.motion import change
 from skin.body.arm import Arm
 from skin.build import build_data, build_device
 from skin.errors import InputError
 from skin.storage import read, write
-from studies.moving import change
 
 SOLID = (
     "simulator=solid",

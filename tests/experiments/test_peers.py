@@ -12,7 +12,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
-from peers.exchange import export
+from experiments.peers.exchange import export
 from skin.build import build_device
 from skin.config import ROOT, Evaluation, Tracking, checked, fingerprint
 from skin.tracking import Store
@@ -38,7 +38,7 @@ def command(run):
     def command(folder, *arguments):
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("COLUMNS", "200")
-            return run(folder, "peers.py", *arguments, "--folder", folder / "files")
+            return run(folder, "peers", *arguments, f"peers.folder={folder}/files")
 
     return command
 
@@ -62,7 +62,7 @@ def exchanged(configured, tmp_path_factory):
 
 
 def test_without_its_environment_it_says_what_builds_it(command, tmp_path):
-    done = command(tmp_path, "--python", str(tmp_path / "none" / "python"))
+    done = command(tmp_path, f"peers.python={tmp_path}/none/python")
     assert done.returncode == 2
     assert done.stderr.endswith("make peers builds it\n")
     assert not list(tmp_path.iterdir())
@@ -71,9 +71,8 @@ def test_without_its_environment_it_says_what_builds_it(command, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--peers", "rocket9"], "no peer rocket9: choose from lightgbm"),
-        (["--python", sys.executable, "datta.gestures=9"], "datta"),
-        (["--seeds", "0"], "1 or more"),
+        (["row=rocket9"], "no peer row=rocket9: choose from lightgbm"),
+        (["datta.gestures=9"], "datta"),
     ],
 )
 def test_bad_input_exits_with_2(command, tmp_path, arguments, reason):
@@ -87,7 +86,7 @@ def test_bad_input_exits_with_2(command, tmp_path, arguments, reason):
 def ran(command, tmp_path_factory):
     """What two calls of the command with the peer that needs no other environment did."""
     folder = tmp_path_factory.mktemp("peers")
-    arguments = ["--peers", "ridge", "--python", sys.executable, "--simulators", "naive", *SMALL]
+    arguments = ["row=ridge", f"peers.python={sys.executable}", "simulator=naive", *SMALL]
     return folder, command(folder, *arguments), command(folder, *arguments)
 
 

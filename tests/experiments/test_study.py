@@ -1,48 +1,47 @@
-"""The command finds finished runs, trains what is missing, and gives verdicts; bad input is one sentence."""
+"""The command finds finished runs, trains what is missing, measures, and gives verdicts."""
 
+import csv
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 
 import pytest
+from PIL import Image
 
+from experiments.studies.study import SMOKE
 from skin.config import ROOT, checked, fingerprint
 from skin.tracking import Store
-from studies.study import SMOKE
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
-STUDY = ROOT / "experiments" / "study.py"
-LIGHT = f"""
-import runpy, sys
-sys.path.insert(0, {str(STUDY.parent)!r})
-try:
-    runpy.run_path({str(STUDY)!r}, run_name="__main__")
-finally:
-    print("heavy:", *sorted({{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)))
-"""
+SMALL = ["data.gestures=160", "device.test_gestures=64", "evaluation.devices=0", "evaluation.layouts=0",
+         "evaluation.safe_gestures=64"]  # fmt: skip
+NAIVE = ["simulator=naive", *SMALL]
 
 
-def light(folder, *arguments):
-    """Run the command with a store and a folder of results of its own; it tells its heavy imports."""
-    own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a", f"--out={folder}/r"]
-    return subprocess.run(
-        [sys.executable, "-c", LIGHT, *arguments, *own],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        cwd=folder,
-    )
+def runs(folder):
+    """Return the names and statuses of all runs."""
+    with closing(sqlite3.connect(folder / "m.db")) as store:
+        return store.execute("select name, status from runs order by start_time").fetchall()
+
+
+def lines(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, configured):
     """A store with finished runs of one study: silu has 80, 81, 82 %, relu 10 points less, elu 10 more."""
     folder = tmp_path_factory.mktemp("studies")
-    row = ["sweep=activation", "experiment=temporal_graph", f"tracking.uri=sqlite:///{folder}/m.db"]
+    row = ["experiment=temporal_graph", "trainer.max_epochs=40", "evaluation.devices=0"]
+    row += ["evaluation.layouts=0", "tracking.experiment=studies", f"tracking.uri=sqlite:///{folder}/m.db"]
     for activation, gain in (("silu", 0.0), ("relu", -0.1), ("elu", 0.1)):
         for seed in range(3):
-            config = checked(configured(*row, f"model.activation={activation}", f"seed={seed}"))
+            own = [f"model.activation={activation}", f"learner.activation={activation}", f"seed={seed}"]
+            config = checked(configured(*row, *own))
             store = Store.open(config.tracking)
             # 0.002 more or less, that the differences have a spread
             value = 0.8 + gain * (1 + 0.02 * seed) + 0.01 * seed
@@ -52,54 +51,224 @@ def folder(tmp_path_factory, configured):
 
 
 def test_finished_runs_are_found_and_judged(run, folder):
-    done = run(folder, "study.py", "activation", f"--out={folder}/r")
+    done = run(folder, "study", "study=activation", f"out={folder}/r")
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout, "nothing was to be trained"
     page = (folder / "r" / "study_activation.md").read_text()
     assert "| activation=silu | 81.0 ± 1.0 |" in page
     assert "+10.2 ± 0.1 points (activation=relu); -10.2 ± 0.1 points (activation=elu) | disagree |" in page
-    assert len((folder / "r" / "study_activation.csv").read_text().splitlines()) == 10
-    assert {path.name for path in (folder / "r").iterdir()} == {"study_activation.md", "study_activation.csv"}
+    assert len(lines(folder / "r" / "study_activation.csv")) == 9
+    assert {path.suffix for path in (folder / "r").iterdir()} == {".md", ".csv", ".png"}
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [
-        (["pooling"], "graph_pooling"),
-        (["norm", "typo=1"], "typo"),
-        (["norm", "--seeds", "0"], "1 or more"),
-    ],
+    [((), "which study"), (["study=pooling"], "graph_pooling"), (["study=norm", "study.seeds=[]"], "seeds")],
 )
-def test_bad_input_ends_with_code_2_and_says_what(arguments, named, tmp_path):
-    done = light(tmp_path, *arguments)
-    assert (done.returncode, done.stdout.split()) == (2, ["heavy:"])
+def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, tmp_path):
+    code = (
+        f"import sys; from skin.cli import main; sys.path.insert(0, {str(ROOT)!r})\n"
+        f"try: main(['study', *{[*arguments]}])\n"
+        "finally: print(*sorted({'torch', 'mlflow', 'pytorch_lightning', 'scipy'} & set(sys.modules)))"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "\n"), done.stderr
     assert named in done.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_the_list_names_studies_and_statements_at_once(tmp_path):
-    done = light(tmp_path, "--list")
-    assert done.returncode == 0
-    assert "edge_weight: " in done.stdout
-    assert "  3.2.2  SiLU has a significant benefit" in done.stdout
-    assert done.stdout.splitlines()[-1] == "heavy:"
-
-
 @pytest.mark.slow
-def test_what_is_missing_is_trained_and_what_failed_is_told(run, folder):
+def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     # graph convolutions know this pooling, the transformer does not
-    few = ["--smoke", "--seeds", "1", "model.pooling=attention", f"--out={folder}/r"]
-    done = run(folder, "study.py", "transformer", *few)
-    assert done.returncode == 1
+    few = ["smoke=true", "study.seeds=[0]", "simulator=naive", "+model.pooling=attention", "out=r"]
+    done = run(tmp_path, "study", "study=transformer", *few)
+    assert done.returncode == 1, done.stderr
     assert done.stdout.count("took") == 1
     assert all(setting in done.stdout.replace("\n", "") for setting in SMOKE[:2])
+    page = (tmp_path / "r" / "smoke" / "study_transformer.md").read_text()
     assert "SMOKE" in done.stdout
-    assert "SMOKE" in next((folder / "r").glob("study_*.md")).read_text()
-    assert [line.count("| failed |") for line in table(folder, "transformer")] == [0, 1, 1]
+    assert "SMOKE" in page
+    body = page.split("\n\n")[1].splitlines()[2:]
+    assert [line.count("(1 failed) | failed |") for line in body] == [0, 1, 1]
     assert done.stderr.count("failed: model.pooling=attention must be 'mean' or 'max'") == 2
 
 
-def table(folder, name):
-    """Return the lines of a study's first table."""
-    lines = (folder / "r" / f"study_{name}.md").read_text().split("\n\n")[1].splitlines()
-    return lines[2:]
+@pytest.fixture(scope="module")
+def trained(run, tmp_path_factory):
+    """A folder with finished runs of two rows."""
+    folder = tmp_path_factory.mktemp("finished")
+    for words in (["experiment=rules"], ["experiment=temporal_graph", "trainer.max_epochs=1"]):
+        done = run(folder, "train", *words, *NAIVE)
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+def test_finished_runs_are_tried_under_conditions_once(run, trained):
+    words = ["study=dead", "simulator=naive", "study.devices=2", "device.test_gestures=48", "out=dead"]
+    done = run(trained, "study", *words)
+    assert done.returncode == 0, done.stderr
+    found = lines(trained / "dead" / "study_dead.csv")
+    assert [line["condition"] for line in found[::2]] == ["0 dead", "1 dead", "3 dead", "5 dead"] * 2
+    assert {line["variant"].split()[0] for line in found} == {"rules", "temporal_graph"}
+    assert all(0.25 < float(line["same/overall/accuracy"]) < 1 for line in found)
+    assert "undecided" in done.stdout
+    before = runs(trained)
+    again = run(trained, "study", *words)
+    assert (again.returncode, again.stdout) == (0, done.stdout), again.stderr
+    assert runs(trained) == before
+    assert lines(trained / "dead" / "study_dead.csv") == found
+    refused = run(trained, "study", "study=dead", "simulator=naive", "study.rows=[gru]")
+    assert refused.returncode == 2
+    assert "no finished run of gru" in refused.stderr
+
+
+@pytest.mark.slow
+def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
+    """Independent answer: skin evaluate with the same settings."""
+    few = [
+        "simulator=naive",
+        "study.rows=[rules]",
+        "study.devices=1",
+        "device.test_gestures=48",
+        "out=misplaced",
+    ]
+    done = run(trained, "study", "study=misplaced", *few)
+    assert done.returncode == 0, done.stderr
+    found = {line["condition"]: line for line in lines(trained / "misplaced" / "study_misplaced.csv")}
+    device = ["device.seed=1", "device.position_error=0.005", "device.test_gestures=48"]
+    done = run(trained, "evaluate", f"run={found['5 mm']['run']}", *device, "evaluation.devices=0",
+               "evaluation.layouts=0", "out=e")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    with closing(sqlite3.connect(trained / "m.db")) as store:
+        value = store.execute(
+            "select value from latest_metrics join runs using (run_uuid) where name like 'evaluation of%' "
+            "and key = 'same/overall/accuracy'"
+        ).fetchone()[0]
+    assert float(found["5 mm"]["same/overall/accuracy"]) == pytest.approx(value)
+    assert found["5 mm"]["same/overall/accuracy"] != found["0 mm"]["same/overall/accuracy"]
+
+
+@pytest.mark.slow
+def test_verdicts_are_sorted_by_margins(run, trained):
+    few = ["study.rows=[rules]", "simulator=naive", "out=margins"]
+    done = run(trained, "study", "study=margins", "study.measure.gestures=400", *few)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout.splitlines()
+    assert "within 10 % of their thresholds lie " in said[0]
+    assert "chosen on 64 fresh safe gestures for 2 % false alarms, finds " in said[0]
+    (path,) = (trained / "margins").glob("margins_rules_*.csv")
+    ways = [
+        [one for one in lines(path) if (one["label"], one["by"]) == ("big", way)]
+        for way in ("threshold", "reading")
+    ]
+    assert [sum(int(one["touches"]) for one in each) for each in ways] == [400, 400]
+    wrong, also = (sum(int(one["wrong"]) for one in each) for each in ways)
+    assert wrong == also > 0
+    assert f"of {wrong} errors of big" in said[0]
+    assert "## Alarm above 0." in path.with_suffix(".md").read_text()
+    with Image.open(path.with_suffix(".png")) as picture:
+        assert picture.size[0] > 800
+
+
+@pytest.mark.slow
+def test_every_course_is_played_and_no_alarm_ends_early(run, trained):
+    few = ["study.rows=[rules]", "simulator=naive", "out=holds"]
+    done = run(trained, "study", "study=holds", "study.measure.gestures=2", "study.measure.rate=10", *few)
+    assert done.returncode == 0, done.stderr
+    found = lines(next((trained / "holds").glob("holds_rules_*.csv")))
+    assert len(found) == 9
+    assert {one["course"] for one in found} >= {"tap", "press", "hold 600 s", "ramp 10 s"}
+    assert all(one["kept"] == one["touches"] for one in found)
+    assert sum(int(one["alarms"]) for one in found) > 0
+    assert f"course {found[0]['course']}, touches 2" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_run_is_probed_beside_graph_embeddings(run, trained):
+    few = ["train=80", "test=40", "seeds=[0]", "epochs=2", "layouts=2", "attributes=[reading]"]
+    words = ["study.rows=[temporal_graph]", "simulator=naive", *(f"study.measure.{one}" for one in few)]
+    done = run(trained, "study", "study=embeddings", *words, "out=embeddings")
+    assert done.returncode == 0, done.stderr
+    (path,) = (trained / "embeddings").glob("embeddings_temporal_graph_*.md")
+    assert path.with_suffix(".png").is_file()
+    text = path.read_text()
+    rows = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| ")]
+    assert rows == ["input", "Graph2Vec, reading",
+                    "GL2Vec, reading", "IGE, reading", "trained encoder", "readings, one frame",
+                    "readings, window"]  # fmt: skip
+    assert text.count("**undecided**") == 3  # one seed decides nothing
+
+
+@pytest.mark.slow
+def test_a_skin_itself_is_measured(run, tmp_path):
+    words = ["study=motion", "study.measure.gestures=40", "out=r"]
+    done = run(tmp_path, "study", *words)
+    assert done.returncode == 0, done.stderr
+    assert "below 1 %, no effect possible" in done.stdout
+    assert "mm into the skin" in (tmp_path / "r" / "study_motion.md").read_text()
+    done = run(tmp_path, "study", *words, "simulator=naive")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "constraint" in done.stderr
+
+
+@pytest.mark.slow
+def test_every_simulator_against_every_other(run, tmp_path):
+    skin = ["body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100",
+            "touch.small_area=[0.1,0.3]", "study.rows=[rules]", "study.seeds=[0]", "out=r"]  # fmt: skip
+    done = run(tmp_path, "study", "study=crosscheck", *skin, *SMALL)
+    assert done.returncode == 0, done.stderr
+    found = lines(tmp_path / "r" / "study_crosscheck.csv")
+    names = ["naive", "fem, equation 10", "fem, interface", "solid"]
+    assert [(line["variant"], line["condition"]) for line in found] == [(a, b) for a in names for b in names]
+    assert all(0.4 < float(line["same/overall/accuracy"]) <= 1 for line in found)
+    assert "| variant | naive | fem, equation 10 |" in (tmp_path / "r" / "study_crosscheck.md").read_text()
+
+
+@pytest.mark.slow
+def test_skins_of_one_study_feel_the_same_touches(run, tmp_path):
+    few = ["study.seeds=[0]", "study.rows=[features]", "body.cells=[8,8]", "+simulator.divisions=1"]
+    done = run(tmp_path, "study", "study=direction", *few, *SMALL)
+    assert done.returncode == 0, done.stderr
+    found = lines(tmp_path / "results" / "study_direction.csv")
+    assert [line["variant"] for line in found] == [
+        "upright",
+        "upright with friction",
+        "leaning with friction",
+    ]
+    assert all(0 < float(line["same/direction/degrees"]) < 180 for line in found)
+    with closing(sqlite3.connect(tmp_path / "m.db")) as store:
+        hashes = store.execute("select distinct value from tags where key = 'data_hash'").fetchall()
+    assert len(hashes) == 3
+    again = run(tmp_path, "study", "study=direction", *few, *SMALL)
+    assert again.returncode == 0, again.stderr
+    assert "took" not in again.stdout
+
+
+@pytest.mark.slow
+def test_rows_decide_together(run, trained):
+    words = ["study=ensemble", "study.rows=[rules,temporal_graph]", "study.seeds=[0]", "trainer.max_epochs=1"]
+    done = run(trained, "study", *words, *NAIVE, "out=ensemble")
+    assert done.returncode == 0, done.stderr
+    found = {line["variant"]: line for line in lines(trained / "ensemble" / "study_ensemble.csv")}
+    assert list(found) == ["rules", "temporal_graph", "ensemble_vote", "ensemble_average"]
+    assert 0 < float(found["ensemble_vote"]["same/any/disagreement"]) < 1
+
+
+@pytest.mark.slow
+def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
+    (tmp_path / "own" / "study").mkdir(parents=True)
+    (tmp_path / "own" / "experiment").mkdir()
+    (tmp_path / "own" / "experiment" / "mine.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /learner: rules\nrow: mine\n"
+    )
+    (tmp_path / "own" / "study" / "noise.yaml").write_text(
+        "about: noise\ntrainings: [{experiment: mine, device.noise: [0.05, 0.5]}]\ndifferences: greater\n"
+    )
+    few = ["--config-dir", tmp_path / "own", "study.seeds=[0]"]
+    done = run(tmp_path, "study", *few, "study=noise", *NAIVE)
+    assert done.returncode == 0, done.stderr
+    found = lines(tmp_path / "results" / "study_noise.csv")
+    assert [line["variant"] for line in found] == ["noise=0.05", "noise=0.5"]
+    assert "| noise=0.5 |  | " in (tmp_path / "results" / "study_noise.md").read_text()

@@ -4,13 +4,13 @@ import json
 
 import pytest
 
+from experiments.validation.index import LAWS
 from skin.config import ROOT
-from validation.index import LAWS
 
 
 @pytest.mark.slow
 def test_every_law_holds(run, tmp_path):
-    done = run(tmp_path, "verify_physics.py", "physics.quick=true", f"out={tmp_path}", store=False)
+    done = run(tmp_path, "validate", "validate.quick=true", f"out={tmp_path}", store=False)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = json.loads((tmp_path / "physics.json").read_text())
     assert {line["law"] for line in lines} == {law.name for law in LAWS}
@@ -25,16 +25,14 @@ def test_every_law_holds(run, tmp_path):
 def test_some_laws_leave_the_page_alone(run, tmp_path):
     page = ROOT / "docs" / "physics.md"
     before = page.read_bytes() if page.exists() else None
-    done = run(
-        tmp_path, "verify_physics.py", "physics.quick=true", "physics.laws=[confined,naive]", store=False
-    )
+    done = run(tmp_path, "validate", "validate.quick=true", "validate.laws=[confined,naive]", store=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["confined: holds, 2 numbers", "naive: holds, 1 numbers"]
     assert (page.read_bytes() if page.exists() else None) == before
 
 
 def test_an_unknown_law_is_refused(run, tmp_path):
-    done = run(tmp_path, "verify_physics.py", "physics.laws=[gravity]", store=False)
+    done = run(tmp_path, "validate", "validate.laws=[gravity]", store=False)
     assert done.returncode == 2
     assert "got gravity" in done.stderr
     assert "hertz" in done.stderr
@@ -43,15 +41,14 @@ def test_an_unknown_law_is_refused(run, tmp_path):
 
 def test_a_law_that_fails_ends_with_one(run, tmp_path):
     """A solid whose stiffness is wrong by a tenth does not pass for the right one."""
-    spoilt = tmp_path / "verify_physics.py"
+    spoilt = tmp_path / "spoilt.py"
     spoilt.write_text(
-        f"import sys; sys.path.insert(0, {str(ROOT / 'experiments')!r})\n"
         "from skin.simulator._hexahedra import Hexahedra\n"
         "right = Hexahedra.stiffness; Hexahedra.stiffness = lambda mesh: 1.1 * right(mesh)\n"
-        "from verify_physics import main; main()\n"
+        "from skin.cli import main; import sys; main(['validate', *sys.argv[1:]])\n"
     )
     done = run(
-        tmp_path, spoilt, "physics.quick=true", "physics.laws=[confined]", f"out={tmp_path}", store=False
+        tmp_path, spoilt, "validate.quick=true", "validate.laws=[confined]", f"out={tmp_path}", store=False
     )
     assert done.returncode == 1, done.stderr
     assert "confined: FAILS" in done.stdout

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from peers.exchange import Foreign, export
+from experiments.peers.exchange import Foreign, export
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.evaluation.report import columns

@@ -5,6 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
+from experiments.studies.report_figures import draw_skin
 from skin.body.arm import Arm
 from skin.body.sheet import Sheet
 from skin.build import build_device
@@ -15,7 +16,6 @@ from skin.simulator._assembly import Structure
 from skin.simulator._operator import build
 from skin.simulator.naive import Naive
 from skin.simulator.solid import Solid
-from studies.report_figures import draw_skin
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -103,9 +103,9 @@ def test_living_sensors_at_their_limit_are_saturated():
 
 
 def test_bad_settings_are_refused():
-    with pytest.raises(InputError, match=r"device.noise must be at least 0, got -1"):
+    with pytest.raises(InputError, match=r"device.noise=-1 must be greater than or equal to 0"):
         Imperfection(noise=-1)
-    with pytest.raises(InputError, match=r"device.clip must be above 0"):
+    with pytest.raises(InputError, match=r"device.clip=0 must be greater than 0"):
         Imperfection(clip=0)
     with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
         Imperfection(dead=25).constants(25, generator())

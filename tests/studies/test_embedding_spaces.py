@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from studies.embedding.probe import FRAME, Found, Space
-from studies.embedding_spaces import lines, planes, spaces, statements
+from experiments.studies.embedding.probe import FRAME, Found, Space
+from experiments.studies.embedding_spaces import lines, planes, spaces, statements
 
 NAMES = ("big", "press")
 

@@ -4,16 +4,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from rich.console import Console
 
+from experiments.studies import ensemble
+from experiments.studies.ensemble import average, combine, disagreement, vote
+from experiments.studies.runs import finished
 from skin.config import checked, fingerprint
 from skin.console import quiet
 from skin.errors import InputError
 from skin.labels import TOUCH, Task
 from skin.run import train
 from skin.tracking import Store
-from studies import ensemble
-from studies.ensemble import average, combine, disagreement, show, vote
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -27,7 +27,8 @@ SMALL = (
     "evaluation.safe_gestures=64",
     "evaluation.gestures=48",
 )
-ROWS = ("rules", "linked_graph", "temporal_graph")
+ROWS = ("rules", "linked_graph")
+COLUMNS = ("unseen_layout/overall/accuracy", "device_shift/overall/accuracy")
 TWO = Task(("one", "two"))
 # two members that differ on the first label of the second touch
 CHANCES = torch.tensor([[[0.9, 0.2], [0.6, 0.8]], [[0.7, 0.4], [0.1, 0.6]]])
@@ -54,7 +55,7 @@ def test_disagreement_counts_touches_without_unanimity():
 
 @pytest.fixture(scope="module")
 def trained(configured, tmp_path_factory):
-    """A function that composes, a store with two finished rows, and its three configurations of members."""
+    """A function that composes, a store with two finished rows, and these with their configurations."""
     folder = tmp_path_factory.mktemp("ensemble")
     own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
 
@@ -63,9 +64,10 @@ def trained(configured, tmp_path_factory):
 
     quiet()
     members = [compose(f"experiment={row}", "trainer.max_epochs=1") for row in ROWS]
-    for config in members[:2]:
+    for config in members:
         train(config)
-    return compose, Store.open(members[0].tracking), members
+    store = Store.open(members[0].tracking)
+    return compose, store, {config.row: (config, finished(store, config)) for config in members}
 
 
 @pytest.fixture(scope="module")
@@ -91,42 +93,31 @@ def predictions(store, folder, config):
 @pytest.mark.slow
 def test_ensembles_say_what_their_members_logged_together(trained, combined, tmp_path):
     _, store, members = trained
-    ways, outcome, _ = combined
-    one, two = (predictions(store, tmp_path, config)[0] for config in members[:2])
+    ways, found, _ = combined
+    one, two = (predictions(store, tmp_path, config)[0] for config, _ in members.values())
     averaged, truth = predictions(store, tmp_path, ways["ensemble_average"])
     voted, _ = predictions(store, tmp_path, ways["ensemble_vote"])
     assert averaged == pytest.approx((one + two) / 2, abs=1e-5)
     assert voted == pytest.approx(((one > 0.5) * 0.5 + (two > 0.5) * 0.5), abs=1e-6)
     right = ((averaged > 0.5) == (truth > 0)).mean()
-    assert outcome.ensembles["ensemble_average"]["same/overall/accuracy"] == pytest.approx(right)
+    assert found["ensemble_average"].data.metrics["same/overall/accuracy"] == pytest.approx(right)
     differ = ((one > 0.5) != (two > 0.5)).any(axis=1).mean()
-    assert outcome.ensembles["ensemble_vote"]["same/any/disagreement"] == pytest.approx(differ)
+    assert found["ensemble_vote"].data.metrics["same/any/disagreement"] == pytest.approx(differ)
     assert 0 < differ < 1
-    assert set(outcome.members) == {"rules", "linked_graph"}
-    assert outcome.missing == ("temporal_graph",)
 
 
 @pytest.mark.slow
 def test_every_column_is_tried_and_nothing_twice(trained, combined):
     _, store, members = trained
-    ways, outcome, before = combined
-    for metrics in outcome.ensembles.values():
+    ways, found, before = combined
+    for run in found.values():
         for column in ("same", "holdout", "device_shift", "unseen_layout"):
-            assert f"{column}/overall/accuracy" in metrics
+            assert f"{column}/overall/accuracy" in run.data.metrics
     again = combine(store, members, ways)
-    assert again == outcome
+    assert {way: run.info.run_id for way, run in again.items()} == {
+        way: run.info.run_id for way, run in found.items()
+    }
     assert len(store.find()) == len(before)
-
-
-@pytest.mark.slow
-def test_a_person_reads_who_was_best_and_who_was_not_there(combined, capsys):
-    outcome = combined[1]
-    show(outcome, "naive, seed 0", Console(width=120))
-    said = capsys.readouterr().out
-    best = outcome.ensembles["ensemble_average"]["same/overall/accuracy"]
-    assert f"{100 * best:.1f}" in said
-    assert "best member: rules" in said
-    assert "without temporal_graph: no finished run" in said
 
 
 @pytest.mark.slow
@@ -151,29 +142,15 @@ def test_who_takes_no_other_layout_is_left_out_of_that_column_only(trained, monk
 
     monkeypatch.setattr(ensemble, "build_learner", homebound)
     ways = {"ensemble_average": compose("row=homebound")}
-    outcome = combine(store, members, ways)
-    assert outcome.left_out == {"unseen_layout": "rules: only the layout it was trained on"}
-    alone = outcome.members["linked_graph"]["unseen_layout/overall/accuracy"]
-    found = outcome.ensembles["homebound"]
-    assert found["unseen_layout/overall/accuracy"] == pytest.approx(alone)
-    assert found["device_shift/overall/accuracy"] != pytest.approx(
-        outcome.members["linked_graph"]["device_shift/overall/accuracy"]
-    )
+    run = combine(store, members, ways)["ensemble_average"]
+    assert run.data.tags["left_out_unseen_layout"] == "rules: only the layout it was trained on"
+    alone, found = members["linked_graph"][1].data.metrics, run.data.metrics
+    same = [found[name] == pytest.approx(alone[name]) for name in COLUMNS]
+    assert same == [True, False]
 
 
 @pytest.mark.slow
 def test_one_member_is_no_ensemble(trained):
     compose, store, members = trained
-    with pytest.raises(InputError, match=r"got rules without temporal_graph: .*experiment=temporal_graph"):
-        combine(store, [members[0], members[2]], {"ensemble_vote": compose("row=alone")})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [(["--rows", "ruless"], "no row ruless"), ([], "two finished rows, got none")],
-)
-def test_the_command_refuses_with_one_sentence(run, tmp_path, arguments, reason):
-    done = run(tmp_path, "ensemble.py", *arguments)
-    assert done.returncode == 2
-    assert reason in done.stderr
-    assert "Traceback" not in done.stderr
+    with pytest.raises(InputError, match="two finished runs, got rules"):
+        combine(store, {"rules": members["rules"]}, {"ensemble_vote": compose("row=alone")})

@@ -6,10 +6,10 @@ import pytest
 import torch
 from PIL import Image
 
+from experiments.studies.sliding import line, publish
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.sliding import Bin, Sliding
-from studies.sliding import line, publish
 
 NAMES = ("big", "dynamic", "press", "dangerous")
 FOUND = Sliding(

@@ -2,15 +2,15 @@
 
 import csv
 import io
-from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
+from experiments.studies.table import COLUMNS, LABELS, Cell, as_csv, grid, report_values, rows, show
+from experiments.studies.tables import markdown
 from skin.config import CONF, ROOT
 from skin.files import write
-from studies.table import COLUMNS, LABELS, Cell, as_csv, grid, markdown, report_values, rows, show
 
 REPORT = {("temporal_graph", "fem", "overall"): 0.732, ("temporal_graph", "fem", "big"): 0.646}
 
@@ -136,13 +136,9 @@ def test_the_reports_overall_is_the_mean_of_its_labels(row):
     assert known[row, "fem", "overall"] == pytest.approx(sum(each) / 4, abs=2e-3)
 
 
-def test_a_table_tells_its_budget(monkeypatch):
+def test_a_table_tells_its_budget():
     cell = Cell("rules", "fem", (run(0.8),), 0)
     assert {line["budget"] for line in rows([cell], {}, "smoke")} == {"smoke"}
-    monkeypatch.syspath_prepend(str(ROOT / "experiments"))
-    titles = import_module("reproduce_table").TITLES
-    assert "SMOKE" in titles["smoke"]
-    assert "SMOKE" not in titles["full"]
 
 
 def test_no_number_is_cut_on_a_narrow_terminal():

@@ -6,11 +6,11 @@ import re
 
 import pytest
 
+from experiments.validation.finding import Curve, Finding, Law, Outcome, Picture, compared
+from experiments.validation.index import LAWS, chosen
+from experiments.validation.page import as_json, page, publish
 from skin.config import ROOT
 from skin.errors import InputError
-from validation.finding import Curve, Finding, Law, Outcome, Picture, compared
-from validation.index import LAWS, chosen
-from validation.page import as_json, page, publish
 
 MISS = Outcome([compared("this", 1.2, 1.0, 0.1), compared("that", 1.0, 1.0, 0.1)], ["a remark"])
 LAW = Law("gravity", "Things fall.", "an apple", lambda quick: MISS)

@@ -101,7 +101,7 @@ def benchmarks():
     """Return the benchmark and the frames that it writes, which are no part of the package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "experiments")
-        return import_module("benchmarks.fuzz"), import_module("benchmarks.pieces")
+        return import_module("experiments.benchmarks.fuzz"), import_module("experiments.benchmarks.pieces")
 
 
 def test_another_hand_writes_the_same_frames(benchmarks):

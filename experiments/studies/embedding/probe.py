@@ -9,15 +9,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from experiments.studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
+from experiments.studies.embedding.settings import Probing
 from skin.device.base import AbstractDevice
-from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
-from skin.learner.network import Network
+from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.representation.graph import adjacency, neighbours
-from studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
-from studies.embedding.settings import Probing
 
 __all__ = [
     "FRAME",
@@ -78,7 +77,7 @@ class Found(NamedTuple):
     space: Space
 
 
-def probe(device: AbstractDevice, settings: Probing, learner: Network | None) -> Iterator[Found]:
+def probe(device: AbstractDevice, settings: Probing, learner: AbstractLearner | None) -> Iterator[Found]:
     """Yield what every input tells, seed by seed: graph embeddings, a trained encoder's, plain readings.
 
     A simulated device draws new touches for every seed, of which no training has any; of another device the
@@ -86,7 +85,7 @@ def probe(device: AbstractDevice, settings: Probing, learner: Network | None) ->
     """
     if device.task.direction:
         raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
-    for seed in settings.seeds if isinstance(device, Simulated) else settings.seeds[:1]:
+    for seed in settings.seeds if device.simulation else settings.seeds[:1]:
         touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
         for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):
             yield _found(attribute, name, seed, _space(vectors, touches, mixed), device.task.names)
@@ -150,7 +149,7 @@ def _graph_vectors(
 
 
 def _inputs(
-    sets: Sequence[Touches], settings: Probing, seed: int, learner: Network | None
+    sets: Sequence[Touches], settings: Probing, seed: int, learner: AbstractLearner | None
 ) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
     for attribute in settings.attributes:
         for name, vectors in _graph_vectors(sets, attribute, settings, seed):
@@ -186,26 +185,29 @@ def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[s
 def _touches(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
     """Return the touches of one layout, those to train the SVM on first."""
     count = settings.train + settings.test
-    if isinstance(device, Simulated):
-        drawn = device.replace(data_seed=_FIRST_SEED + seed, gestures=count).recording().touches
+    if device.simulation is not None:
+        drawn = device.simulation.replace(data_seed=_FIRST_SEED + seed, gestures=count).recording().touches
         return [drawn[: settings.train], drawn[settings.train :]]
     return [device.touches("train")[: settings.train], device.touches("test")[: settings.test]]
 
 
 def _layouts(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
     """Return as many other touches on each of some scattered layouts; none where that cannot be."""
-    if not isinstance(device, Simulated) or settings.layouts < 2:
+    simulation = device.simulation
+    if simulation is None or settings.layouts < 2:
         return []
-    count = len(device.sensors)
+    count = len(simulation.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
         return []  # no grid of so many sensors could be scattered
-    footprint, depth, found = device.sensors.footprint, device.sensors.positions[:, 2], []
+    sensors, found = simulation.sensors, list[AbstractDevice]()
     for number in range(settings.layouts):
         seed_of = _FIRST_LAYOUT + number
-        layout = Scattered(rows, count // rows, seed=seed_of, footprint=footprint, depth=depth)
+        layout = Scattered(
+            rows, count // rows, seed=seed_of, footprint=sensors.footprint, depth=sensors.positions[:, 2]
+        )
         draw = _FIRST_SEED * (2 + number) + seed
-        found.append(device.replace(layout=layout, data_seed=draw, gestures=settings.test))
+        found.append(simulation.replace(layout=layout, data_seed=draw, gestures=settings.test))
     return [one.recording().touches for one in found]
 
 

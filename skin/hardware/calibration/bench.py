@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench_session import Session
 from skin.hardware.calibration.gauge import Gauge, per_newton
@@ -91,7 +91,7 @@ class Bench:
         return found
 
 
-def bench(device: Simulated, session: Session, gauge: Gauge | None) -> Bench:
+def bench(device: AbstractSimulated, session: Session, gauge: Gauge | None) -> Bench:
     """Set a session beside the simulation of its presses on the skin as it is designed.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench_session import Session, write
 from skin.hardware.calibration.gauge import Gauge, per_newton
@@ -72,7 +72,7 @@ class Protocol:
             np.repeat(np.arange(len(places)), len(one)),
         )
 
-    def places(self, device: Simulated, generator: np.random.Generator) -> np.ndarray:
+    def places(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
         """Return two places per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
         home = device.sensors.positions[:, :2]
         beside = home + generator.uniform(-0.003, 0.003, home.shape)
@@ -80,7 +80,7 @@ class Protocol:
 
 
 def emulate(
-    device: Simulated,
+    device: AbstractSimulated,
     gauge: Gauge,
     protocol: Protocol,
     generator: np.random.Generator,
@@ -99,7 +99,7 @@ def emulate(
     if bits is None:
         return Session(time, said.astype(float), "N", gauge)
     middle = 2 ** (bits - 1)
-    counts = np.clip(np.round(middle + said * middle / (2 * device.clip)), 0, 2**bits - 1)
+    counts = np.clip(np.round(middle + said * middle / (2 * device.imperfection.clip)), 0, 2**bits - 1)
     return Session(time, counts, "adc", gauge, bits)
 
 
@@ -109,7 +109,7 @@ def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarra
     return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
 
 
-def demo(device: Simulated, settings: Mapping[str, Any], path: str) -> str:
+def demo(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
     """Write what an emulated device says to the protocol, and return a line about it.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.emulator.faults import BANNER, KINDS, Faults
 from skin.hardware.emulator.gestures import Converter, Gesture, gestures, in_time
@@ -98,7 +98,7 @@ class Emulator:
 
     def __init__(
         self,
-        device: Simulated,
+        device: AbstractSimulated,
         outlet: AbstractOutlet,
         settings: Settings,
         faults: Faults,

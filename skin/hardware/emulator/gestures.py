@@ -8,7 +8,7 @@ from itertools import count
 import numpy as np
 import torch
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.rng import Stream, generator
 from skin.touch.sampler import balanced
 
@@ -61,7 +61,7 @@ class Converter:
         return np.clip(np.round(middle + newtons / self.scale), 0, 2**self.bits - 1).astype(np.float64)
 
 
-def gestures(device: Simulated, seed: int = 0) -> Iterator[Gesture]:
+def gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
     """Yield gestures that no training can draw, in an order of ``seed`` alone, balanced in sixteens."""
     with ThreadPoolExecutor(1, "skin-gestures") as ahead:
         # Drawn while the ones before are played: a device does not pause.
@@ -72,18 +72,18 @@ def gestures(device: Simulated, seed: int = 0) -> Iterator[Gesture]:
             yield from ready
 
 
-def alike(device: Simulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
+def alike(device: AbstractSimulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
     """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``skin.labels.TOUCH``."""
     return _drawn(device, labels, generator(Stream.TEST, 5, seed))
 
 
-def _batch(device: Simulated, seed: int, number: int) -> list[Gesture]:
+def _batch(device: AbstractSimulated, seed: int, number: int) -> list[Gesture]:
     draw = generator(Stream.TEST, 2, seed, number)
     return _drawn(device, balanced(_BATCH, draw), draw)
 
 
 @torch.no_grad()
-def _drawn(device: Simulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
+def _drawn(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
     movie = device.sampler.sample(len(labels), draw, labels)
     readings = device.model.respond(movie, displacement=False).readings.double().numpy()
     names, found, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()

@@ -95,7 +95,10 @@ class _Pty(AbstractOutlet):
         try:
             import tty
         except ImportError as error:  # Windows
-            raise InputError("there are no pseudo-terminals here: add port=tcp:5555") from error
+            raise InputError(
+                "this system has no pseudo-terminals: add port=tcp:5555, and read it with "
+                "device.port=socket://127.0.0.1:5555"
+            ) from error
         with self._lock:
             self._master, slave = os.openpty()
             tty.setraw(slave)

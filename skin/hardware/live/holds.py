@@ -7,7 +7,7 @@ from itertools import count
 import numpy as np
 import torch
 
-from skin.device.simulated import Simulated
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.emulator.gestures import alike, in_time
 from skin.hardware.live.engine import Engine
@@ -73,7 +73,7 @@ class Outcome:
     early: bool
 
 
-def trials(device: Simulated, course: str, number: int, seed: int = 0) -> Iterator[np.ndarray]:
+def trials(device: AbstractSimulated, course: str, number: int, seed: int = 0) -> Iterator[np.ndarray]:
     """Yield the true readings (T, S), N, of dangerous touches that stand still, at the model's rate.
 
     Args:
@@ -103,7 +103,9 @@ def trials(device: Simulated, course: str, number: int, seed: int = 0) -> Iterat
         yield load[: np.flatnonzero(load)[-1] + 2, None] * strongest
 
 
-def played(engine: Engine, device: Simulated, force: np.ndarray, rate: float, seed: int = 0) -> Outcome:
+def played(
+    engine: Engine, device: AbstractSimulated, force: np.ndarray, rate: float, seed: int = 0
+) -> Outcome:
     """Let an engine follow a touch frame by frame.
 
     Args:
@@ -167,7 +169,11 @@ def summary(course: str, found: Sequence[Outcome]) -> list[str]:
 
 
 def courses(
-    engine: Engine, device: Simulated, number: int, rate: float, track: Callable[..., Iterable[np.ndarray]]
+    engine: Engine,
+    device: AbstractSimulated,
+    number: int,
+    rate: float,
+    track: Callable[..., Iterable[np.ndarray]],
 ) -> Iterator[list[str]]:
     """Play every course before an engine and yield a line of each, as :func:`summary` gives it.
 

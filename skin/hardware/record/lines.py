@@ -30,7 +30,8 @@ class Lines:
     def __init__(self, path: Path) -> None:
         self._path = path
         with _said(path):
-            self._file = os.open(path, os.O_WRONLY | os.O_APPEND)
+            # Windows would write two bytes for the end of a line.
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_BINARY", 0))
             self._size = os.fstat(self._file).st_size
 
     def add(self, text: str) -> None:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from skin.device.serial import Serial
+from skin.device.base import AbstractWired
 from skin.errors import InputError
 from skin.hardware.record.lines import locked
 from skin.hardware.record.log import Log, Stored, check, read
@@ -24,7 +24,7 @@ _log = logging.getLogger("skin.hardware.record")
 
 
 def record(
-    device: Serial, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
+    device: AbstractWired, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
 ) -> None:
     """Write frames until all gestures are done, ``seconds`` are over, or a person ends it.
 
@@ -43,7 +43,7 @@ def record(
 
 
 def _record(
-    device: Serial, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
+    device: AbstractWired, path: Path, seconds: float | None, free: bool, tell: Callable[[str], None]
 ) -> None:
     skin, tap = device.open(reconnect=True)
     with skin:
@@ -79,7 +79,7 @@ def _record(
             log.close()
 
 
-def _about(device: Serial, header: Header | None) -> dict[str, Any]:
+def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
     """Return what stands beside a session."""
     return {
         "format": 2,
@@ -97,7 +97,7 @@ def _about(device: Serial, header: Header | None) -> dict[str, Any]:
     }
 
 
-def finish(device: Serial, path: Path) -> tuple[Path, int]:
+def finish(device: AbstractWired, path: Path) -> tuple[Path, int]:
     """Write the whole gestures of a session as a recording beside it; return it and how many there are.
 
     Raises:

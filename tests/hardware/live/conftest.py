@@ -10,7 +10,7 @@ def browser():
     """Return a headless Chromium; skip where there is none."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "experiments")
-        from benchmarks.browser import Browser, installed
+        from experiments.benchmarks.browser import Browser, installed
     found = installed()
     if found is None:
         pytest.skip("needs Chromium and its driver: apt-get install chromium chromium-driver")

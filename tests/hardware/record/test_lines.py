@@ -37,6 +37,15 @@ def frame(number):
     return Frame(number, number / 100, 0.0, np.array([500.0, 512.0]), np.array([True, True]))
 
 
+def test_lines_end_alike_on_windows(tmp_path, monkeypatch):
+    path, flags, usual = tmp_path / "session.csv", [], os.open
+    path.touch()
+    monkeypatch.setattr(os, "O_BINARY", 1 << 15, raising=False)
+    monkeypatch.setattr(os, "open", lambda path, flag: flags.append(flag) or usual(path, flag))
+    Lines(path).close()
+    assert flags[0] & os.O_BINARY
+
+
 def recorded(log, number):
     """Record a gesture of twenty frames."""
     take = Take(number, {"big": 1}, number / 2, 0)

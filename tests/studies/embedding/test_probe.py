@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.studies.embedding.probe import FRAME, accuracy, explained, probe, strongest
+from experiments.studies.embedding.settings import Probing
 from skin.build import build_device
-from skin.errors import InputError
 from skin.recording import Touches
-from studies.embedding.probe import FRAME, accuracy, explained, probe, strongest
-from studies.embedding.settings import Probing
 
 SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "layouts": 2}
 
@@ -70,16 +69,3 @@ def test_touches_of_another_seed_are_others(configured, found):
     other = next(probe(device, Probing(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
     assert other.space.labels.shape == (240, 4)
     assert (other.space.labels != found["degree", "Graph2Vec"].space.labels).any()
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"attributes": ["colour"]}, "set embeddings.attributes"),
-        ({"train": 5}, "embeddings.train must be at least 20"),
-        ({"seeds": []}, "embeddings.seeds is empty"),
-    ],
-)
-def test_settings_of_no_use_are_refused(given, words):
-    with pytest.raises(InputError, match=words.replace("[", r"\[")):
-        Probing(**given)

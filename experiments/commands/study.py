@@ -1,0 +1,80 @@
+"""Compare variants of trainings, or finished runs under conditions; give verdicts on statements.
+
+    skin study study=norm
+    skin study -m study=norm,activation simulator=naive
+    skin study study=dead study.rows=[features,gru]
+    skin study study=margins study.run=latest
+
+A study is a file of conf/study. It trains the runs that are missing, with the budget in that file; rerun to
+resume. Writes study_<name>.md, .csv and .png into out=.
+"""
+
+import sys
+from pathlib import Path
+
+from experiments.studies.study import SMOKE, Study, given, words
+from skin.command import command
+from skin.config import DictConfig, checked
+from skin.errors import InputError
+from skin.files import results
+
+
+@command("study")
+def main(config: DictConfig) -> None:
+    """Train or find the runs of a study, measure them, write and print what was found."""
+    study = Study.of(config)
+    folder = results(config.out) / ("smoke" if config.smoke else "")
+
+    from skin.console import quiet
+
+    quiet()
+    if not study.trainings and study.rows is None and study.run is None:
+        _measure_skin(study, folder)
+    else:
+        _compare(study, config, folder)
+
+
+def _compare(study: Study, config: DictConfig, folder: Path) -> None:
+    """Measure the runs of a study; exit code 1 if one is missing."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from experiments.studies.page import publish
+    from experiments.studies.runs import known, trained
+    from experiments.studies.trials import trials
+    from skin.tracking import Store
+
+    if study.trainings:
+        store, planned = trained(study, config.smoke)
+    else:
+        store = Store.open(config.tracking)
+        planned = known(study, config, store)
+    found, console = [], Console(stderr=True)
+    shown = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
+    for trial in (trial for one in shown for trial in trials(store, one, study, config, folder)):
+        found.append(trial)
+        if trial.line:
+            print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *trial.files, sep="\n", flush=True)
+    if study.metrics:
+        smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
+        settings = [word for word in given() if not word.startswith("tracking.")]
+        title = smoke + ", ".join([f"{study.name}: {study.about}", *(SMOKE if smoke else ()), *settings])
+        publish(study, title, found, folder / f"study_{study.name}")
+    if any(one.run is None for one in planned):
+        sys.exit(1)
+
+
+def _measure_skin(study: Study, folder: Path) -> None:
+    """Measure the skin itself."""
+    from hydra import compose
+
+    from experiments.studies.measures import Subject
+    from skin.build import build_device
+
+    if study.measure is None:
+        raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
+    config = checked(compose("train", [*words(study.test), *given()]))
+    found = study.measure(Subject(config, build_device(config)))
+    print(found.line)
+    if found.publish:
+        print(*found.publish(f"{study.name}: {study.about}", folder / f"study_{study.name}"), sep="\n")

@@ -1,0 +1,261 @@
+"""What a study measures: of a finished run, on a device that a condition may have changed.
+
+Measures import late, so that a mistake in their settings is reported at once.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Protocol
+
+from annotated_types import Ge, Gt
+
+from experiments.studies.embedding.settings import Probing
+from skin.errors import InputError
+from skin.evaluation.course import Course
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+    from omegaconf import DictConfig
+
+    from skin.device.base import AbstractDevice
+    from skin.evaluation.operating_point import OperatingPoint
+    from skin.learner.base import AbstractLearner
+    from skin.tracking import Store
+
+__all__ = [
+    "Accuracy",
+    "Embeddings",
+    "Finished",
+    "Holds",
+    "Margins",
+    "Measure",
+    "Measured",
+    "Motion",
+    "SelfShare",
+    "Streams",
+    "Subject",
+]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run.
+
+    Attributes:
+        store: where it is.
+        run: as MLflow has it.
+        stored: its configuration.
+        learner: what it learned.
+    """
+
+    store: "Store"
+    run: "Run"
+    stored: "DictConfig"
+    learner: "AbstractLearner"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is measured.
+
+    Attributes:
+        config: of the run, with what the condition changes; without a run that of the command.
+        device: as ``config`` describes it.
+        finished: the run; None where a study has none.
+    """
+
+    config: "DictConfig"
+    device: "AbstractDevice"
+    finished: Finished | None = None
+
+    @property
+    def of(self) -> Finished:
+        """The run.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.finished is None:
+            raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
+        return self.finished
+
+    def point(self) -> "OperatingPoint":
+        """Return where the run raises the alarm."""
+        from skin.evaluation.operating_point import OperatingPoint
+        from skin.reload import operating_point
+
+        settings = self.config.evaluation
+        found = operating_point(self.of.run, self.of.learner, self.of.stored, settings)
+        return found or OperatingPoint.default(settings.false_alarm_rate)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What came out.
+
+    Attributes:
+        metrics: name -> value; shares are of 1.
+        line: what matters most, for a person; empty where the metrics tell it.
+        publish: writes files to a path without an ending, under a title; None: there are none.
+    """
+
+    metrics: dict[str, float] = field(default_factory=dict)
+    line: str = ""
+    publish: Callable[[str, Path], list[Path]] | None = None
+
+
+class Measure(Protocol):
+    """A frozen dataclass of settings that measures."""
+
+    def __call__(self, subject: Subject) -> Measured:
+        """Measure; InputError where the device or the learner cannot be measured so."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Accuracy and the like on the test touches."""
+
+    def __call__(self, subject: Subject) -> Measured:
+        from skin.evaluation.metrics import metrics
+
+        touches = subject.device.touches("test")
+        assert touches.labels is not None
+        chances = subject.of.learner.probabilities(touches)
+        found = metrics(chances, touches.labels, subject.device.task)
+        return Measured({f"same/{name}": value for name, value in found.items()})
+
+
+@dataclass(frozen=True)
+class SelfShare:
+    """How much of its own row a node of the run's graph is (:func:`skin.representation.graph.self_share`)."""
+
+    def __call__(self, subject: Subject) -> Measured:
+        from skin.build import build_data
+        from skin.representation.graph import self_share
+
+        data = build_data(subject.config, subject.device)
+        graph = data.representation_for(data.touches("train").positions)
+        return Measured({"self_share": self_share(graph.adjacency)})  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far from a threshold a verdict can be trusted.
+
+    Sorts verdicts by area, travel, duration and pressure over their thresholds, and by the highest reading.
+
+    Args:
+        gestures: number of test touches.
+    """
+
+    gestures: Annotated[int, Ge(1)] = 20000
+
+    def __call__(self, subject: Subject) -> Measured:
+        from experiments.studies import margins as page
+        from skin.evaluation.margins import margins
+
+        found = margins(subject.of.learner, subject.device, self.gestures, subject.point())
+        return Measured({}, page.line(found), partial(page.publish, found))
+
+
+class Streams(Course):
+    """False alarms per hour of a stream, and accuracy by the share of a touch that a window shows."""
+
+    def __call__(self, subject: Subject) -> Measured:
+        from rich.console import Console
+        from rich.progress import track
+
+        from experiments.studies import sliding as page
+        from skin.evaluation.sliding import slide
+
+        shown = partial(
+            track, description=subject.of.run.info.run_name, console=Console(stderr=True), transient=True
+        )
+        found = slide(subject.of.learner, subject.device, self, subject.point(), shown)
+        return Measured(found.metrics(), page.line(found), partial(page.publish, found))
+
+
+@dataclass(frozen=True)
+class Holds:
+    """When the alarm is raised, and whether a held press keeps it.
+
+    Plays dangerous taps, presses, holds of 1 s to 10 min and slow ramps to the engine of ``skin live``, in
+    the time of the device.
+
+    Args:
+        gestures: number of taps, presses, short holds and ramps; a tenth of it of those of ten minutes.
+        rate: of the device, Hz.
+        touch: as ``live.touch``, N.
+        drift: as ``live.drift``, N in ten minutes.
+    """
+
+    gestures: Annotated[int, Ge(1)] = 40
+    rate: Annotated[float, Gt(0)] = 100.0
+    touch: Annotated[float, Gt(0)] | None = None
+    drift: Annotated[float, Ge(0)] = 0.2
+
+    def __call__(self, subject: Subject) -> Measured:
+        from rich.progress import track
+
+        from experiments.studies.tables import as_csv
+        from skin.files import write
+        from skin.hardware.live import start
+        from skin.hardware.live.holds import FIELDS, courses
+        from skin.hardware.live.verdict import Patience
+        from skin.trained import trained
+
+        of = trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
+        engine = start.engine(of, Patience(), self.touch, self.drift)
+        device = of.device.simulated("held touches are simulated").replace(stream=False)
+        table = [FIELDS, *courses(engine, device, self.gestures, self.rate, partial(track, transient=True))]
+        told = (zip(FIELDS, values, strict=True) for values in table[1:])
+        lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
+
+        def publish(title: str, path: Path) -> list[Path]:
+            return [write(as_csv(table), path.with_suffix(".csv"))]
+
+        return Measured({}, "\n".join(lines), publish)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far touches move the sensors of a skin in which they can, and how well readings tell it; of no run.
+
+    Args:
+        gestures: number of test gestures.
+    """
+
+    gestures: Annotated[int, Ge(1)] = 1000
+
+    def __call__(self, subject: Subject) -> Measured:
+        from experiments.studies.motion import change
+        from skin.files import write
+
+        device = subject.device.simulated("how sensors move is known in simulation only")
+        found = change(device, self.gestures)
+        text = f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"
+        return Measured(
+            {}, text, lambda title, path: [write(f"# {title}\n\n{text}\n", path.with_suffix(".md"))]
+        )
+
+
+class Embeddings(Probing):
+    """What an SVM reads in graph embeddings, in readings, and in the encoder of a run, if one is given."""
+
+    def __call__(self, subject: Subject) -> Measured:
+        from rich.console import Console
+        from rich.progress import track
+
+        from experiments.studies import embedding_spaces as page
+        from experiments.studies.embedding.probe import probe
+        from skin.balance import announce
+
+        device, learner = subject.device, subject.finished.learner if subject.finished else None
+        announce(device)
+        count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
+        steps = probe(device, self, learner)
+        found = list(track(steps, "probing", count, console=Console(stderr=True)))
+        names = device.task.names
+        return Measured({}, page.text(found, names), partial(page.publish, found, names))

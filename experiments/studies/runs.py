@@ -1,0 +1,143 @@
+"""The runs that a study is about: those that it trains, and finished ones."""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.singleton import Singleton
+from mlflow.entities import Run
+from omegaconf import DictConfig
+
+from experiments.studies.ensemble import combine
+from experiments.studies.study import Study, Variant, given, sweeps, variants, words
+from skin.commands import train
+from skin.config import checked, fingerprint
+from skin.errors import InputError
+from skin.reload import find
+from skin.run import simulator
+from skin.tracking import Store
+
+__all__ = ["Planned", "finished", "known", "multirun", "trained"]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A run of a study.
+
+    Attributes:
+        variant: that it is of.
+        seed: of the training.
+        run: the newest that finished; None where none did: it failed, was killed, or never started.
+    """
+
+    variant: Variant
+    seed: str
+    run: Run | None
+
+
+def trained(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]]:
+    """Train what a study lacks, and return where its runs are, and all of them."""
+    every = variants(study, smoke)
+    store = Store.open(next(iter(every[0].configs.values())).tracking)
+    if study.train and any(one.run is None for one in _look(store, every)):
+        for _, line in sweeps(study, smoke):
+            multirun(line)
+    planned = _look(store, every)
+    return store, planned + _ensembles(study, store, planned)
+
+
+def known(study: Study, config: DictConfig, store: Store) -> list[Planned]:
+    """Return finished runs: the one that is named, or the newest ones of rows on the simulator of ``config``.
+
+    Runs of a row whose names differ in more than the seed are different variants.
+
+    Raises:
+        InputError: there is none, or a row that is named has none.
+    """
+    if study.rows is None:
+        assert study.run is not None
+        run = find(store, study.run)
+        return [Planned(Variant(_name(run), {}, {}), run.data.tags.get("seed", ""), run)]
+    found: dict[tuple[str, str], Planned] = {}
+    data = simulator(config)
+    for run in store.find("FINISHED", simulator=data):
+        row = run.data.tags["row"]
+        if "learned" in run.data.tags and (study.rows == "all" or row in study.rows):
+            one = Planned(Variant(_name(run), {"row": row}, {}), run.data.tags["seed"], run)
+            found.setdefault((one.variant.name, one.seed), one)
+    rows = {one.variant.chosen["row"] for one in found.values()}
+    wanted = [study.rows] if isinstance(study.rows, str) else list(study.rows)
+    missing = [row for row in wanted if row not in (*rows, "all")] or ([] if rows else ["features"])
+    if missing:
+        raise InputError(
+            f"no finished run of {', '.join(missing)} on {data} data in {store.uri}: "
+            f"skin train experiment={missing[0]} simulator={data} makes one"
+        )
+    return [found[key] for key in sorted(found)]
+
+
+def finished(store: Store, config: DictConfig, **further: str) -> Run | None:
+    """Return the newest finished run of a configuration."""
+    return next(iter(store.find("FINISHED", fingerprint=fingerprint(config), **further)), None)
+
+
+def multirun(line: Sequence[str]) -> None:
+    """Train what a line of overrides sweeps, as ``skin train -m`` does; failed runs are told and left out."""
+    sources = HydraConfig.get().runtime.config_sources
+    folder = [one.path for one in sources if one.provider == "command-line"]  # of --config-dir
+    with _another_command():
+        try:
+            train.main(["-m", *(["--config-dir", *folder] if folder else []), *line])
+        except SystemExit as stop:
+            if isinstance(stop.code, int) and stop.code > 128:  # a signal: train nothing more
+                raise
+
+
+@contextmanager
+def _another_command() -> Iterator[None]:
+    """Let Hydra run a command inside of one."""
+    state, shown = Singleton.get_state(), os.environ.pop("HYDRA_FULL_ERROR", None)
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        Singleton.set_state(state)
+        if shown is not None:
+            os.environ["HYDRA_FULL_ERROR"] = shown
+
+
+def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
+    return [
+        Planned(variant, seed, finished(store, config))
+        for variant in every
+        for seed, config in variant.configs.items()
+    ]
+
+
+def _ensembles(study: Study, store: Store, members: Sequence[Planned]) -> list[Planned]:
+    """Let the finished runs of each seed decide together, in each way that the study names."""
+    suffix = "" if study.rows is None else "_of_" + "_".join(study.rows)
+    ways = {way: Variant(way, {"row": way}, {}) for way in study.ensembles}
+    planned = []
+    for seed in dict.fromkeys(one.seed for one in members) if ways else ():
+        for way, variant in ways.items():
+            line = [*words(study.common), *given(), f"seed={seed}", f"row={way}{suffix}"]
+            variant.configs[seed] = checked(compose("train", line))
+        present = {
+            one.variant.name: (one.variant.configs[seed], one.run)
+            for one in members
+            if one.seed == seed and one.run is not None
+        }
+        runs = combine(store, present, {way: variant.configs[seed] for way, variant in ways.items()})
+        planned += [Planned(ways[way], seed, run) for way, run in runs.items()]
+    return planned
+
+
+def _name(run: Run) -> str:
+    """Return the name of a run without its seed."""
+    return re.sub(r"( seed)? \d+$", "", run.info.run_name)

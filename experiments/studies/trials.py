@@ -1,0 +1,134 @@
+"""Trials: what a study measures of its runs, under each condition, on each device; kept in MLflow."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hydra import compose
+from mlflow.artifacts import download_artifacts
+from mlflow.entities import Run
+from omegaconf import DictConfig
+
+from experiments.studies.measures import Accuracy, Finished, Measure, Subject
+from experiments.studies.runs import Planned
+from experiments.studies.study import Study, Variant, given, words
+from skin.build import build_data, build_device, build_learner
+from skin.config import checked, fingerprint
+from skin.learner.base import AbstractLearner
+from skin.reload import TAG, changed, configuration, restore
+from skin.tracking import Store
+
+__all__ = ["Trial", "trials"]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What was measured of one run under one condition on one device.
+
+    Attributes:
+        variant: of the run.
+        seed: of its training.
+        condition: name; empty where the study has none.
+        device: its number; empty: the run's own.
+        run: id of the run; empty where none finished.
+        metrics: name -> value.
+        line: for a person; empty where there is only a table.
+        files: of the measure.
+    """
+
+    variant: Variant
+    seed: str
+    condition: str
+    device: str
+    run: str
+    metrics: Mapping[str, float]
+    line: str = ""
+    files: Sequence[Path] = ()
+
+
+def trials(store: Store, planned: Planned, study: Study, config: DictConfig, folder: Path) -> Iterator[Trial]:
+    """Yield what a study measures of a run; what was measured before is read from MLflow.
+
+    Args:
+        store: where the run is, and where what is measured is logged beside it.
+        planned: the run.
+        study: what to measure.
+        config: of the command.
+        folder: for the files of a measure.
+    """
+    if planned.run is None:
+        yield Trial(planned.variant, planned.seed, "", "", "", {})
+        return
+    own = planned.run.data.metrics if planned.variant.configs else {}
+    if study.measure is None and not study.conditions:
+        yield Trial(planned.variant, planned.seed, "", "", planned.run.info.run_id, own)
+        return
+    subject = _Run(store, planned.run, config)
+    for condition, settings in (study.conditions or {"": {}}).items():
+        for number in range(1, study.devices + 1) or ("",):
+            numbered = dict.fromkeys(study.numbered, number) if study.devices else {}
+            line = words({**study.test, **settings, **numbered})
+            base, line = (given(), line) if planned.variant.configs else ([], [*line, *given()])
+            found = subject.measured(study, base, line)
+            files = _fetched(store, found, folder)
+            metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
+            at = planned.variant, planned.seed, condition, str(number), planned.run.info.run_id
+            yield Trial(*at, metrics, said, files)
+
+
+class _Run:
+    """A finished run, brought back at most once."""
+
+    def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
+        self.store, self.run, self.config = store, run, config
+
+    @cached_property
+    def stored(self) -> DictConfig:
+        return configuration(self.store, self.run, self.config.trust)
+
+    @cached_property
+    def learner(self) -> AbstractLearner:
+        own = checked(self.stored)
+        learner = build_learner(own)
+        restore(self.store, self.run, learner, build_data(own, build_device(own)))
+        return learner
+
+    def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
+        """Return the run of MLflow that holds what a study measures on the device that overrides change."""
+        own = changed(self.stored, compose("train", [*base, *line]), line)
+        what = study.measure or Accuracy()
+        asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]
+        key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
+        tags = {"evaluated": self.run.info.run_id, "study": key}
+        known = self.store.find("FINISHED", **tags) if self.config.tracking.resume else []
+        if not known:
+            known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags)]
+        return known[0]
+
+    def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str]) -> Run:
+        """Measure, and log it beside the run."""
+        subject = Subject(own, build_device(own), Finished(self.store, self.run, self.stored, self.learner))
+        with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
+            found = what(subject)
+            self.store.log_metrics(logged, found.metrics)
+            self.store.client.set_tag(logged.info.run_id, "outcome", found.line)
+            if found.publish is not None:
+                stem = f"{type(what).__name__.lower()}_{own.row}_{logged.info.run_id[:8]}"
+                title = f"{self.run.info.run_name}, run {self.run.info.run_id[:8]}"
+                found.publish(title, Path(made) / stem)
+                self.store.client.log_artifacts(logged.info.run_id, made)
+        return self.store.client.get_run(logged.info.run_id)
+
+
+def _fetched(store: Store, run: Run, folder: Path) -> list[Path]:
+    """Copy the files of a measure to a folder and return their paths there."""
+    if not store.client.list_artifacts(run.info.run_id):
+        return []
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=folder) as holder:
+        fetched = download_artifacts(run_id=run.info.run_id, dst_path=holder, tracking_uri=store.uri)
+        return [path.replace(folder / path.name) for path in sorted(Path(fetched).iterdir())]

@@ -1,0 +1,31 @@
+"""A stream of frames that can be watched, with the tare that says what its values mean."""
+
+from dataclasses import dataclass
+
+from skin.wire.conversion import newtons
+from skin.wire.skin import Skin
+from skin.wire.tare import Tare
+
+__all__ = ["Source"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where frames come from.
+
+    Attributes:
+        name: of it, for a person.
+        skin: open.
+        tare: finds out what its values mean.
+    """
+
+    name: str
+    skin: Skin
+    tare: Tare
+
+    @classmethod
+    def of_newtons(cls, name: str, skin: Skin, sensors: int) -> "Source":
+        """Return one whose values are N already, of so many sensors."""
+        # No baseline is taken: a run that learned from such values expects their offsets.
+        meaning = newtons(sensors, None, 1.0, None, None)
+        return cls(name, skin, Tare(lambda baseline, header: meaning, 0.0, 1.0))

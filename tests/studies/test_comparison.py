@@ -1,0 +1,77 @@
+"""Verdicts follow from intervals over paired seeds."""
+
+import math
+
+import pytest
+from scipy.stats import ttest_rel
+
+from experiments.studies.comparison import Paired, conclude, paired, verdict
+
+
+def test_a_paired_difference_is_that_of_the_paired_t_test():
+    one, other = {"0": 71.0, "1": 74.5, "2": 70.2, "3": 79.0}, {"0": 70.0, "1": 71.0, "2": 70.4, "3": 75.0}
+    found = paired(one, other)
+    assert found.mean / found.error == pytest.approx(ttest_rel([*one.values()], [*other.values()]).statistic)
+    assert (found.mean, found.seeds) == (pytest.approx(2.075), 4)
+
+
+def test_only_common_seeds_count():
+    found = paired({"0": 3.0, "1": 5.0, "7": 99.0}, {"1": 4.0, "0": 1.0, "8": 0.0})
+    # differences 2 and 1: mean 1.5, deviation 1 / sqrt 2, by sqrt 2
+    assert found == Paired(1.5, pytest.approx(0.5), 2)
+
+
+def test_a_ratio_is_taken_seed_by_seed():
+    found = paired({"0": 8.0, "1": 30.0}, {"0": 2.0, "1": 5.0}, ratio=True)
+    assert found == Paired(5.0, pytest.approx(1.0), 2)
+
+
+def test_one_seed_has_no_known_error_and_none_no_difference():
+    assert paired({"0": 2.0}, {"0": 1.0}) == Paired(1.0, math.inf, 1)
+    assert paired({"0": 2.0}, {"1": 1.0}) is None
+
+
+@pytest.mark.parametrize(
+    ("claim", "by", "mean", "error", "said"),
+    [
+        ("greater", 0, 2.1, 1.0, "agree"),
+        ("greater", 0, 1.9, 1.0, "undecided"),
+        ("greater", 0, -1.9, 1.0, "undecided"),
+        ("greater", 0, -2.1, 1.0, "disagree"),
+        ("less", 0, -2.1, 1.0, "agree"),
+        ("less", 0, 2.1, 1.0, "disagree"),
+        ("alike", 2, 0.9, 0.5, "agree"),
+        ("alike", 2, 1.1, 0.5, "undecided"),
+        ("alike", 2, -3.1, 0.5, "disagree"),
+        ("no better", 1, -9.0, 1.0, "agree"),
+        ("no better", 1, 0.5, 0.2, "agree"),
+        ("no better", 1, 0.5, 0.3, "undecided"),
+        ("no better", 1, 1.5, 0.2, "disagree"),
+        ("about", 3, 2.0, 0.2, "agree"),
+        ("about", 3, 7.0, 0.2, "disagree"),
+        ("ratio", 10, 12.0, 1.0, "agree"),
+        ("ratio", 10, 5.5, 0.5, "undecided"),
+        ("ratio", 10, 4.0, 0.2, "disagree"),
+        ("ratio", 10, 21.0, 0.2, "disagree"),
+    ],
+)
+def test_a_verdict_needs_two_standard_errors_of_room(claim, by, mean, error, said):
+    assert verdict(claim, Paired(mean, error, 3), by) == said
+
+
+def test_two_seeds_decide_nothing():
+    assert verdict("greater", Paired(50.0, 0.1, 2)) == "undecided"
+    assert verdict("greater", None) == "undecided"
+
+
+@pytest.mark.parametrize(
+    ("each", "whole"),
+    [
+        (["agree", "agree"], "agree"),
+        (["agree", "undecided"], "undecided"),
+        (["agree", "disagree"], "disagree"),
+        ([], "undecided"),
+    ],
+)
+def test_a_statement_about_several_holds_against_each(each, whole):
+    assert conclude(each) == whole

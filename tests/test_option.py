@@ -1,0 +1,17 @@
+"""The name of an option, asked of its class, its factory or of what it has made."""
+
+from functools import partial
+
+import pytest
+
+from skin.device._blank import Blank
+from skin.option import option
+from skin.simulator.fem import PlatesAndBeams
+
+
+@pytest.mark.parametrize(
+    ("made", "name"),
+    [(PlatesAndBeams, "fem"), (Blank(None, (1.0, 1.0), None), "_blank"), (partial, "functools")],
+)
+def test_an_option_is_named_after_its_module(made, name):
+    assert option(made) == name

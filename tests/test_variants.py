@@ -39,7 +39,9 @@ def test_each_variant_has_its_metrics_and_its_row(tmp_path):
     parent = store.create("parent", {})
     log(store, parent, ["model.norm"], {("layer",): runs[:2], ("[8]",): runs[2:]})
     place = "model.norm layer"
-    assert store.client.get_run(parent.info.run_id).data.metrics == {
+    found = store.client.get_run(parent.info.run_id).data
+    assert "variants.json" in found.tags["mlflow.loggedArtifacts"]  # by which the UI shows a table
+    assert found.metrics == {
         f"n/{place}": 2,
         f"mean/same/overall/accuracy/{place}": 0.625,
         f"sd/same/overall/accuracy/{place}": pytest.approx(0.125 * 2**0.5),

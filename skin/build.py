@@ -1,6 +1,5 @@
 """Build the objects that a configuration names, group by group."""
 
-from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from hydra.utils import instantiate
@@ -8,10 +7,9 @@ from omegaconf import DictConfig
 
 from skin.config import plain
 from skin.device.base import AbstractDevice
-from skin.errors import InputError
 from skin.learner.base import AbstractLearner
 from skin.plausible import check, warn_of_surface
-from skin.settings import check_groups
+from skin.settings import check_groups, configured
 
 if TYPE_CHECKING:
     from skin.datamodule import TouchData
@@ -39,11 +37,7 @@ def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
     from skin.signal.augmentation import Augmentation
 
     groups = plain(config)
-    try:
-        augmentation = Augmentation(**groups["data"]["augment"])
-    except TypeError as error:
-        known = ", ".join(entry.name for entry in fields(Augmentation))
-        raise InputError(f"data.augment takes {known}: {error}") from error
+    augmentation = configured(Augmentation, groups["data"]["augment"], "data.augment")
     check_groups({"representation": groups["representation"]})
     representation = instantiate(groups["representation"])
     return TouchData(device, representation, config.data.batch_size, config.seed, augmentation)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 
 import pytorch_lightning as pl
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from skin.classifier import Batch
@@ -12,6 +13,7 @@ from skin.errors import InputError
 from skin.labels import Task
 from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation
+from skin.settings import checked
 from skin.signal.augmentation import Augmentation
 
 __all__ = ["MakeRepresentation", "TouchData"]
@@ -19,6 +21,7 @@ __all__ = ["MakeRepresentation", "TouchData"]
 MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
 
 
+@checked("data")
 class TouchData(pl.LightningDataModule):
     """Cuts a device's touches into batches and shows them as a representation does.
 
@@ -43,13 +46,11 @@ class TouchData(pl.LightningDataModule):
         self,
         device: AbstractDevice,
         representation: MakeRepresentation,
-        batch_size: int = 64,
+        batch_size: PositiveInt = 64,
         seed: int = 0,
         augmentation: Augmentation | None = None,
     ) -> None:
         super().__init__()
-        if batch_size < 1:
-            raise InputError(f"a batch needs at least one gesture, got {batch_size}: set data.batch_size=64")
         if augmentation is not None and augmentation.reverse and device.task.direction:
             raise InputError(
                 "a touch that runs backwards slides the other way: set data.augment.reverse=false where "
@@ -97,10 +98,9 @@ class TouchData(pl.LightningDataModule):
 
     def frames(self, touches: Touches) -> Batch:
         """Return the frames of touches and their labels (B, L), on the touches' device."""
-        if touches.labels is None:
-            raise InputError("touches without labels cannot be learnt from: record them with labels")
+        labels = touches.known_labels
         representation = self.representation_for(touches.positions.cpu()).to(touches.readings.device)
-        return representation.show(touches), touches.labels
+        return representation.show(touches), labels
 
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""

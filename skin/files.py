@@ -9,7 +9,7 @@ from tempfile import NamedTemporaryFile
 
 from skin.errors import InputError
 
-__all__ = ["results", "unwritable", "whole", "write"]
+__all__ = ["results", "tabular", "unwritable", "whole", "write"]
 
 
 def results(out: str | None) -> Path:
@@ -17,9 +17,27 @@ def results(out: str | None) -> Path:
     return Path("results" if out is None else out).expanduser()
 
 
+def tabular(path: str | Path, what: str) -> Path:
+    """Return the path of a table.
+
+    Args:
+        path: as a person gave it.
+        what: is in it, the subject of the sentence.
+
+    Raises:
+        InputError: another ending than .parquet or .csv.
+    """
+    path = Path(path).expanduser()
+    if path.suffix not in (".parquet", ".csv"):
+        raise InputError(f"{what} is a .parquet or .csv file, got {path.name}")
+    return path
+
+
 @contextmanager
 def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
     """Give a temporary path beside ``path``, with its ending, that takes its place if the block ends well.
+
+    It has reached the disk then, so that a power cut leaves the old file or the new one.
 
     Folders that are missing are made.
 
@@ -38,6 +56,8 @@ def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
             partial = Path(file.name)
         try:
             yield partial
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
             partial.chmod(0o644)
             partial.replace(path)
         finally:

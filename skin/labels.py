@@ -1,12 +1,13 @@
 """Labels of a touch, and how they follow from its pressure movie."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
+from annotated_types import Gt, Lt, MinLen
 from torch import Tensor
 
-from skin.errors import InputError
+from skin.settings import ONCE, checked
 
 __all__ = [
     "OPPOSITE",
@@ -41,7 +42,7 @@ class Task:
         ValueError: a gate that is no label, or a gate or a direction beside labels that are not binary.
     """
 
-    names: tuple[str, ...]
+    names: Annotated[tuple[str, ...], MinLen(1), ONCE]
     kind: Literal["binary", "exclusive"] = "binary"
     gate: str | None = None
     direction: bool = False
@@ -114,6 +115,7 @@ OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "s
 """Label -> what a touch is without it."""
 
 
+@checked("touch.thresholds")
 @dataclass(frozen=True)
 class Thresholds:
     """Where the report draws its lines (section 2.1.1).
@@ -127,20 +129,11 @@ class Thresholds:
         travel: a touch is dynamic if its centre of pressure moves further than this from where it began, m.
     """
 
-    area: float = 0.30
+    area: Annotated[float, Gt(0), Lt(1)] = 0.30
     frames: int = 3
     pressure: float = 90.5e3
-    contact: float = 0.02
+    contact: Annotated[float, Gt(0), Lt(1)] = 0.02
     travel: float = 1e-3
-
-    def __post_init__(self) -> None:
-        for name in ("area", "contact"):
-            share = getattr(self, name)
-            if not 0 < share < 1:
-                raise InputError(
-                    f"thresholds.{name} is a share between 0 and 1, got {share}: "
-                    f"use touch.thresholds.{name}={getattr(Thresholds, name)}"
-                )
 
 
 class Measures(NamedTuple):

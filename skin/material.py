@@ -1,15 +1,22 @@
 """Silicones in SI units, each number with its source."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Gt, Lt
+from pydantic import PositiveFloat
 
 from skin.errors import InputError
+from skin.settings import checked, configured
 
 __all__ = ["MATERIALS", "Material", "Relaxation"]
 
 
+Ratio = Annotated[float, Gt(-1), Lt(1)]
+
+
+@checked("relaxation")
 @dataclass(frozen=True)
 class Relaxation:
     """How stress relaxes under a strain that is held: E(t) = E (1 + strength exp(-t / time)).
@@ -24,20 +31,11 @@ class Relaxation:
         InputError: a time or a strength that is not a positive number.
     """
 
-    time: float
-    strength: float
-
-    def __post_init__(self) -> None:
-        for key in ("time", "strength"):
-            value = getattr(self, key)
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or value <= 0:
-                raise InputError(
-                    f"a material's relaxation.{key} must be a number above 0, got {value!r}: as in "
-                    "relaxation: {time: 0.5, strength: 0.3}, in s and as a share of young"
-                )
+    time: PositiveFloat
+    strength: PositiveFloat
 
 
+@checked("material")
 @dataclass(frozen=True)
 class Material:
     """A linear elastic material, which may relax.
@@ -54,24 +52,9 @@ class Material:
     """
 
     name: str
-    young: float
-    poisson: float
+    young: PositiveFloat
+    poisson: Ratio
     relaxation: Relaxation | None = None
-
-    def __post_init__(self) -> None:
-        for key, unit in (("young", " in Pa"), ("poisson", "")):
-            value = getattr(self, key)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise InputError(f"material {self.name}: {key} must be a number{unit}, got {value!r}")
-        if self.young <= 0:
-            raise InputError(
-                f"material {self.name}: young must be above 0 Pa, got {self.young:g}; EcoFlex 00-30 has 170e3"
-            )
-        if not -1 < self.poisson < 1:
-            raise InputError(
-                f"material {self.name}: Poisson's ratio must lie between -1 and 1 (a plate's stiffness is "
-                f"E / (1 - nu^2)), got {self.poisson:g}; silicones have about 0.49"
-            )
 
     @property
     def shear(self) -> float:
@@ -102,24 +85,7 @@ class Material:
         """
         if isinstance(given, Material):
             return given
-        constants = {"name": given} if isinstance(given, str) else given
-        if not isinstance(constants, Mapping) or "name" not in constants:
-            raise InputError(f"a material is a name or {{name, young, poisson}}, got {given!r}; {_known()}")
-        if unknown := set(constants) - {"name", "young", "poisson", "relaxation"}:
-            raise InputError(
-                f"material {constants['name']}: unknown key {', '.join(sorted(map(str, unknown)))}; "
-                "a material has name, young (Pa), poisson and relaxation"
-            )
-        name = str(constants["name"])
-        known = _BY_KEY.get(_key(name))
-        young: Any = constants.get("young")
-        poisson: Any = constants.get("poisson")
-        if known is not None:
-            young = known.young if young is None else young
-            poisson = known.poisson if poisson is None else poisson
-        if young is None or poisson is None:
-            raise InputError(_missing(name, young, poisson))
-        return cls(known.name if known else name, young, poisson, _relaxation(constants.get("relaxation")))
+        return configured(_material, {"name": given} if isinstance(given, str) else given, "material")
 
 
 MATERIALS = (
@@ -141,19 +107,24 @@ def _key(name: str) -> str:
 _BY_KEY = {_key(material.name): material for material in MATERIALS}
 
 
-def _relaxation(given: Any) -> Relaxation | None:
-    if given is None:
-        return None
-    if not isinstance(given, Mapping) or set(given) != {"time", "strength"}:
-        raise InputError(f"a material's relaxation is {{time (s), strength}}, got {given!r}")
-    return Relaxation(given["time"], given["strength"])
+def _material(
+    name: str, young: PositiveFloat | None = None, poisson: Ratio | None = None, relaxation: Any = None
+) -> Material:
+    known = _BY_KEY.get(_key(name))
+    if known is not None:
+        name, young, poisson = known.name, young or known.young, known.poisson if poisson is None else poisson
+    if young is None or poisson is None:
+        raise InputError(_missing(name, young, poisson))
+    if relaxation is not None:
+        relaxation = configured(Relaxation, relaxation, f"material {name}.relaxation")
+    return Material(name, young, poisson, relaxation)
 
 
 def _known() -> str:
     return "known materials: " + ", ".join(material.name for material in MATERIALS)
 
 
-def _missing(name: str, young: Any, poisson: Any) -> str:
+def _missing(name: str, young: float | None, poisson: float | None) -> str:
     need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
     mend = f"give {need}, as in {{name: {name}, young: 100e3, poisson: 0.49}}"
     if _key(name) == "ecoflexgel":

@@ -4,11 +4,11 @@ Classes take any value that has a meaning, however large a sheet or stiff a laye
 configuration describes a skin that somebody could hold, and 12 in place of 0.012 m is a mistake there.
 """
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from skin.body._given import positive
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.sensors import Sensors
@@ -76,11 +76,15 @@ def _within(name: str, group: Any, ranges: Mapping[str, Any]) -> None:
         low, high, unit = within
         for value in given if isinstance(given, list) else [given]:
             # What is no number, or not above 0, the classes refuse with a sentence of their own.
-            if positive(value) and not low <= value <= high:
+            if _positive(value) and not low <= value <= high:
                 raise InputError(
                     f"{name}.{key}={value:g} {unit} is not plausible: it is given in {unit}, from {low:g} to "
                     f"{high:g} {unit}; was another unit meant?"
                 )
+
+
+def _positive(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
 
 
 def warn_of_surface(body: AbstractBody, sensors: Sensors) -> None:

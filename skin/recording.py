@@ -2,12 +2,13 @@
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from skin.errors import InputError
 from skin.labels import Task
 
 __all__ = ["Recording", "Touches", "digest", "join"]
@@ -41,22 +42,16 @@ class Touches:
     saturated: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if self.readings.ndim != 3 or self.valid.shape != self.readings.shape:
-            raise ValueError(
-                f"readings and valid must both be (B, T, S), got {tuple(self.readings.shape)} "
-                f"and {tuple(self.valid.shape)}"
-            )
+        if self.readings.ndim != 3:
+            raise ValueError(f"readings must be (B, T, S), got {tuple(self.readings.shape)}")
         if self.valid.dtype != torch.bool:
             raise ValueError(f"valid must be bool, got {self.valid.dtype}")
         batch, time, sensors = self.readings.shape
-        if tuple(self.positions.shape) not in {(sensors, 3), (batch, time, sensors, 3)}:
-            raise ValueError(
-                f"positions must be (S, 3) or (B, T, S, 3), S = {sensors}, got {tuple(self.positions.shape)}"
-            )
-        if self.motion is not None and tuple(self.motion.shape) != (batch, time, sensors, 3):
-            raise ValueError(f"motion must be (B, T, S, 3), S = {sensors}, got {tuple(self.motion.shape)}")
-        if self.saturated is not None and self.saturated.shape != self.readings.shape:
-            raise ValueError(f"saturated must be (B, T, S), got {tuple(self.saturated.shape)}")
+        each, moving = (batch, time, sensors), (batch, time, sensors, 3)
+        _expect(self.valid, "valid", each)
+        _expect(self.positions, "positions", (sensors, 3), moving)
+        _expect(self.motion, "motion", moving)
+        _expect(self.saturated, "saturated", each)
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
             raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
@@ -75,11 +70,21 @@ class Touches:
             None if self.saturated is None else self.saturated[index],
         )
 
+    @property
+    def known_labels(self) -> Tensor:
+        """The labels, (B, L).
+
+        Raises:
+            InputError: nobody knows them.
+        """
+        if self.labels is None:
+            raise InputError("touches without labels cannot be learnt from: record them with labels")
+        return self.labels
+
     def to(self, device: torch.device | str) -> "Touches":
         """Return these touches with every tensor on ``device``."""
-        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         moved: dict[str, Any] = {
-            name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
         }
         return replace(self, **moved)
 
@@ -115,15 +120,11 @@ class Recording:
         shape = tuple(self.touches.readings.shape)
         if self.touches.positions.ndim != 2:
             raise ValueError("a recording has one layout: positions must be (S, 3)")
-        if self.force is not None and tuple(self.force.shape) != shape[:2]:
-            raise ValueError(f"force must be (B, T) = {shape[:2]}, got {tuple(self.force.shape)}")
-        if self.displacement is not None and tuple(self.displacement.shape) != (*shape, 2):
-            raise ValueError(f"displacement must be (B, T, S, 2), got {tuple(self.displacement.shape)}")
+        _expect(self.force, "force", shape[:2])
+        _expect(self.displacement, "displacement", (*shape, 2))
+        _expect(self.touches.labels, "labels", (shape[0], len(self.task)))
         for name, values in self.parameters.items():
-            if tuple(values.shape) != shape[:1]:
-                raise ValueError(f"parameter {name} must be (B,) = {shape[:1]}, got {tuple(values.shape)}")
-        if self.touches.labels is not None and self.touches.labels.shape[1] != len(self.task):
-            raise ValueError(f"labels must be (B, {len(self.task)}), got {tuple(self.touches.labels.shape)}")
+            _expect(values, f"parameter {name}", shape[:1])
 
     def __len__(self) -> int:
         return len(self.touches)
@@ -137,6 +138,12 @@ class Recording:
             displacement=None if self.displacement is None else self.displacement[index],
             parameters={name: values[index] for name, values in self.parameters.items()},
         )
+
+
+def _expect(values: Tensor | None, name: str, *shapes: tuple[int, ...]) -> None:
+    """Raise a ValueError where a tensor, if there is one, has none of some shapes."""
+    if values is not None and tuple(values.shape) not in shapes:
+        raise ValueError(f"{name} must be {' or '.join(map(str, shapes))}, got {tuple(values.shape)}")
 
 
 def join(parts: Sequence[Recording]) -> Recording:

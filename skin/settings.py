@@ -1,58 +1,125 @@
 """Check settings against the annotated parameters of what they configure (docs/adr/0016).
 
 Types are checked for every parameter that has one, ranges where it is ``Annotated``, as in
-``rounds: Annotated[int, Ge(1)]``. Numbers must be finite.
+``rounds: Annotated[int, Ge(1)]`` or pydantic's ``PositiveInt``. Numbers must be finite.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache, wraps
 from inspect import Parameter, signature
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
 from skin.errors import InputError
 from skin.trust import resolved
 
-__all__ = ["check", "check_groups"]
+__all__ = ["ONCE", "RISING", "check", "check_groups", "checked", "configured"]
+
+_Made = TypeVar("_Made")
 
 _LIBRARIES = ("torch.", "torch_geometric.")  # which check their own settings
 _FINITE = ConfigDict(allow_inf_nan=False)
 _INNER = {"contact", "fusion", "model", "simulator"}
-_SCALARS = {int, float, bool, str, Path, NoneType, Ellipsis}
+_SCALARS = {int, float, bool, str, dict, Path, NoneType, Ellipsis}
 _COLLECTIONS = {Union, UnionType, Sequence, Mapping, list, tuple, dict}
+_LONG = 80  # characters of a value, in a message
+_FEW = "has too few entries"
+_LENGTHS = {"missing": _FEW, "too_short": _FEW, "too_long": "has too many entries"}
 
 
-def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str) -> None:
+def _rising(given: tuple[Any, Any]) -> tuple[Any, Any]:
+    if given[0] > given[1]:
+        raise ValueError("must be a range [least, most]")
+    return given
+
+
+def _once(given: Sequence[str]) -> Sequence[str]:
+    if len(set(given)) < len(given):
+        raise ValueError("must hold each name once")
+    return given
+
+
+RISING = AfterValidator(_rising)
+"""Makes a pair a range: ``Annotated[tuple[float, float], RISING]``."""
+ONCE = AfterValidator(_once)
+"""Makes a list one of different names."""
+
+
+def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, whole: bool = False) -> None:
     """Refuse settings that a class or function does not have, or does not take.
 
     Args:
         target: what they configure.
         settings: in plain containers; keys that begin with ``_`` are Hydra's.
         name: where they stand in the configuration, for the message.
+        whole: whether they are all that the target is given; if not, the program gives what has no default.
 
     Raises:
         InputError: naming the setting, its value and what is valid.
     """
+    if not isinstance(settings, Mapping):
+        raise InputError(f"{name} must be settings by name, got {settings!r}")
     parameters = signature(target).parameters
     hints = _hints(target)
+    required = [key for key, its in parameters.items() if its.default is its.empty]
     for key, value in settings.items():
         if key.startswith("_"):
             continue
         if key not in parameters:
             if any(one.kind == Parameter.VAR_KEYWORD for one in parameters.values()):
                 continue
-            # What has no default is given by the program.
-            known = [
-                one for one, its in parameters.items() if its.default is not its.empty or one in settings
-            ]
+            known = [one for one in parameters if whole or one not in required or one in settings]
             near = get_close_matches(key, known, 1)
             meant = f": did you mean {near[0]}?" if near else ":"
             raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(known)}")
-        if key in hints and _plain(hints[key]):
-            _fits(hints[key], value, f"{name}.{key}")
+        if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
+            default = _written(parameters[key].default)
+            example = f": as in {name}.{key}={default}" if default else ""
+            shown = str(list(value) if isinstance(value, tuple) else value)
+            shown = shown if len(shown) <= _LONG else f"{shown[:_LONG]}..."
+            raise InputError(f"{name}.{key}={shown} {wrong}{example}")
+    if whole and (missing := [key for key in required if key not in settings]):
+        raise InputError(f"{name} needs {' and '.join(missing)}, got {', '.join(settings) or 'nothing'}")
+
+
+def configured(target: Callable[..., _Made], settings: Mapping[str, Any], name: str) -> _Made:
+    """Return what a class or function makes of settings that were checked.
+
+    Args:
+        target: what they configure; it takes nothing else.
+        settings: in plain containers.
+        name: as in :func:`check`.
+
+    Raises:
+        InputError: as :func:`check`, and where a setting is missing.
+    """
+    check(target, settings, name, whole=True)
+    return target(**settings)
+
+
+def checked(name: str) -> Callable[[type[_Made]], type[_Made]]:
+    """Let a class check its arguments, so that a script is refused what a configuration is refused.
+
+    Args:
+        name: as in :func:`check`.
+    """
+
+    def decorate(made: type[_Made]) -> type[_Made]:
+        init, expected = made.__init__, signature(made)  # type: ignore[misc]
+
+        @wraps(init)
+        def checking(self: Any, *args: Any, **kwargs: Any) -> None:
+            check(made, expected.bind(*args, **kwargs).arguments, name)
+            init(self, *args, **kwargs)
+
+        made.__init__ = checking  # type: ignore[method-assign]
+        return made
+
+    return decorate
 
 
 def check_groups(config: Mapping[str, Any]) -> None:
@@ -106,14 +173,41 @@ def _plain(hint: Any) -> bool:
     return origin is Literal or (origin in _COLLECTIONS and all(map(_plain, arguments)))
 
 
-def _fits(hint: Any, value: Any, name: str) -> None:
+@cache
+def _adapter(hint: Any) -> TypeAdapter:
+    return TypeAdapter(hint, config=_FINITE)
+
+
+def _refusal(hint: Any, value: Any) -> str:
+    """Return what is wrong with a value, and what is valid; empty if it fits."""
     try:
-        taken = TypeAdapter(hint, config=_FINITE).validate_python(value)
+        taken = _adapter(hint).validate_python(value)
     except ValidationError as error:
-        # Of a union, what is said of its first member.
-        said = error.errors()[0]["msg"].replace("Input should be", "must be")
+        # Of a union, what is said of the member that the value came closest to.
+        nearest = max(error.errors(), key=lambda one: len(one["loc"]))
+        said = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
         said = said.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
-        said = said.replace("a valid tuple", "a list")
-        raise InputError(f"{name}={value} {said[0].lower()}{said[1:]}") from error
-    if isinstance(value, str) and not isinstance(taken, str | Path):
-        raise InputError(f"{name}={value} is text, and must be a number")
+        said = _LENGTHS.get(nearest["type"], said.replace("a valid tuple", "a list"))
+        return said[0].lower() + said[1:]
+    for given, number in _changed(value, taken):
+        if isinstance(given, str):
+            return "is text, and must be a number"
+        return f"must be a {'whole ' * isinstance(number, int)}number"
+    return ""
+
+
+def _changed(value: Any, taken: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield what pydantic has converted to another type, which would reach the class unconverted."""
+    if isinstance(value, list | tuple):
+        for pair in zip(value, taken, strict=True):
+            yield from _changed(*pair)
+    for kind in (bool, str, float):
+        if isinstance(value, kind) and not isinstance(taken, kind | Path):
+            yield value, taken
+
+
+def _written(default: Any) -> str:
+    """Return a default as an override has it; empty if it is no example."""
+    if isinstance(default, list | tuple) and default:
+        return f"[{','.join(map(_written, default))}]"
+    return str(default) if isinstance(default, int | float | str) and not isinstance(default, bool) else ""

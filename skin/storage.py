@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from skin import files
-from skin.description import check, check_rows
+from skin.description import check_rows, task_of
 from skin.errors import InputError
-from skin.files import whole
+from skin.files import tabular, whole
 from skin.labels import Task
 from skin.recording import Recording, Touches
 
@@ -44,8 +44,7 @@ def write(recording: Recording, path: str | Path) -> Path:
     Raises:
         InputError: another ending, or a folder that cannot be written.
     """
-    path = Path(path)
-    _check_suffix(path)
+    path = tabular(path, "a recording")
     table, about = _table(recording), _describe(recording)
     if path.suffix == ".parquet":
         with whole(path) as partial:
@@ -66,26 +65,20 @@ def read(path: str | Path) -> Recording:
     Raises:
         InputError: no such file, not a recording, damaged, or rows that are not whole touches.
     """
-    path = Path(path).expanduser()
-    _check_suffix(path)
+    path = tabular(path, "a recording")
     if not path.is_file():
         raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
     try:
         about = _read_about(path)
         if isinstance(about, dict) and about.get("format") != FORMAT:
-            raise InputError(f"{path} has format {about.get('format')}, this version reads format {FORMAT}")
-        check(about, str(path))
-        return _recording(_read_table(path, about), about, path)
+            raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
+        task = task_of(about, str(path))
+        return _recording(_read_table(path, about), about, task)
     except InputError:
         raise
     except (OSError, pa.ArrowException, ValueError, KeyError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
-
-
-def _check_suffix(path: Path) -> None:
-    if path.suffix not in (".parquet", ".csv"):
-        raise InputError(f"a recording is a .parquet or .csv file, got {path.name}: as in out=x.parquet")
 
 
 def _sidecar(path: Path) -> Path:
@@ -170,14 +163,14 @@ def _read_about(path: Path) -> dict[str, Any]:
     if path.suffix == ".csv":
         sidecar = _sidecar(path)
         if not sidecar.is_file():
-            raise InputError(f"{path} needs {sidecar.name} beside it: units, layout and rate are there")
+            raise ValueError(f"it needs {sidecar.name} beside it: units, layout and rate are there")
         return json.loads(sidecar.read_text(encoding="utf-8"))
     stored = pa.parquet.read_schema(path).metadata or {}
     if b"skin" not in stored:
-        raise InputError(f"{path} is no recording: its schema has no units, layout and rate under 'skin'")
+        raise ValueError("its schema has no units, layout and rate under 'skin'")
     # Older files have no checksum.
     if stored.get(b"skin_sha256", _sha256(stored[b"skin"]).encode()) != _sha256(stored[b"skin"]).encode():
-        raise InputError(f"{path} is damaged: its units, layout and rate are not those that were written")
+        raise ValueError("its units, layout and rate are not those that were written")
     return json.loads(stored[b"skin"])
 
 
@@ -193,15 +186,15 @@ def _read_table(path: Path, about: dict[str, Any]) -> pa.Table:
         return file.read(columns=list(columns)).cast(pa.schema(columns.items()))
 
 
-def _recording(table: pa.Table, about: dict[str, Any], path: Path) -> Recording:
+def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     if about["units"] != UNITS:
-        raise InputError(f"{path} has the units {about['units']}, needed are {UNITS}: convert it before")
+        raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
     batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
     rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
     whole = np.stack([np.repeat(np.arange(batch), time), np.tile(np.arange(time), batch)], axis=1)
     if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
-        raise InputError(
-            f"{path}, row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
+        raise ValueError(
+            f"row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
             f"{whole[wrong[0]].tolist()}: every touch needs its {time} frames in order"
         )
 
@@ -211,7 +204,6 @@ def _recording(table: pa.Table, about: dict[str, Any], path: Path) -> Recording:
     def columns(name: str) -> Tensor:
         return torch.stack([column(one) for one in _numbered(name, sensors)], dim=-1)
 
-    task = Task(**about["task"] | {"names": tuple(about["task"]["names"])})
     present = [table[name].is_valid().to_numpy() for name in _numbered("reading", sensors)]
     touches = Touches(
         columns("reading"),

@@ -10,10 +10,12 @@ from skin.config import CONF, ROOT
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
 errors interrupt paths option
-refusal identity labels rng material model lag sensors trust
+trust
+settings
+refusal identity labels rng material model lag sensors
 config recording body
 command
-files foreign description layout summary plausible settings
+files foreign description layout summary plausible
 storage touch tracking
 simulator
 contact

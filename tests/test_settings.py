@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live.settings import Settings
-from skin.settings import check, check_groups
+from skin.settings import RISING, check, check_groups, checked, configured
 
 
 class Thing:
@@ -24,6 +24,7 @@ class Thing:
         name: str = "",
         on: bool = False,
         copies: Mapping[str, int] | None = None,
+        span: Annotated[tuple[float, float], RISING] = (1, 10),
     ) -> None:
         pass
 
@@ -50,6 +51,16 @@ def test_what_fits_is_taken():
         ({"widths": 8}, "thing.widths=8 must be a list"),
         ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a valid integer"),
         ({"name": 1}, "thing.name=1 must be a valid string"),
+        ({"count": 2.0}, "thing.count=2.0 must be a whole number"),
+        ({"count": True}, "thing.count=True must be a whole number"),
+        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] is text, and must be a number"),
+        ({"share": -1j}, "thing.share=.*: as in thing.share=0.5$"),
+        (
+            {"span": [2, 1]},
+            r"thing.span=\[2, 1\] must be a range .*: as in thing.span=\[1,10\]$",
+        ),
+        ({"span": [2]}, r"thing.span=\[2\] has too few entries"),
+        ({"span": [1, 2, 3]}, r"thing.span=\[1, 2, 3\] has too many entries"),
         ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
         ({"zzz": 1}, "thing has no setting zzz: it has count"),
     ],
@@ -77,6 +88,27 @@ def test_classes_of_others_are_checked_too(part, said):
 
 def test_classes_of_libraries_check_themselves():
     check_groups({"learner": {"optimizer": {"_target_": "torch.optim.Adam", "no": "such setting"}}})
+
+
+def test_settings_that_are_all_are_missed_by_name():
+    with pytest.raises(InputError, match=r"^thing needs made, got count$"):
+        configured(Thing, {"count": 1}, "thing")
+    with pytest.raises(InputError, match=r"^thing has no setting mad: did you mean made"):
+        configured(Thing, {"mad": 1}, "thing")
+
+
+def test_a_checked_class_refuses_what_a_script_gives_it():
+    @checked("pair")
+    class Pair:
+        def __init__(self, first: Annotated[int, Ge(1)], second: float = 0.5) -> None:
+            self.sum = first + second
+
+    assert Pair(1, second=2).sum == 3
+    for given in ({"first": 0}, {"first": 1.5}, {"first": 1, "second": "x"}):
+        with pytest.raises(InputError, match=r"^pair[.]"):
+            Pair(**given)
+    with pytest.raises(TypeError, match="third"):
+        Pair(1, third=2)
 
 
 SMALL = ["simulator=naive", "data.gestures=20"]
@@ -117,8 +149,8 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         ([*SERIAL, "device.scale=abc"], "device.scale=abc must be a valid number"),
         ([*SERIAL, "device.tare=inf"], "device.tare=inf must be a finite number"),
         ([*SERIAL, "device.limits=[a,b]"], "device.limits=.* must be a valid number"),
-        ([*SERIAL, "device.limits=[1023,0]"], r"device.limits must be \[smallest, largest\]"),
-        ([*SERIAL, "device.limits=[1]"], r"device.limits must be \[smallest, largest\]"),
+        ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
+        ([*SERIAL, "device.limits=[1]"], r"device.limits=\[1\] has too few entries"),
     ],
 )
 def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides, said):

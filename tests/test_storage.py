@@ -126,13 +126,13 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
 def test_files_that_are_no_recordings_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"no recording .*x.parquet: skin generate"):
         read(tmp_path / "x.parquet")
-    with pytest.raises(InputError, match=r"\.parquet or \.csv file, got x.txt"):
+    with pytest.raises(InputError, match=r"a recording is a \.parquet or \.csv file, got x.txt"):
         write(recording(), tmp_path / "x.txt")
     (tmp_path / "y.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match=r"y.csv needs y.csv.json beside it"):
+    with pytest.raises(InputError, match=r"y.csv is damaged or no recording .*: it needs y.csv.json"):
         read(tmp_path / "y.csv")
     pa.parquet.write_table(pa.table({"a": [1]}), tmp_path / "z.parquet")
-    with pytest.raises(InputError, match=r"z.parquet is no recording"):
+    with pytest.raises(InputError, match=r"z.parquet is damaged or no recording .* its schema has no units"):
         read(tmp_path / "z.parquet")
     path = write(recording(), tmp_path / "cut.parquet")
     path.write_bytes(path.read_bytes()[:-100])
@@ -267,5 +267,5 @@ def test_a_gesture_without_frames_is_refused(tmp_path, name):
     about = json.loads((tmp_path / "x.csv.json").read_text())
     (tmp_path / "x.csv.json").write_text(json.dumps(about | {name: 0}))
     path.write_text(path.read_text().splitlines()[0] + "\n")
-    with pytest.raises(InputError, match=f"{name} must be a whole number of at least 1, got 0"):
+    with pytest.raises(InputError, match=f"x.csv: description.{name}=0 must be greater than or equal to 1"):
         read(path)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.nn import DenseGCNConv, GCNConv, aggr
 
-from skin.model._pooling import POOLINGS
+from skin.model._pooling import POOLINGS, Pooling, Set2Set
 from skin.model.gcn import _Convolution
 from skin.representation.graph import adjacency, neighbours, normalised
 
@@ -62,12 +62,13 @@ def convolutions(first: int, second: int, graphs: int) -> tuple[Task, dict[str, 
     }
 
 
-def poolings(name: str, width: int, graphs: int) -> tuple[Task, dict[str, Task]]:
+def poolings(name: Pooling, width: int, graphs: int) -> tuple[Task, dict[str, Task]]:
     """Return skin's pooling of nodes (S, N, width), and PyTorch Geometric's with the same weights."""
     ours = POOLINGS[name](width)
-    if name == "set2set":
-        theirs: nn.Module = aggr.Set2Set(width, processing_steps=3)
-        theirs.lstm.load_state_dict({f"{key}_l0": value for key, value in ours.lstm.state_dict().items()})
+    if isinstance(ours, Set2Set):
+        whole = aggr.Set2Set(width, processing_steps=3)
+        whole.lstm.load_state_dict({f"{key}_l0": value for key, value in ours.lstm.state_dict().items()})
+        theirs: nn.Module = whole
     elif name == "attention":
         theirs = aggr.AttentionalAggregation(ours.gate)
     else:

@@ -4,28 +4,9 @@ import math
 
 import numpy as np
 
-from skin.errors import InputError
 from skin.rng import Stream, generator
 
-__all__ = ["along", "check_variation", "factors"]
-
-
-def check_variation(variation: float, seed: int) -> None:
-    """Refuse a variation or a seed from which nothing can be drawn.
-
-    Raises:
-        InputError: a variation that is no number from 0 up, or a seed that is no whole number from 0 up.
-    """
-    number = isinstance(variation, int | float) and not isinstance(variation, bool)
-    if not number or not math.isfinite(variation) or variation < 0:
-        raise InputError(
-            f"body.variation must be a share of Young's modulus of at least 0, got {variation!r}: "
-            "as in body.variation=0.2"
-        )
-    if type(seed) is not int or seed < 0:
-        raise InputError(
-            f"body.variation_seed must be a whole number from 0 up, got {seed!r}: as in body.variation_seed=0"
-        )
+__all__ = ["along", "factors"]
 
 
 def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
@@ -34,8 +15,7 @@ def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
     Without variation they are 1 to the last bit.
     """
     spread = math.sqrt(math.log1p(variation**2))
-    drawn = generator(Stream.MODULUS, seed).standard_normal(shape)
-    values = np.exp(spread * drawn - spread**2 / 2)
+    values = np.exp(spread * generator(Stream.MODULUS, seed).standard_normal(shape) - spread**2 / 2)
     values.setflags(write=False)
     return values
 

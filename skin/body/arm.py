@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Gt, Lt
+from pydantic import PositiveFloat
 
-from skin.body._given import positive
 from skin.body.base import AbstractBody
 from skin.errors import InputError
+from skin.settings import checked
 
 __all__ = ["Arm"]
 
 
+@checked("body")
 @dataclass(frozen=True)
 class Arm(AbstractBody):
     """Layers glued around a hard core, over a part of its circumference: a sheet rolled up (docs/adr/0010).
@@ -24,7 +27,7 @@ class Arm(AbstractBody):
     Attributes:
         radius: of the outer surface, m.
         length: of the sleeve along the arm, m.
-        angle: that the sleeve covers, rad.
+        angle: that the sleeve covers, rad; less than a full turn: a closed sleeve has no edge.
         size: (radius * angle, length), m.
         cells, layers, variation, variation_seed: as in :class:`skin.body.base.AbstractBody`; layers from the
             core outwards.
@@ -35,24 +38,13 @@ class Arm(AbstractBody):
     """
 
     size: tuple[float, float] = field(init=False)
-    radius: float = field(kw_only=True)
-    length: float = field(kw_only=True)
-    angle: float = field(kw_only=True)
+    radius: PositiveFloat = field(kw_only=True)
+    length: PositiveFloat = field(kw_only=True)
+    angle: Annotated[float, Gt(0), Lt(2 * math.pi)] = field(kw_only=True)
 
     flat: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        for name, example in (("radius", "0.05"), ("length", "0.16"), ("angle", "3.2")):
-            if not positive(value := getattr(self, name)):
-                unit = "an angle in rad" if name == "angle" else "a length in m"
-                raise InputError(
-                    f"body.{name} must be {unit} above 0, got {value!r}: as in body.{name}={example}"
-                )
-        if self.angle >= 2 * math.pi:
-            raise InputError(
-                f"body.angle={self.angle:g} rad is a full turn: a sleeve that closes has no edge, and "
-                "its chart would tear neighbours apart: give less than 6.283, as in body.angle=6.2"
-            )
         object.__setattr__(self, "size", (self.radius * self.angle, self.length))
         super().__post_init__()
         if self.thickness >= self.radius:

@@ -2,15 +2,20 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from annotated_types import Ge
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
-from skin.body._given import Layer, cells_of, layers_of, size_of
 from skin.body._memory import require_memory
-from skin.body._variation import along, check_variation, factors
+from skin.body._variation import along, factors
+from skin.errors import InputError
+from skin.material import Material
+from skin.settings import checked, configured
 
 if TYPE_CHECKING:
     from skin.sensors import Sensors
@@ -19,6 +24,20 @@ __all__ = ["AbstractBody", "Layer", "overlaps"]
 
 # What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
 _BYTES_PER_CELL = 25 * 8 + 30 * 4
+
+
+@checked("body.layers")
+@dataclass(frozen=True)
+class Layer:
+    """One layer of a body.
+
+    Attributes:
+        material: what it is made of.
+        thickness: m.
+    """
+
+    material: Material
+    thickness: PositiveFloat
 
 
 @dataclass(frozen=True)
@@ -47,19 +66,18 @@ class AbstractBody(ABC):
             unknown material, a variation below 0, or more cells than memory allows.
     """
 
-    size: tuple[float, float]
-    cells: tuple[int, int]
+    size: tuple[PositiveFloat, PositiveFloat]
+    cells: tuple[Annotated[int, Ge(2)], Annotated[int, Ge(2)]]
     layers: tuple[Layer, ...]
-    variation: float = 0.0
-    variation_seed: int = 0
+    variation: NonNegativeFloat = 0.0
+    variation_seed: NonNegativeInt = 0
 
     flat: ClassVar[bool]
 
     def __post_init__(self) -> None:
-        check_variation(self.variation, self.variation_seed)
-        object.__setattr__(self, "size", size_of(self.size))
-        object.__setattr__(self, "cells", cells_of(self.cells))
-        object.__setattr__(self, "layers", layers_of(self.layers))
+        object.__setattr__(self, "size", tuple(map(float, self.size)))
+        object.__setattr__(self, "cells", tuple(self.cells))
+        object.__setattr__(self, "layers", _layers(self.layers))
         require_memory(
             _BYTES_PER_CELL * math.prod(self.cells),
             f"body.cells=[{self.cells[0]},{self.cells[1]}]",
@@ -173,3 +191,24 @@ def overlaps(edges: np.ndarray, centres: np.ndarray, extent: float) -> np.ndarra
     """
     low, high = (centres[:, None] + side * extent / 2 for side in (-1, 1))
     return np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0, None)
+
+
+def _layers(given: Sequence[Layer | Mapping[str, Any]]) -> tuple[Layer, ...]:
+    """Return the layers from the table up.
+
+    Raises:
+        InputError: no layer, or one that cannot be used.
+    """
+    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
+        raise InputError(
+            f"body.layers must list at least one layer from the table up, got {given}: "
+            "as in body.layers=[{material: EcoFlex 00-30, thickness: 0.005}]"
+        )
+    return tuple(
+        one if isinstance(one, Layer) else configured(_layer, one, f"body.layers.{number}")
+        for number, one in enumerate(given)
+    )
+
+
+def _layer(material: Any, thickness: PositiveFloat) -> Layer:
+    return Layer(Material.of(material), float(thickness))

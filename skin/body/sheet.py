@@ -6,10 +6,12 @@ from typing import ClassVar
 import numpy as np
 
 from skin.body.base import AbstractBody
+from skin.settings import checked
 
 __all__ = ["Sheet"]
 
 
+@checked("body")
 @dataclass(frozen=True)
 class Sheet(AbstractBody):
     """A rectangular sheet of layers, glued to a table: its chart is the sheet itself, seen from above.

@@ -52,10 +52,6 @@ def main(config: DictConfig) -> None:
             f"It does not help, so {config.out} was not written: is the layout, the body or the clock wrong?"
         )
         sys.exit(1)
-    about_all = {
-        **calibration.about,
-        **about(outcome),
-        "session": config.session,
-        "presses_file": config.presses,
-    }
-    print(write(replace(calibration, about=about_all), config.out))
+    known = {**calibration.about, **about(outcome)}
+    known |= {"session": config.session, "presses_file": config.presses}
+    print(write(replace(calibration, about=known), config.out))

@@ -26,9 +26,11 @@ def main(config: DictConfig) -> None:
     from skin.hardware.emulator.emulator import Emulator, Settings
     from skin.hardware.emulator.faults import Faults
     from skin.hardware.emulator.outlet import outlet
+    from skin.settings import configured
 
     groups = plain(config)
-    settings, faults = Settings.of(groups["emulate"]), Faults.of(groups["faults"])
+    settings = configured(Settings, groups["emulate"], "emulate")
+    faults = configured(Faults, groups["faults"], "faults")
     device = build_device(config).simulated("only simulated gestures can be emulated")
     signal.signal(signal.SIGTERM, _leave)
     port = outlet(config.port, config.link)

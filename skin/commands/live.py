@@ -24,6 +24,13 @@ def main(config: DictConfig) -> None:
     from skin.hardware.live.settings import Settings
 
     live = Settings.of(plain(config)["live"])
+
+    import torch
+
+    from skin.console import quiet
+
+    quiet()
+    torch.set_num_threads(config.tracking.threads or 1)
     try:
         _watch(config, live)
     except KeyboardInterrupt:
@@ -31,11 +38,9 @@ def main(config: DictConfig) -> None:
 
 
 def _watch(config: DictConfig, live: "Settings") -> None:
-    import torch
     from rich.console import Console
 
     from skin.build import build_device
-    from skin.console import quiet
     from skin.hardware.live import start, terminal, web
     from skin.hardware.live.board import Board, Facts
     from skin.hardware.live.loop import Session
@@ -43,8 +48,6 @@ def _watch(config: DictConfig, live: "Settings") -> None:
     from skin.tracking import Store, ends_on_signal
     from skin.trained import trained
 
-    quiet()
-    torch.set_num_threads(config.tracking.threads or 1)
     store, said = Store.open(config.tracking), Console(stderr=True)
     run = find(store, config.run)
     stored, given = configuration(store, run, config.trust), overrides()

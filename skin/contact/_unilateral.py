@@ -107,9 +107,8 @@ class _State:
     def __init__(
         self, compliance: Tensor, gap: Tensor, total: Tensor, start: Tensor | None, rest: float
     ) -> None:
-        self.compliance = compliance
-        self.rest = rest  # share of the largest deflection
-        self.total = total
+        # The rest is a share of the largest deflection.
+        self.compliance, self.rest, self.total = compliance, rest, total
         self.allowed = gap.isfinite()
         self.gap = gap.where(self.allowed, 0)
         even = self.allowed.to(gap)

@@ -1,9 +1,11 @@
 """Rigid objects: the picture is their height, and contact mechanics gives the pressure."""
 
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
 import torch
+from annotated_types import Ge
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from skin.body.base import AbstractBody
@@ -11,7 +13,7 @@ from skin.contact._force import Found, seek
 from skin.contact._grain import with_grain
 from skin.contact._unilateral import Equilibrium, solve
 from skin.contact.base import AbstractContact
-from skin.errors import InputError
+from skin.settings import checked
 from skin.simulator.base import AbstractSimulator
 from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
@@ -19,6 +21,7 @@ __all__ = ["Rigid"]
 
 
 @final
+@checked("contact")
 class Rigid(AbstractContact):
     """A rigid object, its picture a map of heights, is pressed into the skin, without friction.
 
@@ -55,19 +58,11 @@ class Rigid(AbstractContact):
         self,
         body: AbstractBody,
         simulator: AbstractSimulator,
-        relief: float = 0.004,
-        fillet: float = 0.005,
-        tolerance: float = 1e-4,
-        iterations: int = 200,
+        relief: NonNegativeFloat = 0.004,
+        fillet: NonNegativeFloat = 0.005,
+        tolerance: Annotated[float, Ge(1e-5)] = 1e-4,  # what single precision resolves
+        iterations: PositiveInt = 200,
     ) -> None:
-        for name, value, least in (
-            ("relief", relief, 0.0),
-            ("fillet", fillet, 0.0),
-            ("tolerance", tolerance, 1e-5),  # what single precision resolves
-            ("iterations", iterations, 1),
-        ):
-            if not least <= value < np.inf:
-                raise InputError(f"contact.{name} must be at least {least:g}, got {value}")
         self.relief, self.fillet = relief, fillet
         self.tolerance, self.iterations = tolerance, iterations
         self.compliance = with_grain(simulator.compliance().detach().cpu().double(), body).float()

@@ -19,10 +19,10 @@ from skin.recording import Recording, Touches
 from skin.signal.calibration import read
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
+from skin.wire.announcement import Tap
 from skin.wire.conversion import Newtons, newtons
 from skin.wire.detect import Format
 from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.listener import Tap
 from skin.wire.open import Settings, open_skin
 from skin.wire.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
 from skin.wire.skin import Skin

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from annotated_types import Ge, Gt
+from pydantic import PositiveFloat, PositiveInt
 
-from skin.errors import InputError
-from skin.settings import check
+from skin.settings import RISING, checked
 
 __all__ = ["Course"]
 
 
+@checked("measure")
 @dataclass(frozen=True)
 class Course:
     """The stream on which alarms are counted, and what else is tried.
@@ -23,15 +23,10 @@ class Course:
         windows: lengths of window on which the learner is tried, frames.
 
     Raises:
-        InputError: no stream, or no range.
+        InputError: a value that cannot be used.
     """
 
-    hours: Annotated[float, Gt(0)] = 1.0
-    gap: tuple[Annotated[int, Ge(1)], Annotated[int, Ge(1)]] = (50, 1150)
-    stride: Annotated[int, Ge(1)] = 1
-    windows: Sequence[Annotated[int, Ge(1)]] = (20, 30, 60)
-
-    def __post_init__(self) -> None:
-        check(Course, vars(self), "measure")
-        if self.gap[0] > self.gap[1]:
-            raise InputError(f"measure.gap must be [least, most] frames, got {list(self.gap)}")
+    hours: PositiveFloat = 1.0
+    gap: Annotated[tuple[PositiveInt, PositiveInt], RISING] = (50, 1150)
+    stride: PositiveInt = 1
+    windows: Sequence[PositiveInt] = (20, 30, 60)

@@ -108,9 +108,7 @@ def slide(
     device = device.simulated(f"streams are simulated, {type(device).__name__} has none")
     # One device feels the whole stream, and its baseline is known as after a tare.
     streamed = device.replace(stream=True, randomise=False)
-    known, idle = streamed.touches("validation"), streamed.idle
-    assert known.labels is not None
-    threshold = Threshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
+    threshold = _tuned(streamed)
     all_gates = gates(threshold, device.task)
     recording = streamed.recording("test")
     touches, labels = recording.touches, recording.touches.labels
@@ -127,6 +125,13 @@ def slide(
         device.stream,
         point,
     )
+
+
+def _tuned(device: AbstractSimulated) -> Threshold:
+    """Return the threshold that tells touched windows from idle ones, tuned on the validation split."""
+    known, idle = device.touches("validation"), device.idle
+    assert known.labels is not None
+    return Threshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
 
 
 def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:

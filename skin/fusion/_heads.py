@@ -1,37 +1,17 @@
 """How a sequence of embeddings becomes one."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from skin.model._attention import encoder
+from skin.model._pooling import Reduced
 
-__all__ = ["HEADS"]
+__all__ = ["HEADS", "Head"]
 
-
-class Mean(nn.Module):
-    """The mean over time."""
-
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (B, E) of x (B, T, E)."""
-        return x.mean(dim=1)
-
-
-class Max(nn.Module):
-    """The maximum over time."""
-
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (B, E) of x (B, T, E)."""
-        return x.amax(dim=1)
+Head = Literal["mean", "max", "conv", "lstm", "gru", "attention+gru", "residual", "transformer"]
 
 
 class Convolution(nn.Module):
@@ -125,9 +105,9 @@ class Residual(nn.Module):
         return torch.cat([states.amax(dim=-1), states.mean(dim=-1)], dim=1)
 
 
-HEADS: dict[str, Callable[[int, int], nn.Module]] = {
-    "mean": Mean,
-    "max": Max,
+HEADS: dict[Head, Callable[[int, int], nn.Module]] = {
+    "mean": lambda width, hidden: Reduced(width, torch.mean, 1),
+    "max": lambda width, hidden: Reduced(width, torch.amax, 1),
     "conv": Convolution,
     "lstm": lambda width, hidden: Recurrent(nn.LSTM(width, hidden, batch_first=True)),
     "gru": lambda width, hidden: Recurrent(nn.GRU(width, hidden, batch_first=True)),

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from torch import Tensor, nn
 
+from skin.errors import InputError
 from skin.model.base import AbstractModel, Kind
 from skin.representation.base import Frames
 
@@ -29,6 +30,17 @@ class AbstractFusion(nn.Module, ABC):
     """
 
     width: int
+
+    @staticmethod
+    def common(adjacency: Tensor | None) -> Tensor | None:
+        """Return the graph of all frames, (S, S), if there is one.
+
+        Raises:
+            InputError: every frame has its own.
+        """
+        if adjacency is not None and adjacency.ndim > 2:
+            raise InputError("one graph per frame needs fusion=late, or representation.positions=layout")
+        return adjacency
 
     @abstractmethod
     def forward(self, frames: Frames) -> Tensor:

@@ -34,13 +34,11 @@ class Early(AbstractFusion):
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the embeddings (B, E) of windows of the length that was built for."""
-        x, adjacency = frames.x, frames.adjacency
+        x, adjacency = frames.x, self.common(frames.adjacency)
         if x.shape[1] != self.window:
             raise InputError(
                 f"fusion=early is made for windows of {self.window} frames, got {x.shape[1]}: "
                 "train with fusion=late, which takes any length"
             )
-        if adjacency is not None and adjacency.ndim > 2:
-            raise InputError("fusion=early needs one graph for all frames: use fusion=late")
         stacked = x.transpose(1, 2).flatten(2) if self.kind == "graph" else x.flatten(1, 2)
         return self.model(stacked, adjacency)

@@ -2,17 +2,19 @@
 
 from collections.abc import Sequence
 
+from pydantic import PositiveInt
 from torch import Tensor
 
-from skin.errors import InputError
-from skin.fusion._heads import HEADS
+from skin.fusion._heads import HEADS, Head
 from skin.fusion.base import AbstractFusion, MakeModel
 from skin.model.base import Kind
 from skin.representation.base import Frames
+from skin.settings import checked
 
 __all__ = ["Late"]
 
 
+@checked("fusion")
 class Late(AbstractFusion):
     """Encodes every frame with the same weights and folds the embeddings (report, sections 3.2.4 and 3.2.5).
 
@@ -36,14 +38,10 @@ class Late(AbstractFusion):
         kind: Kind,
         shape: Sequence[int],
         window: int,
-        head: str = "gru",
-        hidden: int = 64,
+        head: Head = "gru",
+        hidden: PositiveInt = 64,
     ) -> None:
         super().__init__()
-        if head not in HEADS:
-            raise InputError(f"unknown head {head!r}: set fusion.head to one of {', '.join(HEADS)}")
-        if hidden < 1:
-            raise InputError(f"a head is at least 1 wide, got {hidden}: set e.g. fusion.hidden=64")
         self.model = model(kind, shape)
         self.head = HEADS[head](self.model.width, hidden)
         self.width = int(self.head.width)  # type: ignore[arg-type]
@@ -53,5 +51,4 @@ class Late(AbstractFusion):
         x, adjacency = frames.x, frames.adjacency
         if adjacency is not None and adjacency.ndim > 2:
             adjacency = adjacency.flatten(0, 1)
-        embeddings = self.model(x.flatten(0, 1), adjacency)
-        return self.head(embeddings.unflatten(0, x.shape[:2]))
+        return self.head(self.model(x.flatten(0, 1), adjacency).unflatten(0, x.shape[:2]))

@@ -60,7 +60,7 @@ class Linked(AbstractFusion):
 
     def forward(self, frames: Frames) -> Tensor:
         """Return the embeddings (B, E) of windows of any length."""
-        x, adjacency = frames.x, frames.adjacency
-        if adjacency is None or adjacency.ndim > 2:
-            raise InputError("fusion=linked needs one graph for all frames: use fusion=late")
+        x, adjacency = frames.x, self.common(frames.adjacency)
+        if adjacency is None:
+            raise ValueError("fusion=linked needs a graph, got frames without")
         return self.model(x.flatten(1, 2), link(adjacency, x.shape[1]))

@@ -1,22 +1,37 @@
-"""Places of a regular grid."""
+"""Sensors on a regular grid: their places, and which way they face."""
+
+import math
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
 
-from skin.errors import InputError
+__all__ = ["Tilt", "grid", "rosette"]
 
-__all__ = ["grid"]
+Tilt = Annotated[float, Ge(0), Lt(math.pi / 2)]
+"""Angle between the normals of a sensor and of the surface, rad."""
+
+_WAYS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 def grid(rows: int, columns: int) -> np.ndarray:
-    """Return the centres (S, 2) of rows x columns equal tiles of the unit square, row by row.
-
-    Raises:
-        InputError: fewer than one row or column.
-    """
-    for name, number in (("rows", rows), ("columns", columns)):
-        if type(number) is not int or number < 1:
-            raise InputError(
-                f"layout.{name} must be a whole number of at least 1, got {number}: as in layout.{name}=5"
-            )
+    """Return the centres (S, 2) of rows x columns equal tiles of the unit square, row by row."""
     y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     return np.column_stack([x.ravel(), y.ravel()])
+
+
+def rosette(rows: int, columns: int, tilt: float) -> np.ndarray:
+    """Return the normals (S, 3) of a grid's sensors, row by row, tilted along +x, +y, -x and -y in turn.
+
+    Each row begins two ways after the one above, so that a sensor's eight neighbours all lean another way
+    than it does, and any two by two of them lean all four: shear along any direction is felt everywhere.
+
+    Args:
+        rows: number of rows (along y).
+        columns: number of columns (along x).
+        tilt: angle between the sensors' normals and the surface's, rad, from 0 to below pi / 2.
+    """
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    lean = math.sin(tilt) * _WAYS[(column + 2 * row) % 4]
+    # Without a tilt, -0.0 would be another key to stored operators than 0.0.
+    return np.column_stack([lean + 0.0, np.full(len(lean), math.cos(tilt))])

@@ -1,11 +1,21 @@
-"""The interface of a sensor layout."""
+"""The interface of a sensor layout, and the check that sensors fit where it puts them."""
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+from pydantic import PositiveFloat
+
 from skin.body.base import AbstractBody
+from skin.errors import InputError
 from skin.sensors import Sensors
 
-__all__ = ["AbstractLayout"]
+__all__ = ["AbstractLayout", "Footprint", "place"]
+
+Footprint = tuple[PositiveFloat, PositiveFloat]
+"""Extent (x, y) over which a sensor feels, m."""
+
+# Two sensors closer than this in the plane are at one place, m.
+_APART = 1e-6
 
 
 class AbstractLayout(ABC):
@@ -18,3 +28,55 @@ class AbstractLayout(ABC):
         Raises:
             InputError: a sensor lies outside the body, or two lie at one place.
         """
+
+
+def place(
+    body: AbstractBody,
+    x: np.ndarray,
+    y: np.ndarray,
+    depth: np.ndarray | float | None,
+    footprint: Footprint,
+    normals: np.ndarray | None = None,
+) -> Sensors:
+    """Return sensors at x and y, each (S,), m, and depth, of each or of all; None: ``body.sensor_depth``.
+
+    Their normals (S, 3), unit vectors, are those of the surface if none are given.
+
+    Raises:
+        InputError: a depth that is no number, a sensor outside
+            the body or deeper than it, or two sensors at one place in the plane, whatever their depths:
+            images and graphs are flat.
+    """
+    depths = np.asarray(body.sensor_depth if depth is None else depth)
+    if depths.dtype.kind not in "if":
+        raise InputError(f"layout.depth must be a length in m or null, got {depth!r}: as in 0.004")
+    positions = np.column_stack([x, y, np.broadcast_to(depths, x.shape)])
+    _inside(body, positions)
+    _apart(positions)
+    extent = float(footprint[0]), float(footprint[1])
+    return Sensors(positions, extent) if normals is None else Sensors(positions, extent, normals)
+
+
+def _inside(body: AbstractBody, positions: np.ndarray) -> None:
+    extent = np.array([*body.size, body.thickness])
+    outside = ((positions < 0) | (positions > extent + 1e-9)).any(axis=1)
+    if outside.any():
+        number = int(outside.argmax())
+        x, y, depth = positions[number]
+        raise InputError(
+            f"{outside.sum()} of {len(positions)} sensors lie outside the body; the first is "
+            f"sensor {number + 1} at x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a surface of "
+            f"{extent[0]:g} x {extent[1]:g} m, {extent[2]:g} m thick: positions are in metres from the "
+            "upper left corner; mend the layout, give a larger body or take layout=grid"
+        )
+
+
+def _apart(positions: np.ndarray) -> None:
+    distance = np.linalg.norm(positions[:, None, :2] - positions[None, :, :2], axis=-1)
+    first, second = np.nonzero(np.triu(distance < _APART, k=1))
+    if len(first):
+        x, y, _ = positions[first[0]]
+        raise InputError(
+            f"sensors {first[0] + 1} and {second[0] + 1} are at one place, x = {x:g} m, y = {y:g} m: "
+            "move one or take it out of the layout"
+        )

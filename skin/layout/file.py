@@ -2,17 +2,16 @@
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.layout._place import place
-from skin.layout.base import AbstractLayout
+from skin.layout.base import AbstractLayout, Footprint, place
 from skin.paths import candidates
 from skin.sensors import Sensors
+from skin.settings import checked
 
 __all__ = ["File"]
 
@@ -24,6 +23,7 @@ _FACING = ("normal_x", "normal_y", "normal_z")
 _PLACE = ("x_m", "y_m", "depth_m")
 
 
+@checked("layout")
 class File(AbstractLayout):
     """Sensors of a CSV file with the columns ``x_m``, ``y_m`` and optionally ``depth_m``, all m.
 
@@ -42,13 +42,10 @@ class File(AbstractLayout):
             without a length, with its line.
     """
 
-    def __init__(
-        self, path: str, footprint: Sequence[float] = (0.01, 0.01), depth: float | None = None
-    ) -> None:
+    def __init__(self, path: str, footprint: Footprint = (0.01, 0.01), depth: float | None = None) -> None:
         self.path = _find(path)
         self.places = _read(self.path)
-        self.footprint = footprint
-        self.depth = depth
+        self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""
@@ -78,39 +75,33 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         # utf-8-sig, because spreadsheets write a byte order mark.
         with path.open(encoding="utf-8-sig", newline="") as lines:
             reader = csv.DictReader(lines, skipinitialspace=True)
-            names = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = names
+            reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
             needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
             if missing := needed - set(names):
                 found = ", ".join(names) or "nothing"
-                raise InputError(f"{path}: no column {' and '.join(sorted(missing))}, found {found}; {_NEED}")
+                raise ValueError(f"no column {' and '.join(sorted(missing))}, found {found}")
             columns = [name for name in names if name in _PLACE + _FACING]
-            rows = list(_rows(path, reader, columns))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+            rows = [_numbers(reader.line_num, row, columns) for row in reader]
+            if not rows:
+                raise ValueError("no sensor below the header")
+    except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"cannot read the layout {path}: {error}; {_NEED}") from error
-    if not rows:
-        raise InputError(f"{path}: no sensor below the header; {_NEED}")
     return dict(zip(columns, np.array(rows).T, strict=True))
 
 
-def _rows(path: Path, reader: csv.DictReader, columns: list[str]) -> Iterator[list[float]]:
-    for row in reader:
-        numbers = []
-        for name in columns:
-            try:
-                number = float(row[name] or "")
-            except ValueError:
-                number = math.nan
-            if not math.isfinite(number):
-                unit = " in m" if name in _PLACE else ""
-                raise InputError(
-                    f"{path}, line {reader.line_num}: {name} must be a number{unit}, got {row[name]!r}"
-                )
-            numbers.append(number)
-        facing = [number for name, number in zip(columns, numbers, strict=True) if name in _FACING]
-        if facing and not any(facing):
-            raise InputError(
-                f"{path}, line {reader.line_num}: a normal of length 0 faces nowhere: as in "
-                "normal_x,normal_y,normal_z = 0,0,1, which faces the surface"
-            )
-        yield numbers
+def _numbers(line: int, row: dict[str, str], columns: list[str]) -> list[float]:
+    """Return the numbers of a row, or raise a ValueError that says what is wrong."""
+    numbers = []
+    for name in columns:
+        try:
+            number = float(row[name] or "")
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            unit = " in m" if name in _PLACE else ""
+            raise ValueError(f"line {line}: {name} must be a number{unit}, got {row[name]!r}")
+        numbers.append(number)
+    facing = [number for name, number in zip(columns, numbers, strict=True) if name in _FACING]
+    if facing and not any(facing):
+        raise ValueError(f"line {line}: a normal of length 0 faces nowhere: 0,0,1 faces the surface")
+    return numbers

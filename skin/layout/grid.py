@@ -1,19 +1,18 @@
 """Sensors on a regular grid."""
 
-from collections.abc import Sequence
-
 import numpy as np
+from pydantic import PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.layout._facing import rosette
-from skin.layout._grid import grid
-from skin.layout._place import place
-from skin.layout.base import AbstractLayout
+from skin.layout._grid import Tilt, grid, rosette
+from skin.layout.base import AbstractLayout, Footprint, place
 from skin.sensors import Sensors
+from skin.settings import checked
 
 __all__ = ["Grid"]
 
 
+@checked("layout")
 class Grid(AbstractLayout):
     """Sensors in the middle of equal tiles of the body's surface.
 
@@ -31,16 +30,15 @@ class Grid(AbstractLayout):
 
     def __init__(
         self,
-        rows: int = 5,
-        columns: int = 5,
-        footprint: Sequence[float] = (0.01, 0.01),
-        tilt: float = 0.0,
+        rows: PositiveInt = 5,
+        columns: PositiveInt = 5,
+        footprint: Footprint = (0.01, 0.01),
+        tilt: Tilt = 0.0,
         depth: float | None = None,
     ) -> None:
         self.centres = grid(rows, columns)
         self.normals = rosette(rows, columns, tilt)
-        self.footprint = footprint
-        self.depth = depth
+        self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""

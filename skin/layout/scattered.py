@@ -1,20 +1,21 @@
 """Sensors scattered at random around a grid."""
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
+from pydantic import NonNegativeInt, PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.errors import InputError
-from skin.layout._facing import rosette
-from skin.layout._grid import grid
-from skin.layout._place import place
-from skin.layout.base import AbstractLayout
+from skin.layout._grid import Tilt, grid, rosette
+from skin.layout.base import AbstractLayout, Footprint, place
 from skin.sensors import Sensors
+from skin.settings import checked
 
 __all__ = ["Scattered"]
 
 
+@checked("layout")
 class Scattered(AbstractLayout):
     """A grid of sensors, each moved at random: what a skin made by hand looks like.
 
@@ -34,27 +35,20 @@ class Scattered(AbstractLayout):
 
     def __init__(
         self,
-        rows: int = 5,
-        columns: int = 5,
-        jitter: float = 0.25,
-        seed: int = 0,
-        footprint: Sequence[float] = (0.01, 0.01),
-        tilt: float = 0.0,
+        rows: PositiveInt = 5,
+        columns: PositiveInt = 5,
+        jitter: Annotated[float, Ge(0), Lt(0.5)] = 0.25,
+        seed: NonNegativeInt = 0,
+        footprint: Footprint = (0.01, 0.01),
+        tilt: Tilt = 0.0,
         depth: float | np.ndarray | None = None,
         normals: np.ndarray | None = None,
     ) -> None:
-        if not 0 <= jitter < 0.5:
-            raise InputError(
-                f"layout.jitter must be at least 0 and below 0.5 of the pitch, got {jitter}: "
-                "as in layout.jitter=0.25"
-            )
         self.centres = grid(rows, columns)
         self.normals = rosette(rows, columns, tilt) if normals is None else normals
         self.pitch = np.array([1 / columns, 1 / rows])
-        self.jitter = jitter
-        self.seed = seed
-        self.footprint = footprint
-        self.depth = depth
+        self.jitter, self.seed = jitter, seed
+        self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""

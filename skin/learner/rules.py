@@ -80,15 +80,13 @@ class Rules(AbstractLearner):
             )
         began = time.perf_counter()
         train, validation = data.touches("train"), data.touches("validation")
-        if train.labels is None or validation.labels is None:
-            raise InputError("touches without labels cannot be learnt from: record them with labels")
         known, other = measurements(train.to("cpu")), measurements(validation.to("cpu"))
         self._set(
             {
                 name: _tune(
                     name,
-                    _told(known, train.labels, data.task, i),
-                    _told(other, validation.labels, data.task, i),
+                    _told(known, train.known_labels, data.task, i),
+                    _told(other, validation.known_labels, data.task, i),
                 )
                 for i, name in enumerate(data.task.names)
             }

@@ -23,13 +23,8 @@ def encoder(
         setting: the override that sets the width, named where it does not fit.
 
     Raises:
-        InputError: no layer, or a width that the heads cannot share.
+        InputError: a width that the heads cannot share.
     """
-    if min(width, heads, layers, feedforward) < 1:
-        raise InputError(
-            "a transformer needs at least one layer, head and feature, "
-            f"got layers {layers}, heads {heads}, {setting}={width} and feedforward {feedforward}"
-        )
     if width % heads:
         raise InputError(
             f"{heads} heads of attention must share the width equally, got {setting}={width}: "

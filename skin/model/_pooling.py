@@ -5,37 +5,35 @@ PyTorch Geometric's aggregations take 2.9 (max), 1.0 to 1.5 (mean), 1.1 to 1.2 (
 """
 
 from collections.abc import Callable
+from functools import partial
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-__all__ = ["POOLINGS"]
+__all__ = ["POOLINGS", "Pooling", "Reduced"]
+
+Pooling = Literal["max", "mean", "attention", "set2set"]
 
 STEPS = 3  # of Set2Set
 
 
-class Max(nn.Module):
-    """The maximum over the nodes."""
+class Reduced(nn.Module):
+    """What torch's ``amax`` or ``mean`` makes of one dimension; it has no weights.
 
-    def __init__(self, width: int) -> None:
+    Args:
+        width: E, of the last dimension.
+        reduce: as ``torch.amax``.
+        dim: the dimension.
+    """
+
+    def __init__(self, width: int, reduce: Callable[..., Tensor], dim: int) -> None:
         super().__init__()
-        self.width = width
+        self.width, self._reduce, self._dim = width, reduce, dim
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (N, E) of nodes x (S, N, E)."""
-        return x.amax(dim=0)
-
-
-class Mean(nn.Module):
-    """The mean of the nodes."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.width = width
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (N, E) of nodes x (S, N, E)."""
-        return x.mean(dim=0)
+        """Return x without the dimension."""
+        return self._reduce(x, dim=self._dim)
 
 
 class Attention(nn.Module):
@@ -72,9 +70,9 @@ class Set2Set(nn.Module):
         return torch.cat([query, read], dim=-1)
 
 
-POOLINGS: dict[str, Callable[[int], nn.Module]] = {
-    "max": Max,
-    "mean": Mean,
+POOLINGS: dict[Pooling, Callable[[int], nn.Module]] = {
+    "max": partial(Reduced, reduce=torch.amax, dim=0),
+    "mean": partial(Reduced, reduce=torch.mean, dim=0),
     "attention": Attention,
     "set2set": Set2Set,
 }

@@ -1,6 +1,7 @@
 """Files of trained weights: where they lie, and whether they fit."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -58,46 +59,42 @@ def load(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
     Raises:
         InputError: the file cannot be read, is no state dict, or holds other weights than the module has.
     """
-    given = {name: value for name, value in _read(path).items() if name not in spare}
-    wanted = module.state_dict()
-    _check(path, given, wanted)
-    module.load_state_dict(wanted | given)
+    content, wanted = _read(path), module.state_dict()
+    if wrong := _unfit(content, wanted, spare):
+        raise InputError(
+            f"the weights file {path} {wrong}: model=efficientnet needs the state dict of torchvision's "
+            f"efficientnet_b0; {_WAYS}"
+        )
+    module.load_state_dict(wanted | {name: content[name] for name in content if name not in spare})
 
 
-def _check(path: Path, given: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
-    # they count batches for a momentum that is not used; files older than torch 0.4.1 have none
-    missing = [name for name in wanted if name not in given and not name.endswith("num_batches_tracked")]
-    foreign = [name for name in given if name not in wanted]
-    if missing or foreign:
-        wrong = [_listed("lacks", missing), _listed("has the unknown", foreign)]
-        raise InputError(_unfit(path, " and ".join(filter(None, wrong))))
-    for name, value in given.items():
-        if value.shape != wanted[name].shape:
-            shapes = f"{tuple(value.shape)} where {tuple(wanted[name].shape)} is needed"
-            raise InputError(_unfit(path, f"has {name} of shape {shapes}"))
-        if not value.isfinite().all():
-            raise InputError(_unfit(path, f"has numbers in {name} that are not finite"))
-
-
-def _read(path: Path) -> dict[str, Tensor]:
+def _read(path: Path) -> Any:
     try:
-        content = torch.load(path, weights_only=True, map_location="cpu")
+        return torch.load(path, weights_only=True, map_location="cpu")
     except Exception as error:  # torch raises nearly anything on a file that it cannot read
         # torch's own words would advise to run the code in the file
         reason = error.strerror if isinstance(error, OSError) else "it is damaged, or holds more than tensors"
         raise InputError(f"cannot read the weights file {path}: {reason}; get it again; {_WAYS}") from error
+
+
+def _unfit(content: Any, wanted: dict[str, Tensor], spare: tuple[str, ...]) -> str:
+    """Return what is wrong with the content of a file; empty if it fits."""
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
-        raise InputError(_unfit(path, "is no state dict (names and tensors)"))
-    return content
+        return "is no state dict (names and tensors)"
+    given = {name: value for name, value in content.items() if name not in spare}
+    # they count batches for a momentum that is not used; files older than torch 0.4.1 have none
+    missing = [name for name in wanted if name not in given and not name.endswith("num_batches_tracked")]
+    foreign = [name for name in given if name not in wanted]
+    if missing or foreign:
+        return " and ".join(filter(None, [_listed("lacks", missing), _listed("has the unknown", foreign)]))
+    for name, value in given.items():
+        if value.shape != wanted[name].shape:
+            return f"has {name} of shape {tuple(value.shape)} where {tuple(wanted[name].shape)} is needed"
+        if not value.isfinite().all():
+            return f"has numbers in {name} that are not finite"
+    return ""
 
 
 def _listed(verb: str, names: list[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return f"{verb} {', '.join(names[:3])}{more}" if names else ""
-
-
-def _unfit(path: Path, reason: str) -> str:
-    return (
-        f"the weights file {path} {reason}: model=efficientnet needs the state dict of "
-        f"torchvision's efficientnet_b0; {_WAYS}"
-    )

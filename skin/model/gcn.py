@@ -2,19 +2,20 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
+from annotated_types import MinLen
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from skin.errors import InputError
 from skin.model._activation import activation as activation_of
-from skin.model._pooling import POOLINGS
+from skin.model._pooling import POOLINGS, Pooling
 from skin.model.base import AbstractModel, Kind
+from skin.settings import checked
 
 __all__ = ["Gcn"]
 
-Pooling = Literal["max", "mean", "attention", "set2set"]
 Norm = Literal["none", "layer", "batch", "instance"]
 
 
@@ -46,6 +47,7 @@ def _mix(adjacency: Tensor, x: Tensor) -> Tensor:
     return torch.einsum("nij,jnf->inf", adjacency, x)
 
 
+@checked("model")
 class Gcn(AbstractModel):
     """Graph convolutions, then one vector per graph (report, sections 3.2.1, 3.2.2 and 3.2.4).
 
@@ -71,22 +73,16 @@ class Gcn(AbstractModel):
         self,
         kind: Kind,
         shape: Sequence[int],
-        widths: Sequence[int] = (32, 128),
+        widths: Annotated[Sequence[PositiveInt], MinLen(1)] = (32, 128),
         activation: str = "silu",
         norm: Norm = "none",
         pooling: Pooling = "max",
     ) -> None:
         super().__init__(kind)
-        if not widths:
-            raise InputError("model=gcn needs at least one layer, got none: set model.widths=[32,128]")
         sizes = [shape[-1], *widths]
         self.convolutions = nn.ModuleList(_Convolution(*pair) for pair in pairwise(sizes))
         self.activation = activation_of(activation)
         self.norms = nn.ModuleList(_norm(norm, width) for width in widths[:-1])
-        if pooling not in POOLINGS:
-            raise InputError(
-                f"unknown pooling {pooling!r}: set model.pooling to one of {', '.join(POOLINGS)}"
-            )
         self.pooling = POOLINGS[pooling](sizes[-1])
         self.width = int(self.pooling.width)  # type: ignore[arg-type]
 
@@ -113,19 +109,16 @@ class _InstanceNorm(nn.Module):
     Not torch's, which refuses a graph of one node.
     """
 
-    def __init__(self, width: int, eps: float = 1e-5) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
-        self.eps = eps
 
     def forward(self, x: Tensor) -> Tensor:
         """Return nodes (S, N, F) of nodes x (S, N, F)."""
         variance, mean = torch.var_mean(x, dim=0, correction=0)
-        return (x - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias
+        return (x - mean) * (variance + 1e-5).rsqrt() * self.weight + self.bias
 
 
 def _norm(name: Norm, width: int) -> nn.Module:
     known = {"none": nn.Identity, "layer": nn.LayerNorm, "batch": _BatchNorm, "instance": _InstanceNorm}
-    if name not in known:
-        raise InputError(f"unknown norm {name!r}: set model.norm to one of {', '.join(known)}")
     return known[name](width)

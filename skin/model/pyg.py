@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_geometric.nn.models.basic_gnn import BasicGNN
 
 from skin.errors import InputError
-from skin.model._pooling import POOLINGS
+from skin.model._pooling import POOLINGS, Pooling
 from skin.model.base import AbstractModel, Kind
 
 __all__ = ["Pyg"]
@@ -44,14 +44,10 @@ class Pyg(AbstractModel):
         network: Callable[..., BasicGNN],
         width: Annotated[int, Ge(1)] = 64,
         layers: Annotated[int, Ge(1)] = 2,
-        pooling: str = "attention",
+        pooling: Pooling = "attention",
         degree: Annotated[int, Ge(1)] = 7,
     ) -> None:
         super().__init__(kind)
-        if pooling not in POOLINGS:
-            raise InputError(
-                f"unknown pooling {pooling!r}: set model.pooling to one of {', '.join(POOLINGS)}"
-            )
         given: dict[str, Any] = network.keywords if isinstance(network, partial) else {}
         made = network.func if isinstance(network, partial) else network
         self._weighted = bool(getattr(made, "supports_edge_weight", False))

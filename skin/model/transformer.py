@@ -3,17 +3,19 @@
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from skin.errors import InputError
 from skin.model._attention import encoder
 from skin.model.base import AbstractModel, Kind
+from skin.settings import checked
 
 __all__ = ["Transformer"]
 
 Pooling = Literal["mean", "max"]
 
 
+@checked("model")
 class Transformer(AbstractModel):
     """Lets every sensor attend to every other one, then takes one vector per frame (report, section 3.2.2).
 
@@ -40,16 +42,14 @@ class Transformer(AbstractModel):
         self,
         kind: Kind,
         shape: Sequence[int],
-        width: int = 64,
-        layers: int = 2,
-        heads: int = 4,
-        feedforward: int = 128,
+        width: PositiveInt = 64,
+        layers: PositiveInt = 2,
+        heads: PositiveInt = 4,
+        feedforward: PositiveInt = 128,
         dropout: float = 0.1,
         pooling: Pooling = "mean",
     ) -> None:
         super().__init__(kind)
-        if pooling not in ("mean", "max"):
-            raise InputError(f"unknown pooling {pooling!r}: set model.pooling=mean or max")
         self.tokens = nn.Linear(shape[-1], width)
         self.encoder = encoder(width, heads, layers, feedforward, dropout, "model.width")
         self.pooling, self.width = pooling, width

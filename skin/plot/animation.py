@@ -65,10 +65,7 @@ def still(scene: Scene, view: str, path: Path) -> Path:
     """
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     _stage(figure, scene, view)(int(scene.readings.sum(axis=1).argmax()))
-    try:
-        return save(figure, path)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error}") from error
+    return save(figure, path)
 
 
 def thinning(frames: int, rate: float) -> int:
@@ -167,12 +164,7 @@ def _skin3d(figure: Figure, scene: Scene) -> Draw:
     """Show the surface of the whole skin as it moves."""
     if scene.body is not None:
         return skin_in_space(figure, scene, scene.body)
-    if scene.moved is None:
-        raise InputError(
-            "view=skin3d needs the pressure on the skin, which only device=simulated knows: "
-            "give view=flat or view=sensors3d"
-        )
-    moved = scene.moved
+    moved = scene.known(scene.moved)
     axis, right = space_and_traces(figure)
     now = traces(right, scene)
 

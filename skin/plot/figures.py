@@ -53,9 +53,7 @@ def images(pictures: Mapping[str, Tensor], points: np.ndarray, size: tuple[float
         else:
             axis.imshow(np.asarray(picture), cmap="magma", extent=extent, interpolation="nearest")
             axis.plot(points[:, 0] * 1e3, points[:, 1] * 1e3, ".", color="#56B4E9", markersize=2)
-        axis.set_title(name)
-        axis.set_xticks([])
-        axis.set_yticks([])
+        axis.set(title=name, xticks=[], yticks=[])
     return figure
 
 
@@ -87,9 +85,7 @@ def overview(
     time = np.arange(len(readings)) / rate
     right.plot(time, readings, linewidth=1)
     right.axvline(frame / rate, color="black", linewidth=0.8, linestyle=":")
-    right.set_title("their readings")
-    right.set_xlabel("time, s")
-    right.set_ylabel("N")
+    right.set(title="their readings", xlabel="time, s", ylabel="N")
     return figure
 
 
@@ -116,9 +112,7 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
             )
         axis.set_xticks([0, 1], names)
         axis.set_yticks([0, 1], names, rotation=90, va="center")
-        axis.set_xlabel("predicted")
-        axis.set_ylabel("true")
-        axis.set_title(title)
+        axis.set(xlabel="predicted", ylabel="true", title=title)
     return figure
 
 
@@ -147,8 +141,7 @@ def misclassified(
         axis.errorbar(
             middles * 1e3, shares, spread, marker=mark, markersize=4, capsize=2, color=colour, label=row
         )
-    axis.set_xlabel("speed, mm per frame (0: static)")
-    axis.set_ylabel(f"share with “{label}” wrong")
+    axis.set(xlabel="speed, mm per frame (0: static)", ylabel=f"share with “{label}” wrong")
     axis.set_ylim(bottom=0)
     figure.legend(loc="outside right upper", fontsize=8)
     return figure
@@ -166,9 +159,7 @@ def traces(readings: Mapping[str, Tensor], rate: float) -> Figure:
     for axis, (name, values) in zip(axes, readings.items(), strict=True):
         sensor = int(values.amax(0).argmax())
         axis.plot(np.arange(len(values)) / rate, values[:, sensor], color=COLOURS[0], marker=".")
-        axis.set_title(f"{name}, sensor {sensor}")
-        axis.set_xlabel("time, s")
-        axis.set_ylabel("reading, N")
+        axis.set(title=f"{name}, sensor {sensor}", xlabel="time, s", ylabel="reading, N")
     return figure
 
 

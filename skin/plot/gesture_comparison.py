@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -109,7 +108,8 @@ def read(device: AbstractSimulated, path: str, seed: int) -> Gestures:
         InputError: no session, no labels in it, another layout, window or rate, or another emulator's.
     """
     stored = log.read(Path(path).expanduser())
-    _fits(device, stored.about, path)
+    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
+    log.check(Path(path), stored.about, now)
     takes = [entry for _, entry in sorted(stored.takes.items()) if entry[0].labels is not None]
     if not takes:
         raise InputError(f"{path} has no gesture with labels: record it with device.labels=prompted")
@@ -132,17 +132,6 @@ def read(device: AbstractSimulated, path: str, seed: int) -> Gestures:
     ]
     seen = [pair for pair in pairs if pair.valid.any(axis=0).any() and pair.simulated.any()]
     return Gestures(seen, same, device.sensors.positions, device.rate)
-
-
-def _fits(device: AbstractSimulated, about: Mapping[str, Any], path: str) -> None:
-    if about.get("positions") != device.sensors.positions.tolist():
-        raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
-    found, needed = (about.get("window"), about.get("rate")), (device.window, device.rate)
-    if found != needed:
-        raise InputError(
-            f"{path} has windows of {found[0]} frames at {found[1]:g} Hz, the simulation has {needed[0]} at "
-            f"{needed[1]:g} Hz: give touch.window={found[0]} device.rate={found[1]:g}"
-        )
 
 
 def _are(drawn: Sequence[Gesture], numbers: Sequence[int], labels: Sequence[Mapping[str, int]]) -> None:

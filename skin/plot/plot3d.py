@@ -12,7 +12,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from skin.body.base import AbstractBody
-from skin.errors import InputError
 from skin.plot.view import FORCE, Draw, Scene, clear, norm, space_and_traces, traces
 
 __all__ = ["sensors_in_space", "skin_in_space"]
@@ -67,12 +66,7 @@ class _Shell:
 
 def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
-    known = scene.moved if scene.moved is not None else scene.pressure
-    if known is None:
-        raise InputError(
-            "view=skin3d needs the pressure on the skin, which only device=simulated knows: "
-            "give view=flat or view=sensors3d"
-        )
+    known = scene.known(scene.pressure if scene.moved is None else scene.moved)
     axis, right = space_and_traces(figure)
     now, shell, most = traces(right, scene), _Shell.of(body), max(float(known.max()), 1e-9)
     stretch = 1.0

@@ -186,19 +186,13 @@ def page(found: Comparison, verdicts: Verdicts | None, about: str) -> str:
     ratios = np.array([press.ratio for press in presses])
     rmse = np.sqrt(np.mean([press.rmse**2 for press in presses]))
     shares = [[press.peaks[side] / press.force for press in presses] for side in (0, 1)]
-    quarter = np.percentile(ratios, [25, 75])
-    lines = [
-        "# The same presses, simulated and recorded",
-        "",
-        about,
-        "",
-        "![force and reading](compare.png)",
-        "",
-    ]
+    low, high = np.percentile(ratios, [25, 75])
+    title, picture = "# The same presses, simulated and recorded", "![force and reading](compare.png)"
+    lines = [title, "", about, "", picture, ""]
     lines += [
         f"- presses: {len(presses)}",
-        f"- gain ratio (recorded over simulated), median: {np.median(ratios):.3f}, middle half "
-        f"{quarter[0]:.3f} to {quarter[1]:.3f}",
+        f"- gain ratio (recorded over simulated), median: {np.median(ratios):.3f}, middle half {low:.3f} "
+        f"to {high:.3f}",
         f"- RMSE of readings: {rmse:.3f} N",
         f"- largest reading per applied force: {np.median(shares[0]):.1%} simulated, "
         f"{np.median(shares[1]):.1%} recorded (the report's skin: about 5 %)",
@@ -209,11 +203,11 @@ def page(found: Comparison, verdicts: Verdicts | None, about: str) -> str:
         "| press | sensor | force, N | simulated, N | recorded, N | ratio | RMSE, N |",
         "|---" * 7 + "|",
     ]
-    for press in presses:
-        lines.append(
-            f"| {press.number} | {press.sensor} | {press.force:.1f} | {press.peaks[0]:.2f} | "
-            f"{press.peaks[1]:.2f} | {press.ratio:.3f} | {press.rmse:.3f} |"
-        )
+    lines += [
+        f"| {press.number} | {press.sensor} | {press.force:.1f} | {press.peaks[0]:.2f} | "
+        f"{press.peaks[1]:.2f} | {press.ratio:.3f} | {press.rmse:.3f} |"
+        for press in presses
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from skin.body.base import AbstractBody
+from skin.errors import InputError
 
 __all__ = ["FORCE", "Draw", "Scene", "clear", "norm", "places", "space_and_traces", "traces"]
 
@@ -50,6 +51,20 @@ class Scene:
     def extent(self) -> tuple[float, float, float, float]:
         """Where a picture of the sheet lies, mm, y downwards."""
         return 0, 1e3 * self.size[0], 1e3 * self.size[1], 0
+
+    @staticmethod
+    def known(values: np.ndarray | None) -> np.ndarray:
+        """Return the movement of the surface, or its pressure.
+
+        Raises:
+            InputError: nobody knows them.
+        """
+        if values is None:
+            raise InputError(
+                "view=skin3d needs the pressure on the skin, which only device=simulated knows: "
+                "give view=flat or view=sensors3d"
+            )
+        return values
 
 
 Draw = Callable[[int], None]

@@ -1,23 +1,14 @@
 """The pixel grid that covers the sheet, shared by the image representations."""
 
+from typing import Annotated
+
 import numpy as np
+from annotated_types import Ge
 
-from skin.errors import InputError
+__all__ = ["Pixels", "centres", "pixel_of"]
 
-__all__ = ["centres", "check_pixels", "pixel_of"]
-
-
-def check_pixels(pixels: int) -> int:
-    """Return the edge length of a square image in pixels, at least 8.
-
-    Raises:
-        InputError: it is smaller, or no whole number.
-    """
-    if not isinstance(pixels, int) or pixels < 8:
-        raise InputError(
-            f"an image must be at least 8 pixels wide, got {pixels!r}: set e.g. representation.pixels=64"
-        )
-    return pixels
+Pixels = Annotated[int, Ge(8)]
+"""Edge length of a square image."""
 
 
 def pixel_of(positions: np.ndarray, size: tuple[float, float], pixels: int) -> np.ndarray:

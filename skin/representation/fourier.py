@@ -5,12 +5,15 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
+from skin.representation._pixels import Pixels
 from skin.representation.base import AbstractRepresentation, Frames
 from skin.representation.image import Image
+from skin.settings import checked
 
 __all__ = ["Fourier"]
 
 
+@checked("representation")
 class Fourier(AbstractRepresentation):
     """Shows log(1 + |FFT|) of the sensor image, zero frequency in the middle (report, section 2.2).
 
@@ -34,7 +37,7 @@ class Fourier(AbstractRepresentation):
         self,
         positions: Tensor,
         size: tuple[float, float],
-        pixels: int = 64,
+        pixels: Pixels = 64,
         scale: float = 10.0,
         mask: bool = False,
     ) -> None:

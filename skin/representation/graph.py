@@ -1,9 +1,10 @@
 """A graph with a sensor at each node and an edge between neighbours."""
 
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
+from pydantic import PositiveInt
 from scipy.spatial import Delaunay, QhullError, cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
@@ -11,8 +12,8 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.recording import Touches
-from skin.representation._channels import channels
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation.base import AbstractRepresentation, Frames, channels
+from skin.settings import checked
 
 __all__ = ["Graph", "adjacency", "neighbours", "normalised", "self_share", "typical_distance"]
 
@@ -28,15 +29,13 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
     the Delaunay triangulation in the plane.
 
     Raises:
-        InputError: an unknown rule, no neighbours asked for, or sensors of which no triangle can be made.
+        InputError: sensors of which no triangle can be made.
     """
     linked = np.zeros((len(positions), len(positions)), dtype=bool)
     if edges == "knn":
-        if count < 1:
-            raise InputError(f"a graph needs at least one neighbour, got {count}: set representation.count=6")
         nearest = cKDTree(positions).query(positions, k=range(1, min(count + 1, len(positions)) + 1))[1]
         np.put_along_axis(linked, nearest, True, axis=1)
-    elif edges == "delaunay":
+    else:
         try:
             triangles = Delaunay(positions[:, :2]).simplices
         except (QhullError, ValueError):
@@ -46,8 +45,6 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
             ) from None
         for corner in range(3):
             linked[triangles[:, corner], triangles[:, corner - 1]] = True
-    else:
-        raise InputError(f"unknown edges {edges!r}: set representation.edges=knn or delaunay")
     np.fill_diagonal(linked, False)
     return linked | linked.T
 
@@ -79,12 +76,8 @@ def adjacency(
         body: whose surface; only ``stiffness`` needs it.
 
     Raises:
-        InputError: an unknown weight, or stiffness without a body.
+        InputError: stiffness without a body.
     """
-    if weight not in get_args(Weight):
-        raise InputError(
-            f"unknown edge weight {weight!r}: set representation.weight=exp, distance, stiffness or none"
-        )
     if weight == "none" or not linked.any():
         return linked.astype(float)
     unit = typical_distance(positions)
@@ -126,6 +119,7 @@ def self_share(adjacency: Tensor) -> float:
     return float(adjacency.diagonal(dim1=-2, dim2=-1).mean())
 
 
+@checked("representation")
 class Graph(AbstractRepresentation):
     """Makes a sensor a node and links neighbours (report, section 2.2).
 
@@ -164,7 +158,7 @@ class Graph(AbstractRepresentation):
         size: tuple[float, float],
         /,
         edges: Edges = "knn",
-        count: int = 6,
+        count: PositiveInt = 6,
         weight: Weight = "exp",
         positions: Positions = "layout",
         coordinates: bool = False,
@@ -174,7 +168,12 @@ class Graph(AbstractRepresentation):
     ) -> None:
         super().__init__()
         self.scale, self.mask, self.coordinates = scale, mask, coordinates
-        self.weight, self.positions = weight, _checked(positions, weight, coordinates)
+        self.weight, self.positions = weight, positions
+        if positions == "deformed" and weight == "none" and not coordinates:
+            raise InputError(
+                "representation.positions=deformed changes nothing at representation.weight=none: set "
+                "representation.weight=exp, or representation.positions=layout"
+            )
         places = layout.cpu().numpy().astype(float)
         weights = adjacency(places, neighbours(places, edges, count), weight, body)
         first, second = np.nonzero(np.triu(weights))
@@ -231,14 +230,3 @@ class Graph(AbstractRepresentation):
         looped[..., first, second] = looped[..., second, first] = weights
         root = looped.sum(dim=-1).sqrt()
         return looped / (root[..., :, None] * root[..., None, :])
-
-
-def _checked(positions: Positions, weight: Weight, coordinates: bool) -> Positions:
-    if positions not in get_args(Positions):
-        raise InputError(f"unknown positions {positions!r}: set representation.positions=layout or deformed")
-    if positions == "deformed" and weight == "none" and not coordinates:
-        raise InputError(
-            "representation.positions=deformed changes nothing at representation.weight=none: set "
-            "representation.weight=exp, or representation.positions=layout"
-        )
-    return positions

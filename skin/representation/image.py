@@ -6,13 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.representation._channels import channels
-from skin.representation._pixels import check_pixels, pixel_of
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation._pixels import Pixels, pixel_of
+from skin.representation.base import AbstractRepresentation, Frames, channels
+from skin.settings import checked
 
 __all__ = ["Image"]
 
 
+@checked("representation")
 class Image(AbstractRepresentation):
     """Puts every reading on the pixel of its sensor; all others are 0 (report, section 2.2).
 
@@ -38,12 +39,12 @@ class Image(AbstractRepresentation):
         self,
         positions: Tensor,
         size: tuple[float, float],
-        pixels: int = 64,
+        pixels: Pixels = 64,
         scale: float = 10.0,
         mask: bool = False,
     ) -> None:
         super().__init__()
-        self.pixels, self.scale, self.mask = check_pixels(pixels), scale, mask
+        self.pixels, self.scale, self.mask = pixels, scale, mask
         where, place = np.unique(pixel_of(positions.cpu().numpy(), size, pixels), return_inverse=True)
         share = np.eye(len(where))[place]
         self.register_buffer("where", torch.from_numpy(where))

@@ -1,18 +1,19 @@
 """An image interpolated between the sensors."""
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
+from annotated_types import MinLen
 from scipy.interpolate import CloughTocher2DInterpolator, LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import QhullError
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.representation._channels import channels
-from skin.representation._pixels import centres, check_pixels
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation._pixels import Pixels, centres
+from skin.representation.base import AbstractRepresentation, Frames, channels
+from skin.settings import checked
 
 __all__ = ["Interpolation", "weights"]
 
@@ -27,7 +28,7 @@ def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarr
     holds.
 
     Raises:
-        InputError: an unknown method, or points of which no triangle can be made.
+        InputError: points of which no triangle can be made.
     """
     unit = np.eye(len(points))
     matrix = NearestNDInterpolator(points, unit)(targets)
@@ -36,13 +37,9 @@ def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarr
     try:
         if method == "linear":
             inner = LinearNDInterpolator(points, unit)(targets)
-        elif method == "cubic":
+        else:
             # the gradients come from an iteration: only a converged one is linear in the values
             inner = CloughTocher2DInterpolator(points, unit, tol=1e-12, maxiter=5000)(targets)
-        else:
-            raise InputError(
-                f"unknown interpolation {method!r}: set representation.method=nearest, linear or cubic"
-            )
     except QhullError:
         raise InputError(
             f"representation.method={method} needs at least three sensors that are not in one line, "
@@ -51,6 +48,7 @@ def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarr
     return np.where(np.isnan(inner), matrix, inner)
 
 
+@checked("representation")
 class Interpolation(AbstractRepresentation):
     """Fills the image between the sensors (report, section 2.2 and figure 4).
 
@@ -76,16 +74,14 @@ class Interpolation(AbstractRepresentation):
         self,
         positions: Tensor,
         size: tuple[float, float],
-        method: Method | Sequence[Method] = "linear",
-        pixels: int = 64,
+        method: Method | Annotated[Sequence[Method], MinLen(1)] = "linear",
+        pixels: Pixels = 64,
         scale: float = 10.0,
         mask: bool = False,
     ) -> None:
         super().__init__()
-        self.pixels, self.scale, self.mask = check_pixels(pixels), scale, mask
+        self.pixels, self.scale, self.mask = pixels, scale, mask
         methods: Sequence = method if isinstance(method, list | tuple) else [method]
-        if not methods:
-            raise InputError("an image needs an interpolation, got none: set representation.method=linear")
         points, targets = positions[:, :2].cpu().numpy(), centres(size, pixels)
         matrix = np.concatenate([weights(points, targets, one) for one in methods])
         self.register_buffer("matrix", torch.from_numpy(matrix).to(torch.float32))

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from skin.recording import Touches
-from skin.representation._channels import channels
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.signal.features import measurements
 
 __all__ = ["Measured"]

@@ -4,8 +4,7 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from skin.representation._channels import channels
-from skin.representation.base import AbstractRepresentation, Frames
+from skin.representation.base import AbstractRepresentation, Frames, channels
 
 __all__ = ["Readings"]
 

@@ -3,10 +3,12 @@
 from dataclasses import dataclass, replace
 
 import torch
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from skin.errors import InputError
 from skin.recording import Touches
+from skin.settings import checked
 
 __all__ = ["Augmentation"]
 
@@ -14,6 +16,7 @@ _IDLE = 8
 _MARGIN = 2  # frames that a touch may last beyond what stands out
 
 
+@checked("data.augment")
 @dataclass(frozen=True)
 class Augmentation:
     """Shifts, reverses, scales and blurs touches of a training batch.
@@ -33,13 +36,8 @@ class Augmentation:
 
     shift: bool = False
     reverse: bool = False
-    gain: float = 0.0
-    noise: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("gain", "noise"):
-            if getattr(self, name) < 0:
-                raise InputError(f"data.augment.{name} must be at least 0, got {getattr(self, name)}")
+    gain: NonNegativeFloat = 0.0
+    noise: NonNegativeFloat = 0.0
 
     def __call__(self, touches: Touches, generator: torch.Generator) -> Touches:
         """Return changed touches; ``generator`` is where all randomness comes from.

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from skin.recording import Touches
+from skin.signal.features import above_idle
 
 __all__ = ["bearings"]
 
-IDLE = 0.2  # a touch rests for at least a fifth of its window
 SHARES = (0.1, 0.25, 0.5)  # of the touch's own peak: a frame beyond is active
 _FORCE = 0.1  # N, twice the noise: what weighs less is no part of a centre
 
@@ -17,10 +17,8 @@ def bearings(touches: Touches) -> dict[str, Tensor]:
 
     Each vector stands as it is and with length 1: its cosines are the label itself where it points rightly.
     """
-    raw = torch.where(touches.valid, touches.readings, torch.zeros(()))
-    x = (raw - torch.quantile(raw, IDLE, dim=1, keepdim=True)) * touches.valid
-    places = touches.positions[..., :2].to(x.dtype)
-    at = places.expand(len(x), x.shape[1], x.shape[2], 2)
+    x = above_idle(touches)
+    at = touches.positions[..., :2].to(x.dtype).expand(*x.shape, 2)
     vectors = {"order of the sensors": _order(x, at)} | _lean(x, at)
     for power in (1, 2):
         push = (x - _FORCE).clamp(min=0) ** power

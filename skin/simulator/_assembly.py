@@ -7,7 +7,7 @@ table up, then by row, then by column. The table holds the lowest beams' feet, s
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy import sparse
@@ -37,7 +37,7 @@ class Structure:
             leaves motion along x and y free too. Rotation about z is held.
 
     Raises:
-        InputError: an unknown constraint, or a body that is not flat.
+        InputError: a body that is not flat.
     """
 
     body: AbstractBody
@@ -49,10 +49,6 @@ class Structure:
             raise InputError(
                 f"plates and beams are flat, body={name} is not: set simulator=solid or "
                 "simulator=naive, or body=sheet"
-            )
-        if self.constraint not in _FREE:
-            raise InputError(
-                f"simulator.constraint must be {' or '.join(get_args(Constraint))}, got {self.constraint}"
             )
 
     @property

@@ -21,8 +21,7 @@ _NUMBERS_AT_ONCE = 2**24
 
 def squeeze(structure: Structure) -> np.ndarray:
     """Return how much thinner the top layer of plates and beams gets at each node, (nodes, cells), 1/Pa."""
-    factors = factorised(structure.stiffness())
-    moved = factors.solve(structure.load().toarray())
+    moved = factorised(structure.stiffness()).solve(structure.load().toarray())
     layers, rows, columns = structure.grid
     down = -moved.reshape(layers, rows * columns, len(structure.free), -1)[:, :, structure.free.index(2)]
     below = down[-2] if layers > 1 else 0.0

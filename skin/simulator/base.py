@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from skin.errors import InputError
@@ -10,7 +11,7 @@ from skin.option import option
 from skin.sensors import Sensors
 from skin.touch.movie import Movie
 
-__all__ = ["AbstractSimulator", "Response"]
+__all__ = ["AbstractSimulator", "Response", "flatten"]
 
 
 class Response(NamedTuple):
@@ -151,3 +152,16 @@ class AbstractSimulator(nn.Module, ABC):
     @property
     def _name(self) -> str:
         return option(self)
+
+
+def flatten(pressure: Tensor, shape: tuple[int, int], dtype: torch.dtype) -> Tensor:
+    """Return pressure (..., H, W), Pa, as (..., H*W) of the simulator's own dtype.
+
+    Raises:
+        ValueError: the frames do not have the shape of the sheet's cells, or are not floating point.
+    """
+    if pressure.ndim < 2 or tuple(pressure.shape[-2:]) != shape:
+        raise ValueError(f"pressure must be (..., H, W) with H, W = {shape}, got {tuple(pressure.shape)}")
+    if not pressure.is_floating_point():
+        raise ValueError(f"pressure must be floating point, in Pa, got {pressure.dtype}")
+    return pressure.to(dtype).flatten(-2)

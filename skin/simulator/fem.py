@@ -2,7 +2,7 @@
 
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,18 +11,19 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.sensors import Sensors
+from skin.settings import checked
 from skin.simulator._assembly import Constraint, Structure
-from skin.simulator._frames import flatten
 from skin.simulator._operator import Operator, cached
 from skin.simulator._store import folder
 from skin.simulator._strain import largest, squeeze
-from skin.simulator.base import AbstractSimulator, Response
+from skin.simulator.base import AbstractSimulator, Response, flatten
 
 __all__ = ["PlatesAndBeams", "Reading"]
 
 Reading = Literal["equation10", "interface"]
 
 
+@checked("simulator")
 class PlatesAndBeams(AbstractSimulator):
     """Layers of Kirchhoff plates on upright Euler-Bernoulli beams, glued to a table.
 
@@ -68,8 +69,6 @@ class PlatesAndBeams(AbstractSimulator):
     ) -> None:
         super().__init__()
         self.refuse_tilted(sensors)
-        if reading not in get_args(Reading):
-            raise InputError(f"simulator.reading must be {' or '.join(get_args(Reading))}, got {reading}")
         self.reading, self.constraint = reading, constraint
         self.shape = body.shape
         self._structure = Structure(body, constraint)

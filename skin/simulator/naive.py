@@ -8,8 +8,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.sensors import Sensors
-from skin.simulator._frames import flatten
-from skin.simulator.base import AbstractSimulator, Response
+from skin.simulator.base import AbstractSimulator, Response, flatten
 
 __all__ = ["Naive"]
 

@@ -8,19 +8,20 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.material import MATERIALS
 from skin.sensors import Sensors
+from skin.settings import checked
 from skin.simulator import _store
 from skin.simulator._elastic import Elastic
 from skin.simulator._footprint import quadrature
-from skin.simulator._frames import flatten
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator._strain import largest, solid_rows
-from skin.simulator.base import AbstractSimulator, Response
+from skin.simulator.base import AbstractSimulator, Response, flatten
 
 __all__ = ["Solid", "hexahedra", "readings"]
 
@@ -32,6 +33,7 @@ _SOURCES = [
 _INWARDS = 2
 
 
+@checked("simulator")
 class Solid(AbstractSimulator):
     """Layers of nearly incompressible elastic solid, glued to something hard.
 
@@ -62,7 +64,7 @@ class Solid(AbstractSimulator):
         self,
         body: AbstractBody,
         sensors: Sensors,
-        divisions: int = 3,
+        divisions: PositiveInt = 3,
         poisson: Mapping[str, float] | None = None,
         cache: str | Path | None = None,
     ) -> None:
@@ -102,8 +104,7 @@ class Solid(AbstractSimulator):
     def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m."""
         count = self._sensors
-        moves = self._rows(pressure, drag, slice(count, 5 * count))
-        inwards, _, x, y = moves.chunk(4, dim=-1)
+        inwards, _, x, y = self._rows(pressure, drag, slice(count, 5 * count)).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:
@@ -175,11 +176,6 @@ def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) 
     Raises:
         InputError: as of :class:`Solid`.
     """
-    if type(divisions) is not int or divisions < 1:
-        raise InputError(
-            f"simulator.divisions must be a whole number of at least 1, got {divisions}: as in "
-            "simulator.divisions=3"
-        )
     ratios = _ratios(body, poisson)
     depths, young, ratio = [0.0], [], []
     for number in reversed(range(len(body.layers))):

@@ -1,13 +1,16 @@
 """Gesture settings, and the draws of shape, time and path."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le, MinLen
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from skin.errors import InputError
 from skin.labels import Thresholds
+from skin.settings import RISING, checked, configured
 from skin.touch._bodies import Fit, draw_bodies
 from skin.touch.shapes import Shapes
 
@@ -17,6 +20,13 @@ Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
 
 
+_From0 = Annotated[tuple[NonNegativeFloat, PositiveFloat], RISING]
+_Above0 = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
+_Tap = Annotated[tuple[PositiveInt, Annotated[int, Ge(2)]], RISING]  # one that slides lasts 2 frames
+_Frames = Annotated[tuple[PositiveInt, PositiveInt], RISING]
+
+
+@checked("touch")
 @dataclass(frozen=True)
 class GestureSettings:
     """The difficulty of the task; ``conf/touch.yaml`` holds the same defaults and says each unit.
@@ -27,25 +37,33 @@ class GestureSettings:
         InputError: a range that is empty, out of order, or on the wrong side of its threshold.
     """
 
-    window: int = 30
-    shapes: tuple[str, ...] = ("disc", "blurred_disc", "square", "bar", "fist", "hand", "fingertip")
-    small_area: tuple[float, float] = (0.01, 0.30)
-    big_area: tuple[float, float] = (0.30, 0.70)
-    tap: tuple[int, int] = (1, 3)
-    press: tuple[int, int] = (4, 20)
-    safe_peak: tuple[float, float] = (10e3, 90.5e3)
-    dangerous_peak: tuple[float, float] = (90.5e3, 180e3)
-    speed: tuple[float, float] = (0.003, 0.020)
-    path: float = 0.010
-    spare: float = 0.010
-    ramp: int = 3
-    shear: float = 0.0
-    redraws: int = 30
-    stretch: float = 4.0
-    leak: float = 0.6
+    window: PositiveInt = 30
+    shapes: Annotated[tuple[str, ...], MinLen(1)] = (
+        "disc",
+        "blurred_disc",
+        "square",
+        "bar",
+        "fist",
+        "hand",
+        "fingertip",
+    )
+    small_area: _From0 = (0.01, 0.30)
+    big_area: _From0 = (0.30, 0.70)
+    tap: _Tap = (1, 3)
+    press: _Frames = (4, 20)
+    safe_peak: _Above0 = (10e3, 90.5e3)
+    dangerous_peak: _Above0 = (90.5e3, 180e3)
+    speed: _From0 = (0.003, 0.020)
+    path: NonNegativeFloat = 0.010
+    spare: NonNegativeFloat = 0.010
+    ramp: Annotated[int, Ge(2)] = 3
+    shear: NonNegativeFloat = 0.0
+    redraws: PositiveInt = 30
+    stretch: Annotated[float, Ge(1)] = 4.0
+    leak: Annotated[float, Ge(0.5), Le(1)] = 0.6
     strict: bool = False
-    gap: tuple[int, int] = (10, 60)
-    stride: tuple[int, int] = (15, 45)
+    gap: _Frames = (10, 60)
+    stride: _Frames = (15, 45)
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     @classmethod
@@ -55,21 +73,13 @@ class GestureSettings:
             return given
         values = dict(given or {})
         limits = values.pop("thresholds", {})
-        if isinstance(limits, Thresholds):
-            limits = vars(limits)
-        for keys, known, prefix in ((values, cls, "touch"), (limits, Thresholds, "touch.thresholds")):
-            names = [entry.name for entry in fields(known)]
-            if unknown := sorted(set(keys) - set(names)):
-                raise InputError(f"{prefix} has no {', '.join(unknown)}: it takes {', '.join(names)}")
+        if not isinstance(limits, Thresholds):
+            limits = configured(Thresholds, limits, "touch.thresholds")
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        return cls(**values, thresholds=Thresholds(**limits))
+        return configured(cls, values | {"thresholds": limits}, "touch")
 
     def __post_init__(self) -> None:
         lines = self.thresholds
-        if not self.shapes or isinstance(self.shapes, str):
-            raise InputError(
-                f"touch.shapes must list at least one shape, got {self.shapes!r}: as in [disc,hand]"
-            )
         # (name, lowest allowed, highest allowed): a range beyond its threshold would be redrawn for ever.
         for name, low, high in (
             ("small_area", 0, lines.area),
@@ -78,53 +88,17 @@ class GestureSettings:
             ("press", lines.frames + 1, self.window),
             ("safe_peak", 0, lines.pressure),
             ("dangerous_peak", lines.pressure, np.inf),
-            ("speed", 0, np.inf),
         ):
-            self._check(name, low, high)
-        for name, low in (("path", 0), ("spare", 0), ("ramp", 2), ("redraws", 1)):
-            if getattr(self, name) < low:
-                raise InputError(f"touch.{name} must be at least {low}, got {getattr(self, name)}")
-        if not 1 <= self.stretch < np.inf:
-            raise InputError(
-                f"touch.stretch is by how much a shape may be lengthened, 1 (not at all) or more, got "
-                f"{self.stretch}"
-            )
-        if not 0.5 <= self.leak <= 1:
-            raise InputError(
-                f"touch.leak is a balanced accuracy from 0.5 to 1, got {self.leak}: as in touch.leak=0.6"
-            )
-        if not 0 <= self.shear < np.inf:
-            raise InputError(
-                f"touch.shear is a coefficient of friction from 0 up, got {self.shear}: as in touch.shear=0.5"
-            )
-        for name in ("gap", "stride"):
             given = getattr(self, name)
-            if (
-                len(given) != 2
-                or any(value != int(value) for value in given)
-                or not 1 <= given[0] <= given[1]
-            ):
+            if given[0] < low or given[1] > high:
                 raise InputError(
-                    f"touch.{name} must be a range [least, most] of whole frames from 1 up, got {list(given)}"
+                    f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: touch.thresholds and "
+                    "touch.window decide"
                 )
-        if self.tap[1] < 2:
-            raise InputError(
-                f"a touch slides over at least 2 frames, got touch.tap={list(self.tap)}: use [1,3]"
-            )
         if self.path > self.speed[1]:
             raise InputError(
                 f"touch.path={self.path} m is longer than the fastest touch moves in a frame "
                 f"({self.speed[1]} m): a tap of 2 frames could not slide so far; raise touch.speed"
-            )
-
-    def _check(self, name: str, low: float, high: float) -> None:
-        given = getattr(self, name)
-        if len(given) != 2 or not all(np.isfinite(given)) or given[0] > given[1] or given[1] <= 0:
-            raise InputError(f"touch.{name} must be a range [least, most] above 0, got {list(given)}")
-        if given[0] < low or given[1] > high or (name == "safe_peak" and given[0] == 0):
-            raise InputError(
-                f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: touch.thresholds and "
-                "touch.window decide; a pressure of 0 is no touch"
             )
 
 

@@ -65,17 +65,12 @@ def check(pixels: np.ndarray, name: str) -> np.ndarray:
     Raises:
         InputError: no pixels, a pixel that is no number or below 0, or nothing but black.
     """
-    if pixels.ndim != 2 or not pixels.size:
-        raise InputError(f"the shape {name} must be a grey-scale picture (h, w), got {pixels.shape} pixels")
-    if not np.isfinite(pixels).all():
-        raise InputError(f"the shape {name} has pixels that are NaN or infinite: give it finite grey values")
-    if pixels.min() < 0:
+    usable = pixels.ndim == 2 and np.isfinite(pixels).all() and pixels.min(initial=0) >= 0 and pixels.any()
+    if not usable:
+        span = f" from {pixels.min():g} to {pixels.max():g}" if pixels.size else ""
         raise InputError(
-            f"the shape {name} has pixels below 0: pressure cannot pull; give it values from 0 up"
-        )
-    if pixels.max() == 0:
-        raise InputError(
-            f"the shape {name} is black all over, so it presses with no force: white = full pressure"
+            f"the shape {name} must be a grey-scale picture (h, w) of finite values from 0 up, not all "
+            f"0, got {pixels.shape} pixels{span}: white = full pressure"
         )
     return pixels / pixels.max()
 

@@ -1,6 +1,8 @@
 """Draw gestures with wanted labels and render their movies."""
 
+import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +14,6 @@ from skin.errors import InputError
 from skin.labels import TOUCH, measure
 from skin.touch._bodies import Fit
 from skin.touch._strokes import course
-from skin.touch._tally import Tally
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
 from skin.touch.movie import Movie, join
 from skin.touch.problem import Contact, ContactProblem, ContactResult
@@ -32,6 +33,37 @@ def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
     """Return label combinations (count, 4), bool: all 16 equally often, to within one, in random order."""
     order = generator.permutation(16)[np.arange(count) % 16]
     return (generator.permutation(order)[:, None] >> np.arange(4) & 1).astype(bool)
+
+
+@dataclass(frozen=True)
+class _Tally:
+    """Counts per gesture (B,), which grow as the search goes on.
+
+    Attributes:
+        draws: how many paths were drawn.
+        unconverged: frames whose pressure was not found.
+        misfits: bodies that had no room on the sheet.
+    """
+
+    draws: np.ndarray
+    unconverged: np.ndarray
+    misfits: np.ndarray
+
+    @classmethod
+    def of(cls, count: int) -> "_Tally":
+        """Return one that begins at 0."""
+        return cls(*np.zeros((3, count)))
+
+    def warn(self) -> None:
+        """Say how many frames were not found, if any."""
+        lost = int(self.unconverged.sum())
+        if lost:
+            warnings.warn(
+                f"{lost} frames were not found to contact.tolerance in contact.iterations; their gestures "
+                "were drawn again: raise contact.iterations or contact.tolerance",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
 
 class TouchSampler:
@@ -87,7 +119,7 @@ class TouchSampler:
         wanted = balanced(count, generator) if labels is None else labels
         redraws = self.settings.redraws
         pending = np.arange(count)
-        tally = Tally.of(count)
+        tally = _Tally.of(count)
         kept = self.fit and self.fit.draw(wanted[:, 0], generator)
         found: list[np.ndarray] = []
         movies: list[Movie] = []
@@ -121,7 +153,7 @@ class TouchSampler:
         return join(movies)[torch.from_numpy(np.concatenate(found).argsort())]
 
     def _round(
-        self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: Tally
+        self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: _Tally
     ) -> tuple[np.ndarray, np.ndarray, Movie]:
         """Try one path per row of ``chance`` (A, B, 5) for each pending gesture, and count.
 

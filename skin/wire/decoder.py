@@ -5,7 +5,6 @@ import numpy as np
 from skin.errors import InputError
 from skin.signal.frame import After, Counters, Frame, FrameError
 from skin.wire.detect import Format, Found, Raw, Speech, detect, refusal
-from skin.wire.quality import Quality
 from skin.wire.sequence import HostClock, Order
 from skin.wire.text import Header, parse_header
 
@@ -16,6 +15,8 @@ _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
 _PAUSE = 0.2  # s: what a silence counts for, because a board may take seconds to start
 _PER_FIELD = 12  # bytes
+_SPAN = 2.0  # s over which good frames are compared with bad ones
+_FEW = 3  # bad frames that say nothing yet
 
 
 class Decoder:
@@ -36,7 +37,7 @@ class Decoder:
 
     def __init__(self, sensors: int | None = None, format: Format = "auto") -> None:
         self.sensors, self.format = sensors, format
-        self.counters, self.quality = Counters(), Quality()
+        self.counters, self.quality = Counters(), _Quality()
         self.header: Header | None = None
         self._order, self._clock = Order(), HostClock()
         self._all_valid = np.ones(sensors or 0, dtype=bool)
@@ -152,3 +153,36 @@ class Decoder:
         if after and after != "gap":
             self._clock.restart()
         return Frame(raw.seq, t, self._clock(t, now), raw.values, self._all_valid, segment, lost, after)
+
+
+class _Quality:
+    """Compares good with bad frames over two seconds at a time.
+
+    Attributes:
+        trouble: the sentence for a person; empty while most frames are good.
+    """
+
+    def __init__(self) -> None:
+        self.trouble = ""
+        self._since: float | None = None
+        self._good = self._bad = 0
+        self._latest = FrameError("")
+
+    def note(self, bad: FrameError) -> None:
+        """Keep what the latest bad frame was like."""
+        self._latest = bad
+
+    def count(self, now: float, good: int, bad: int) -> None:
+        """Add what came by ``now``, s."""
+        self._since = now if self._since is None else self._since
+        self._good += good
+        self._bad += bad
+        if now - self._since >= _SPAN:
+            self.trouble = self._sentence() if self._bad > max(self._good, _FEW) else ""
+            self._since, self._good, self._bad = now, 0, 0
+
+    def _sentence(self) -> str:
+        share = f"{self._bad} of {self._bad + self._good} frames in {_SPAN:g} s were bad"
+        if self._latest.reason == "fields":
+            return f"{share}: the device sends {self._latest.found} values per frame now"
+        return f"{share} ({self._latest.reason}): wrong baud rate or format?"

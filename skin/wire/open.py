@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from math import inf
-from typing import TYPE_CHECKING, Any, Protocol, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
+from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from skin.errors import InputError
+from skin.settings import RISING, checked
 from skin.wire.decoder import Decoder
 from skin.wire.detect import Format
 from skin.wire.feed import Feed, Piece, Player, Wire
@@ -35,6 +37,14 @@ class Streamed(Protocol):
         """Return a stream in one piece; ``whole.touches`` are its touches."""
 
 
+def _ordered(limits: Limits) -> Limits:
+    known = [limit for limit in limits if limit is not None]
+    if sorted(set(known)) != known:
+        raise ValueError("must be [smallest, largest]")
+    return limits
+
+
+@checked("device")
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How a skin is read.
@@ -57,30 +67,15 @@ class Settings:
         InputError: a setting that cannot be used.
     """
 
-    baudrate: int = 115200
+    baudrate: PositiveInt = 115200
     format: Format = "auto"
-    limits: tuple[float | None, float | None] | None = None
-    timeout: float = 5.0
-    queue: int = 4096
+    limits: Annotated[Limits, AfterValidator(_ordered)] | None = None
+    timeout: PositiveFloat = 5.0
+    queue: PositiveInt = 4096
     reconnect: bool = False
-    backoff: tuple[float, float] = (1.0, 10.0)
-    silence: float | None = 5.0
+    backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
+    silence: NonNegativeFloat | None = 5.0
     realtime: bool = True
-
-    def __post_init__(self) -> None:
-        if self.format not in get_args(Format):
-            raise InputError(f"device.format must be one of {', '.join(get_args(Format))}, got {self.format}")
-        for name in ("baudrate", "timeout", "queue"):
-            if not 0 < getattr(self, name) < inf:
-                raise InputError(f"device.{name} must be above 0, got {getattr(self, name)}")
-        if self.limits is not None:
-            known = [limit for limit in self.limits if limit is not None]
-            if len(self.limits) != 2 or sorted(set(known)) != known:
-                raise InputError(f"device.limits must be [smallest, largest], got {list(self.limits)}")
-        if len(self.backoff) != 2 or not 0 < self.backoff[0] <= self.backoff[1] < inf:
-            raise InputError(f"device.backoff must be [first, longest] in s, got {list(self.backoff)}")
-        if self.silence is not None and not 0 <= self.silence < inf:
-            raise InputError(f"device.silence must be in s, or 0 for never, got {self.silence}")
 
 
 def open_skin(

@@ -15,7 +15,7 @@ from skin.labels import OPPOSITE, Task
 from skin.rng import Stream, generator
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.listener import Tap
+from skin.wire.announcement import Tap
 
 __all__ = ["AbstractDirector", "Announced", "Continuous", "Prompted", "Take", "plan", "sentence", "typed"]
 

@@ -33,8 +33,8 @@ def test_a_graph_per_frame_is_taken():
 
 
 def test_an_unknown_head_is_refused():
-    names = r"mean, max, conv, lstm, gru, attention\+gru, residual, transformer"
-    with pytest.raises(InputError, match=rf"unknown head 'tcn': set fusion\.head to one of {names}"):
+    names = r"'mean', 'max', 'conv', 'lstm', 'gru', 'attention\+gru', 'residual' or 'transformer'"
+    with pytest.raises(InputError, match=rf"fusion\.head=tcn must be {names}"):
         Late(MODEL, "readings", (4,), 6, head="tcn")
 
 
@@ -42,8 +42,8 @@ def test_an_unknown_head_is_refused():
     ("head", "hidden", "words"),
     [
         ("transformer", 30, r"got fusion\.hidden=30: set fusion\.hidden=32"),
-        ("gru", 0, r"at least 1 wide, got 0: set e\.g\. fusion\.hidden=64"),
-        ("transformer", -4, r"at least 1 wide, got -4"),
+        ("gru", 0, r"fusion.hidden=0 must be greater than 0: as in fusion.hidden=64"),
+        ("transformer", -4, r"fusion.hidden=-4 must be greater than 0"),
     ],
 )
 def test_a_width_that_a_head_cannot_have_is_refused(head, hidden, words):

@@ -36,14 +36,14 @@ def test_without_a_tilt_sensors_face_the_surface_to_the_last_bit():
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"tilt": -0.1}, "layout.tilt must be an angle in rad from 0 to below pi/2"),
-        ({"tilt": np.pi / 2}, "layout.tilt must be an angle"),
-        ({"tilt": float("nan")}, "layout.tilt must be an angle"),
-        ({"tilt": "much"}, "layout.tilt must be an angle.*'much'"),
-        ({"rows": 0}, "layout.rows must be a whole number of at least 1, got 0"),
-        ({"columns": 2.5}, "layout.columns must be a whole number"),
-        ({"footprint": [0.01, 0]}, "layout.footprint must be two positive lengths"),
-        ({"footprint": [0.01]}, "layout.footprint must be two positive lengths"),
+        ({"tilt": -0.1}, "layout.tilt=-0.1 must be greater than or equal to 0"),
+        ({"tilt": np.pi / 2}, "layout.tilt=1.57.* must be less than 1.57"),
+        ({"tilt": float("nan")}, "layout.tilt=nan must be a finite number"),
+        ({"tilt": "much"}, "layout.tilt=much must be a valid number"),
+        ({"rows": 0}, "layout.rows=0 must be greater than 0: as in layout.rows=5"),
+        ({"columns": 2.5}, "layout.columns=2.5 must be a valid integer"),
+        ({"footprint": [0.01, 0]}, "layout.footprint=.* must be greater than 0"),
+        ({"footprint": [0.01]}, "layout.footprint=.* has too few entries"),
     ],
 )
 def test_what_is_no_grid_is_refused(options, says):

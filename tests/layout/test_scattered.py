@@ -49,5 +49,5 @@ def test_seeds_differ():
 
 @pytest.mark.parametrize("jitter", [-0.1, 0.5])
 def test_a_jitter_at_which_sensors_could_meet_is_refused(jitter):
-    with pytest.raises(InputError, match=r"layout\.jitter must be at least 0 and below 0\.5"):
+    with pytest.raises(InputError, match=r"layout\.jitter=.* must be .*: as in layout.jitter=0\.25"):
         Scattered(jitter=jitter)

@@ -90,8 +90,8 @@ def test_a_graph_of_one_sensor_can_be_normed():
     ("options", "words"),
     [
         ({"widths": []}, "model.widths="),
-        ({"pooling": "set3set"}, "model.pooling to one of max, mean, attention, set2set"),
-        ({"norm": "group"}, "model.norm to one of none, layer, batch, instance"),
+        ({"pooling": "set3set"}, "model.pooling=set3set must be 'max', 'mean', 'attention' or 'set2set'"),
+        ({"norm": "group"}, "model.norm=group must be 'none', 'layer', 'batch' or 'instance'"),
         ({"activation": "tanh"}, "activation=relu, elu or silu"),
     ],
 )

@@ -48,7 +48,7 @@ def test_neighbours_are_those_of_the_graph():
     [
         (["+model.network.headz=4"], "model.network refuses its settings: .*headz"),
         (["model.width=0"], "model.width=0 must be greater than or equal to 1"),
-        (["model.pooling=sum"], "set model.pooling to one of"),
+        (["model.pooling=sum"], "model.pooling=sum must be 'max', 'mean'"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(configured, made_up_device, overrides, said):

@@ -76,8 +76,8 @@ def test_layers_start_different():
             {"width": 10},
             "4 heads of attention must share the width equally, got model.width=10: set model.width=12",
         ),
-        ({"layers": 0}, "at least one layer, head and feature, got layers 0"),
-        ({"pooling": "attention"}, "model.pooling=mean or max"),
+        ({"layers": 0}, "model.layers=0 must be greater than 0"),
+        ({"pooling": "attention"}, "model.pooling=attention must be 'mean' or 'max'"),
     ],
 )
 def test_bad_options_are_refused(options, words):

@@ -86,11 +86,14 @@ def test_normalised_by_hand():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"edges": "ring"}, "representation.edges=knn or delaunay"),
+        ({"edges": "ring"}, "representation.edges=ring must be 'knn' or 'delaunay'"),
         ({"count": 0}, "representation.count=6"),
-        ({"weight": "density"}, "representation.weight=exp, distance, stiffness or none"),
+        (
+            {"weight": "density"},
+            "representation.weight=density must be 'exp', 'distance', 'stiff",
+        ),
         ({"weight": "stiffness"}, "set representation.body="),
-        ({"positions": "moving"}, "representation.positions=layout or deformed"),
+        ({"positions": "moving"}, "representation.positions=moving must be 'layout' or 'deformed'"),
         ({"positions": "deformed", "weight": "none"}, "changes nothing at representation.weight=none"),
     ],
 )
@@ -256,5 +259,5 @@ def test_late_fusion_takes_a_graph_per_frame():
 @pytest.mark.parametrize("fusion", [Early, Linked])
 def test_the_other_fusions_refuse_a_graph_per_frame(fusion):
     built = fusion(lambda kind, shape: Gcn(kind, shape, [6]), "graph", (9, 1), 5)
-    with pytest.raises(InputError, match="use fusion=late"):
+    with pytest.raises(InputError, match="one graph per frame needs fusion=late"):
         built(Graph(PLACES, BODY.size, positions="deformed").show(touches(moves())))

@@ -70,5 +70,5 @@ def test_the_generator_decides(touches):
 
 
 def test_what_cannot_be_is_refused(touches):
-    with pytest.raises(InputError, match=r"data\.augment\.noise must be at least 0"):
+    with pytest.raises(InputError, match=r"data\.augment\.noise=-1 must be"):
         Augmentation(noise=-1)

@@ -272,8 +272,8 @@ def test_thin_wide_cells_are_springs_of_their_own_moduli():
     [
         (0.003, {}, r"sensor 1 lies 0.003 m deep.*0.005, 0 m.*depth_m.*simulator=solid"),
         (0.015, {}, r"sensor 1 lies 0.015 m deep"),
-        (0.005, {"reading": "both"}, r"simulator.reading must be equation10 or interface, got both"),
-        (0.005, {"constraint": "none"}, r"simulator.constraint must be vertical or free, got none"),
+        (0.005, {"reading": "both"}, r"simulator.reading=both must be 'equation10' or 'interface'"),
+        (0.005, {"constraint": "none"}, r"simulator.constraint=none must be 'vertical' or 'free'"),
     ],
 )
 def test_what_it_cannot_simulate_is_refused(depth, options, says, cache):

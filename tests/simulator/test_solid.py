@@ -162,7 +162,7 @@ def test_operators_are_kept(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"divisions": 0}, r"divisions must be .* got 0"),
+        ({"divisions": 0}, r"simulator.divisions=0 must be greater than 0"),
         ({"poisson": {"muscle": 0.5}}, r"muscle has Poisson's ratio 0\.5.*poisson=\{muscle: 0\.49\}"),
         ({"poisson": {"mussel": 0.4}}, r"names mussel, but the body is made of EcoFlex 00-30, muscle"),
     ],

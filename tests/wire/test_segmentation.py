@@ -11,8 +11,7 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.signal.frame import Frame
 from skin.signal.resampling import Window
-from skin.wire.announcement import Announcement, encode
-from skin.wire.listener import Tap
+from skin.wire.announcement import Announcement, Tap, encode
 from skin.wire.segmentation import Announced, Continuous, Prompted, plan
 
 LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}

@@ -13,7 +13,7 @@ import pyarrow.parquet
 
 from skin.body._memory import require_memory
 from skin.errors import InputError
-from skin.files import whole, write
+from skin.files import tabular, whole, write
 
 __all__ = ["load", "numbers", "save"]
 
@@ -32,9 +32,7 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     Raises:
         InputError: no such file, another ending, unreadable, or no rows.
     """
-    path = Path(path).expanduser()
-    if path.suffix not in (".csv", ".parquet"):
-        raise InputError(f"{what} is a .csv or .parquet file, got {path.name}")
+    path = tabular(path, f"a {what}")
     if not path.is_file():
         raise InputError(f"no {what} {path}")
     try:
@@ -48,14 +46,14 @@ def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
             table = pa.csv.read_csv(pa.py_buffer(_rows(path)))
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
+        if not isinstance(about, dict):
+            raise ValueError(f"it says {about!r} of itself, needed is an object, as in {{}}")
+        if not len(table):
+            raise ValueError("it has no rows below its header")
     except InputError:
         raise
     except (OSError, pa.ArrowException, ValueError, RecursionError) as error:
         raise InputError(f"cannot read the {what} {path}: {' '.join(str(error).split())}") from error
-    if not isinstance(about, dict):
-        raise InputError(f"the {what} {path} says {about!r} of itself, needed is an object, as in {{}}")
-    if not len(table):
-        raise InputError(f"the {what} {path} has no rows below its header")
     return table.rename_columns([name.strip() for name in table.column_names]), about
 
 
@@ -81,9 +79,7 @@ def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path)
     Raises:
         InputError: another ending, or the file cannot be written.
     """
-    path, table = Path(path).expanduser(), pa.table(dict(columns))
-    if path.suffix not in (".csv", ".parquet"):
-        raise InputError(f"a session is a .csv or .parquet file, got {path.name}: as in session=bench.csv")
+    path, table = tabular(path, "a session"), pa.table(dict(columns))
     with whole(path) as partial:
         if path.suffix == ".parquet":
             pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
@@ -99,10 +95,9 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
     Raises:
         InputError: the column is missing or holds something else than numbers.
     """
-    if name not in table.column_names:
-        raise InputError(f"{where}: no column {name}, found {', '.join(table.column_names)}")
     try:
         # A copy, because Arrow's memory cannot be written to and torch warns of that.
         return np.array(table[name].cast(pa.float64()).to_numpy())
-    except pa.ArrowException as error:
-        raise InputError(f"{where}: column {name} must hold numbers: {error}") from error
+    except (KeyError, pa.ArrowException) as error:
+        found = ", ".join(table.column_names)
+        raise InputError(f"{where}: the column {name} must hold numbers, found {found}: {error}") from error

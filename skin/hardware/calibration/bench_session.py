@@ -2,20 +2,23 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from skin.errors import InputError
 from skin.hardware.calibration import gauge as gauges
 from skin.hardware.calibration._columns import load, numbers, save
 from skin.hardware.calibration.gauge import GAUGE, Gauge
+from skin.settings import checked
 
 __all__ = ["Session", "read", "write"]
 
-_UNITS = ("N", "adc")
 _OTHER = ("time", "t_us", "seq", *GAUGE)
 
 
+@checked("session")
 @dataclass(frozen=True)
 class Session:
     """What a skin said, and what pressed it meanwhile.
@@ -33,13 +36,11 @@ class Session:
 
     time: np.ndarray
     raw: np.ndarray
-    unit: str
+    unit: Literal["N", "adc"]
     gauge: Gauge | None = None
-    bits: int | None = None
+    bits: Annotated[int, Ge(1), Le(64)] | None = None
 
     def __post_init__(self) -> None:
-        if self.unit not in _UNITS:
-            raise InputError(f"the session's unit must be {' or '.join(_UNITS)}, got {self.unit}")
         if len(self.time) < 2:
             raise InputError(f"a session needs at least two frames, this one has {len(self.time)}")
         if (self.time == self.time[0]).all():
@@ -53,8 +54,6 @@ class Session:
                 f"the session's time must grow from frame to frame: after frame {back[0]} it goes from "
                 f"{before:.9g} to {after:.9g} s"
             )
-        if self.bits is not None and not (isinstance(self.bits, int) and 1 <= self.bits <= 64):
-            raise InputError(f"the session's bits must be a whole number from 1 to 64, got {self.bits}")
 
 
 def read(path: str | Path, indenter: str, radius: float, unit: str | None = None) -> Session:
@@ -86,7 +85,8 @@ def read(path: str | Path, indenter: str, radius: float, unit: str | None = None
         table = table.append_column("time", [time])
     rows = gauges.of_table(table, str(path), indenter, radius) if inside else None
     try:
-        return Session(time, raw, unit or about.get("unit", "N"), rows, about.get("bits"))
+        known: Any = unit or about.get("unit", "N")
+        return Session(time, raw, known, rows, about.get("bits"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import PositiveFloat
 
 from skin.device.base import AbstractSimulated
-from skin.errors import InputError
 from skin.hardware.calibration.bench_session import Session, write
 from skin.hardware.calibration.gauge import Gauge, per_newton
+from skin.settings import configured
 
 __all__ = ["Protocol", "demo", "emulate", "true_readings"]
 
@@ -31,25 +32,17 @@ class Protocol:
         indenter: name as in ``touch.shapes``.
         radius: half its larger extent, m.
         rate: of gauge and session, Hz.
-
-    Raises:
-        InputError: a number that is not above 0.
     """
 
-    peak: float = 120.0
+    peak: PositiveFloat = 120.0
     steps: Sequence[float] = (0.1, 0.2, 0.4, 0.7, 1.0)
-    hold: float = 0.3
-    ramp: float = 0.05
-    idle: float = 3.0
-    rest: float = 2.0
+    hold: PositiveFloat = 0.3
+    ramp: PositiveFloat = 0.05
+    idle: PositiveFloat = 3.0
+    rest: PositiveFloat = 2.0
     indenter: str = "blurred_disc"
-    radius: float = 0.01
-    rate: float = 100.0
-
-    def __post_init__(self) -> None:
-        for name in ("peak", "hold", "ramp", "idle", "rest", "radius", "rate"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"calibrate.protocol.{name} must be above 0, got {getattr(self, name)}")
+    radius: PositiveFloat = 0.01
+    rate: PositiveFloat = 100.0
 
     def gauge(self, places: np.ndarray) -> Gauge:
         """Return a gauge's rows for presses at places (P, 2), m."""
@@ -120,10 +113,7 @@ def demo(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> s
     Raises:
         InputError: a protocol that cannot be used.
     """
-    try:
-        protocol = Protocol(**settings["protocol"])
-    except TypeError as error:
-        raise InputError(f"calibrate.protocol: {error}") from error
+    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
     randomness = np.random.default_rng(device.seed)
     rows = protocol.gauge(protocol.places(device, randomness))
     session = emulate(device, rows, protocol, randomness, settings["bits"])

@@ -1,17 +1,18 @@
 """The emulated skin: plays gestures into an outlet in real time."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import islice
 from threading import Event
 from time import monotonic
-from typing import Any, get_args
+from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from skin.device.base import AbstractSimulated
-from skin.errors import InputError
 from skin.hardware.emulator.faults import BANNER, KINDS, Faults
 from skin.hardware.emulator.gestures import Converter, Gesture, gestures, in_time
 from skin.hardware.emulator.outlet import AbstractOutlet
@@ -42,40 +43,17 @@ class Settings:
         announce: tell every gesture before it is played, in the text format.
         seed: of the gestures and of the faults; the device's own noise follows ``device.seed``.
         id: its name.
-
-    Raises:
-        InputError: a setting that cannot be used.
     """
 
-    rate: float = 100.0
-    speed: float = 1.0
-    bits: int | None = 10
+    rate: PositiveFloat = 100.0
+    speed: PositiveFloat = 1.0
+    bits: Annotated[int, Ge(2), Le(16)] | None = 10
     check: Check = "crc16"
-    idle: float = 3.0
-    gap: float = 0.5
+    idle: NonNegativeFloat = 3.0
+    gap: NonNegativeFloat = 0.5
     announce: bool = True
-    seed: int = 0
+    seed: NonNegativeInt = 0
     id: str = "emulated"
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "speed"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"emulate.{name} must be above 0, got {getattr(self, name)}")
-        for name in ("idle", "gap", "seed"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"emulate.{name} must be at least 0, got {getattr(self, name)}")
-        if self.bits is not None and not 2 <= self.bits <= 16:
-            raise InputError(f"emulate.bits must be 2 to 16, or null for N, got {self.bits}")
-        if self.check not in get_args(Check):
-            raise InputError(f"emulate.check must be one of {', '.join(get_args(Check))}, got {self.check}")
-
-    @classmethod
-    def of(cls, given: dict[str, Any]) -> "Settings":
-        """Return the settings that a configuration means."""
-        if unknown := sorted(set(given) - {entry.name for entry in fields(cls)}):
-            known = ", ".join(entry.name for entry in fields(cls))
-            raise InputError(f"emulate has no {', '.join(unknown)}: it takes {known}")
-        return cls(**given)
 
 
 class Emulator:
@@ -108,9 +86,7 @@ class Emulator:
         faults.fits(len(device.sensors))
         self.device, self.outlet, self.settings, self.faults = device, outlet, settings, faults
         self.converter = Converter(settings.bits, float(device.constants.clip.max()))
-        self._told = told
-        self.binary = binary
-        self.frames = 0
+        self._told, self.binary, self.frames = told, binary, 0
         self._number = self._zero = 0
         self._held: np.ndarray | None = None
         self._silent_until = -1

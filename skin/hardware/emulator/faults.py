@@ -1,10 +1,12 @@
 """Faults of an emulated skin, injected on request."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Le
+from pydantic import NonNegativeFloat, NonNegativeInt
 
 from skin.errors import InputError
 
@@ -15,6 +17,9 @@ BANNER = b"\x00\xff\x00ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET),boot:
 
 KINDS = ("silence", "reset", "unplug")
 """What happens at a moment."""
+
+Share = Annotated[float, Ge(0), Le(1)]
+Often = NonNegativeFloat | Sequence[NonNegativeFloat]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,38 +40,19 @@ class Faults:
         stuck: channels, from 0, that repeat what they said at ``since``.
         dead: channels that say 0 from ``since`` on.
         since: s.
-
-    Raises:
-        InputError: a share outside of 0 to 1, or a negative number.
     """
 
-    flipped_bits: float = 0.0
-    lost_bytes: float = 0.0
+    flipped_bits: Share = 0.0
+    lost_bytes: Share = 0.0
     banner: bool = False
-    silence: float | Sequence[float] = 0.0
-    reset: float | Sequence[float] = 0.0
-    unplug: float | Sequence[float] = 0.0
-    silent: float = 2.0
-    away: float = 2.0
-    stuck: Sequence[int] = ()
-    dead: Sequence[int] = ()
-    since: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("flipped_bits", "lost_bytes"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"faults.{name} is a share from 0 to 1, got {getattr(self, name)}")
-        for name in (*KINDS, "silent", "away", "since", "stuck", "dead"):
-            if not np.all(np.asarray(getattr(self, name), dtype=float) >= 0):
-                raise InputError(f"faults.{name} must be at least 0, got {getattr(self, name)}")
-
-    @classmethod
-    def of(cls, given: dict[str, Any]) -> "Faults":
-        """Return the faults that a configuration asks for."""
-        if unknown := sorted(set(given) - {entry.name for entry in fields(cls)}):
-            known = ", ".join(entry.name for entry in fields(cls))
-            raise InputError(f"faults has no {', '.join(unknown)}: it takes {known}")
-        return cls(**given)
+    silence: Often = 0.0
+    reset: Often = 0.0
+    unplug: Often = 0.0
+    silent: NonNegativeFloat = 2.0
+    away: NonNegativeFloat = 2.0
+    stuck: Sequence[NonNegativeInt] = ()
+    dead: Sequence[NonNegativeInt] = ()
+    since: NonNegativeFloat = 0.0
 
     def fits(self, sensors: int) -> None:
         """Raise InputError where a broken channel does not exist."""

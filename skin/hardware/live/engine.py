@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from skin.errors import InputError
 from skin.evaluation.report import Answers
 from skin.hardware.live.verdict import Debounce, Patience, Verdict
 from skin.labels import Task
 from skin.recording import Touches
+from skin.settings import checked
 from skin.signal.contact_detection import DRIFT, Contact
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
@@ -19,6 +20,7 @@ from skin.wire.conversion import Newtons
 __all__ = ["Detection", "Engine"]
 
 
+@checked("detection")
 @dataclass(frozen=True)
 class Detection:
     """What counts as a contact.
@@ -33,18 +35,10 @@ class Detection:
         InputError: a value that cannot be used.
     """
 
-    threshold: float
-    drift: float = DRIFT
+    threshold: PositiveFloat
+    drift: NonNegativeFloat = DRIFT
     learned: bool = False
     longest: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.threshold < np.inf:
-            raise InputError(f"live.touch must be above 0 N, got {self.threshold}: as in live.touch=0.3")
-        if not 0 <= self.drift < np.inf:
-            raise InputError(
-                f"live.drift must be 0 N or more, got {600 * self.drift:g}: as in live.drift=0.2"
-            )
 
 
 class Engine:

@@ -98,8 +98,7 @@ def trials(device: AbstractSimulated, course: str, number: int, seed: int = 0) -
             yield gesture.force
             continue
         strongest = gesture.force[gesture.force.sum(axis=1).argmax()]
-        time = np.arange(0.0, 2000.0, 1 / device.rate)
-        load = profile(time)
+        load = profile(np.arange(0.0, 2000.0, 1 / device.rate))
         yield load[: np.flatnonzero(load)[-1] + 2, None] * strongest
 
 

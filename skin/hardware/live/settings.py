@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from annotated_types import Ge, Gt, Le
 
 from skin.hardware.live.verdict import Patience
-from skin.settings import check
+from skin.settings import configured
 
 __all__ = ["Settings"]
 
@@ -37,6 +37,5 @@ class Settings:
         Raises:
             InputError: one that is unknown or cannot be used.
         """
-        check(cls, live, "live")
-        check(Patience, live["patience"], "live.patience")
-        return cls(**{**live, "patience": Patience(**live["patience"])})
+        patience = configured(Patience, live["patience"], "live.patience")
+        return configured(cls, {**live, "patience": patience}, "live")

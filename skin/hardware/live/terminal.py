@@ -38,21 +38,22 @@ def shown(board: Board, console: Console) -> Iterator[None]:
         # Where the program is sent to the background, keys are no longer heard; it must not be stopped.
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
     Thread(target=_hear, args=(board,), name="skin-keys", daemon=True).start()
-    if not console.is_terminal:
-        thread = Thread(target=lines, args=(board, console), name="skin-lines", daemon=True)
-        thread.start()
+    live = Live(get_renderable=_Screen(board), console=console, refresh_per_second=_HERTZ, transient=True)
+    with live if console.is_terminal else _printed(board, console):
         try:
             yield
         finally:
             board.closed.set()
-            thread.join(2)
-        return
-    draw = _Screen(board)
-    with Live(get_renderable=draw, console=console, refresh_per_second=_HERTZ, transient=True):
-        try:
-            yield
-        finally:
-            board.closed.set()
+
+
+@contextmanager
+def _printed(board: Board, console: Console) -> Iterator[None]:
+    thread = Thread(target=lines, args=(board, console), name="skin-lines", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join(2)
 
 
 def _hear(board: Board) -> None:
@@ -67,8 +68,7 @@ def lines(board: Board, console: Console) -> None:
     """Print what is said whenever it changes, until the board is closed."""
     before = ""
     while True:
-        look = board.look()
-        said = _sentence(look)
+        said = _sentence(board.look())
         if said != before:
             console.print(said, markup=False, highlight=False, soft_wrap=True)
             before = said

@@ -1,10 +1,13 @@
 """The verdict on a window, and how long it must persist before it is shown."""
 
 from dataclasses import dataclass, field
-from math import inf
+from typing import Annotated
 
-from skin.errors import InputError
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import NonNegativeFloat
+
 from skin.labels import OPPOSITE
+from skin.settings import checked
 
 __all__ = ["Debounce", "Patience", "Verdict"]
 
@@ -45,13 +48,15 @@ class Verdict:
         return [(word, chance) for word, chance in pairs if word]
 
 
+@checked("live.patience")
 @dataclass(frozen=True)
 class Patience:
     """How long an answer must hold before it is said, and be gone before it is taken back, s.
 
     Attributes:
         label: of any label but ``dangerous``, and of touch.
-        alarm: of ``dangerous`` before it is said: 50 ms after the frame that shows it are too late.
+        alarm: of ``dangerous`` before it is said; after more than 0.03 s it would be said too late,
+            50 ms after the frame that shows it.
         calm: before it is taken back.
         above: probability above which a touch is said to be dangerous; None: as the run stores it.
 
@@ -59,20 +64,10 @@ class Patience:
         InputError: a negative time, an alarm that would come too late, or no probability.
     """
 
-    label: float = 0.15
-    alarm: float = 0.02
-    calm: float = 0.5
-    above: float | None = None
-
-    def __post_init__(self) -> None:
-        times = self.label, self.alarm, self.calm
-        # A time that is NaN would never pass, and so hide every alarm.
-        if not all(0 <= time < inf for time in times) or not (self.above is None or 0 < self.above < 1):
-            raise InputError(f"live.patience takes times from 0 s up and above= between 0 and 1, got {self}")
-        if self.alarm > 0.03:
-            raise InputError(
-                f"live.patience.alarm={self.alarm:g} would say danger later than 50 ms: give 0.03 s at most"
-            )
+    label: NonNegativeFloat = 0.15
+    alarm: Annotated[float, Ge(0), Le(0.03)] = 0.02
+    calm: NonNegativeFloat = 0.5
+    above: Annotated[float, Gt(0), Lt(1)] | None = None
 
 
 @dataclass

@@ -11,8 +11,9 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from skin.errors import InputError
+from skin.files import unwritable
 
-__all__ = ["Lines", "locked", "opened", "sealed", "write_whole"]
+__all__ = ["Lines", "locked", "opened", "sealed"]
 
 _SUM = ', "sum": "'
 
@@ -94,26 +95,11 @@ def locked(path: Path) -> Iterator[None]:
             f"{path} is being recorded by another process: end that, or give another out="
         ) from error
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}: give another out=") from error
+        raise unwritable(path, error, "out=FILE.csv") from error
     try:
         yield
     finally:
         lock.release()
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file under another name and let it reach the disk before it takes its place; or OSError."""
-    partial = path.with_name(path.name + ".part")
-    try:
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise
 
 
 def sealed(event: str, **what: Any) -> tuple[str, str]:

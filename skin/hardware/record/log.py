@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from skin import files
 from skin.errors import InputError
-from skin.hardware.record.lines import Lines, sealed, write_whole
+from skin.hardware.record.lines import Lines, sealed
 from skin.hardware.record.reading import read
 from skin.hardware.record.stored import Stored
 from skin.signal.frame import Frame
@@ -56,10 +57,10 @@ class Log:
             stored = self._resume(path, about, header)
             self._about = stored.about if stored else dict(about) | {"started_unix": time.time()}
             if stored is None:
-                write_whole(path.with_name(path.name + ".json"), json.dumps(self._about) + "\n")
-                write_whole(path, header)
+                files.write(json.dumps(self._about) + "\n", path.with_name(path.name + ".json"))
+                files.write(header, path)
         except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror}: give another out=") from error
+            raise files.unwritable(path, error, "out=FILE.csv") from error
         self._lines = Lines(path)
         self.done = set(stored.takes) if stored else set()
         self._last = stored.end if stored else -1.0
@@ -135,21 +136,17 @@ class Log:
 
 def check(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError where a session was recorded otherwise than the configuration or the device is now."""
-    both = {name: (about[name], value) for name, value in now.items() if name in about}
-    differ = {name: pair for name, pair in both.items() if pair[0] != pair[1]}
+    differ = {
+        name: (about[name], value) for name, value in now.items() if name in about and about[name] != value
+    }
     if "positions" in differ:
         raise InputError(f"{path} was recorded with another layout: give it, as in layout.path=FILE.csv")
-    if "unit" in differ:
-        raise InputError(
-            "{} was recorded in {}, the device sends {}: give another out=".format(path, *differ["unit"])
-        )
-    if None not in (pair := differ.get("id", (None,))):
-        raise InputError(
-            "{} was recorded from the device {}, this is {}: give another out=".format(path, *pair)
-        )
+    for name, words in (("unit", "in {}, the device sends {}"), ("id", "from the device {}, this is {}")):
+        if None not in (pair := differ.get(name, (None,))):
+            raise InputError(f"{path} was recorded {words.format(*pair)}: give another out=")
     if {"window", "rate"} & set(differ):
-        (window, new_window), (rate, new_rate) = both["window"], both["rate"]
+        window, rate = about["window"], about["rate"]
         raise InputError(
-            f"{path} has windows of {window} frames at {rate:g} Hz, the configuration has {new_window} at "
-            f"{new_rate:g} Hz: give touch.window={window} device.rate={rate:g}"
+            f"{path} has windows of {window} frames at {rate:g} Hz, the configuration has {now['window']} at "
+            f"{now['rate']:g} Hz: give touch.window={window} device.rate={rate:g}"
         )

@@ -41,9 +41,9 @@ def read(path: Path) -> Stored:
         InputError: no such file, or no session of skin record.
     """
     beside = path.with_name(path.name + ".json")
+    if path.exists() and not beside.exists():
+        raise InputError(f"{path} is no session of skin record: no {beside.name} is beside it")
     try:
-        if path.exists() and not beside.exists():
-            raise InputError(f"{path} is no session of skin record: no {beside.name} is beside it")
         reading = _Reading(_about(beside))
         with path.open("rb") as file:
             for number, line in enumerate(file, 1):
@@ -54,8 +54,6 @@ def read(path: Path) -> Stored:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     except _BAD as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{beside.name} is damaged or no session's: {error}") from error
     stored = reading.stored
     if stored.damaged and not stored.frames:

@@ -115,7 +115,7 @@ def test_a_recorded_session_is_read_without_its_damaged_lines(tmp_path, caplog):
     [
         ("time,a\n", "no rows"),
         ("time\n1\n2\n", "no column of a sensor"),
-        ("a,b\n1,2\n3,4\n", "no column time"),
+        ("a,b\n1,2\n3,4\n", "the column time must hold numbers, found a, b"),
         ("time,a\n1,2\n", "at least two frames, this one has 1"),
         ("time,a\n1,2\n1,3\n", "clock stood still: all 2 frames of the session have the time 1 s"),
         ("t_us,a\n5,2\n5,3\n5,2\n", "clock stood still: all 3 frames of the session have the time 5e-06 s"),

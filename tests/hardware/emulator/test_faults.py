@@ -5,6 +5,7 @@ import pytest
 
 from skin.errors import InputError
 from skin.hardware.emulator.faults import Faults
+from skin.settings import configured
 
 
 def test_no_fault_changes_nothing():
@@ -31,11 +32,15 @@ def test_a_rate_is_per_minute_and_a_list_is_moments():
 
 @pytest.mark.parametrize(
     ("given", "reason"),
-    [({"flip": 1}, "no flip"), ({"flipped_bits": 2}, "flipped_bits"), ({"reset": -1}, "reset")],
+    [
+        ({"flip": 1}, "faults has no setting flip"),
+        ({"flipped_bits": 2}, "flipped_bits"),
+        ({"reset": -1}, "reset"),
+    ],
 )
 def test_what_cannot_be_is_refused(given, reason):
     with pytest.raises(InputError, match=reason):
-        Faults.of(given)
+        configured(Faults, given, "faults")
 
 
 def test_a_channel_that_is_not_there():

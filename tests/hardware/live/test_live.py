@@ -101,7 +101,7 @@ def test_the_simulator_is_watched_without_hardware(run, store, tmp_path):
 @pytest.mark.parametrize(
     ("override", "needed"),
     [
-        ("live.patience.alarm=0.2", "give 0.03 s at most"),
+        ("live.patience.alarm=0.2", "must be less than or equal to 0.03"),
         ("run=none", "no finished training run none"),
     ],
 )

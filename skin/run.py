@@ -29,6 +29,7 @@ from skin.evaluation.report import Report, evaluate
 from skin.evaluation.show import report as show
 from skin.evaluation.show import table
 from skin.labels import Task
+from skin.learner.base import AbstractLearner
 from skin.option import option
 from skin.plot.figures import confusions, save
 from skin.recording import Touches, digest
@@ -63,11 +64,8 @@ def train(config: DictConfig) -> bool:
     A run that finished with the same fingerprint is not repeated, unless ``tracking.resume=false``.
     """
     quiet()
-    if (threads := config.tracking.threads) is not None:
-        if threads < 1:
-            raise InputError(f"tracking.threads={threads} must be at least 1, or null")
-        torch.set_num_threads(threads)
-    if rank_zero_only.rank:  # type: ignore[attr-defined]
+    _limit_threads(config.tracking.threads)
+    if getattr(rank_zero_only, "rank", 0):
         _join(config)
         return True
     store, identity = Store.open(config.tracking), tags(config)
@@ -90,14 +88,27 @@ def train(config: DictConfig) -> bool:
         point = choose(learner, device, config.evaluation)
         report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
-        with tempfile.TemporaryDirectory() as folder:
-            path = learner.save(Path(folder))
-            store.client.log_artifact(run.info.run_id, str(path))
-            store.client.set_tag(run.info.run_id, "learned", path.name)
+        _keep(store, run, learner)
         conclude(store, run, report, device.task, values)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
+
+
+def _limit_threads(number: int | None) -> None:
+    """Let torch use so many threads; None: as many as it likes."""
+    if number is not None:
+        if number < 1:
+            raise InputError(f"tracking.threads={number} must be at least 1, or null")
+        torch.set_num_threads(number)
+
+
+def _keep(store: Store, run: Run, learner: AbstractLearner) -> None:
+    """Log what was learned."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = learner.save(Path(folder))
+        store.client.log_artifact(run.info.run_id, str(path))
+        store.client.set_tag(run.info.run_id, "learned", path.name)
 
 
 def _join(config: DictConfig) -> None:

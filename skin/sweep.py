@@ -1,8 +1,6 @@
 """A sweep: one parent run in MLflow, one line of progress per job."""
 
 import atexit
-import csv
-import math
 import os
 import sys
 import time
@@ -18,8 +16,9 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import ROOT, checked, fingerprint, plain
+from skin.config import checked, plain
 from skin.errors import InputError
+from skin.progress import Progress, clock, seconds
 from skin.refusal import refusal
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     from skin.tracking import Store
 
-__all__ = ["Progress", "Sweep", "jobs"]
+__all__ = ["Sweep", "jobs"]
 
 
 def jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
@@ -36,45 +35,27 @@ def jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, 
     Args:
         overrides: of the command line; the later one of a key holds.
         parameters: ``hydra.sweeper.params``.
+
+    Raises:
+        InputError: an interval, which has no first and no last value to try.
     """
     # Only a loader knows the options that glob(...) means.
     loader = GlobalHydra.instance().config_loader() if GlobalHydra.instance().is_initialized() else None
     lines = [f"{key}={value}" for key, value in parameters.items()] + overrides
-    (found,) = BasicSweeper.split_arguments(OverridesParser.create(loader).parse_overrides(lines), None)
+    parsed = OverridesParser.create(loader).parse_overrides(lines)
+    for override in parsed:
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            key = override.get_key_element()
+            raise InputError(
+                f"{override.input_line} names no values to try: give {key}=1,2 or {key}=range(1,9,2)"
+            )
+    (found,) = BasicSweeper.split_arguments(parsed, None)
     return [_chosen(job) for job in found]
 
 
 def _chosen(overrides: Iterable[str]) -> dict[str, str]:
     """Return the keys and values of overrides."""
     return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
-
-
-class Progress:
-    """Counts jobs and estimates what is left.
-
-    Args:
-        seconds: what each job took before on some machine, in order; None where nobody knows.
-    """
-
-    def __init__(self, seconds: list[float | None]) -> None:
-        known = [value for value in seconds if value is not None]
-        typical = sum(known) / len(known) if known else 1.0
-        self._expected = [typical if value is None else value for value in seconds]
-        self._sure = bool(known)
-        self._spent = self._done = 0.0
-
-    def finish(self, number: int, seconds: float, skipped: bool) -> None:
-        """Note that a job has ended; one that was skipped says nothing about the machine's speed."""
-        if not skipped:
-            self._spent += seconds
-            self._done += self._expected[number]
-        self._expected[number] = 0.0
-
-    def left(self) -> float | None:
-        """Return the estimated rest, s, scaled by this machine's speed so far; None if nothing is known."""
-        if not self._done:
-            return sum(self._expected) if self._sure else None
-        return sum(self._expected) * self._spent / self._done
 
 
 class Sweep(Callback):
@@ -119,7 +100,7 @@ class Sweep(Callback):
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.run import PARENT, SWEPT
+        from skin.run import PARENT, SWEPT, tags
         from skin.tracking import Store
         from skin.variants import title
 
@@ -129,29 +110,31 @@ class Sweep(Callback):
         atexit.register(self._close)
         os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
         _share_cores(config.hydra.launcher)
-        self._fingerprints = [fingerprint(job) if job else "" for job in composed]
-        self._progress = Progress([_seconds(store, job) if job else None for job in composed])
+        identities = [tags(job) if job else {} for job in composed]
+        self._fingerprints = [one.get("fingerprint", "") for one in identities]
+        told = zip(composed, identities, strict=True)
+        self._progress = Progress([seconds(store, job, one) if job else None for job, one in told])
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
         self._began = time.monotonic()
         if self._parent:
             left = self._progress.left()
-            rest = "" if left is None else f" about {_clock(left)} left"
+            rest = "" if left is None else f" about {clock(left)} left"
             print(f"{self._label(config)} …{rest}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
         if not self._parent:
             return
-        seconds, skipped = time.monotonic() - self._began, job_return._return_value is False
+        took, skipped = time.monotonic() - self._began, job_return._return_value is False
         if job_return.status == JobStatus.FAILED:
             print(f"{self._label(config)} failed: {job_return._return_value}", file=sys.stderr, flush=True)
         elif skipped:
             print(f"{self._label(config)} was finished before", flush=True)
         else:
-            print(f"{self._label(config)} took {_clock(seconds)}", flush=True)
-        self._progress.finish(self._jobs.index(_chosen(config.hydra.overrides.task)), seconds, skipped)
+            print(f"{self._label(config)} took {clock(took)}", flush=True)
+        self._progress.finish(self._jobs.index(_chosen(config.hydra.overrides.task)), took, skipped)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
@@ -175,11 +158,12 @@ class Sweep(Callback):
         own = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
         keys = [key for key in self._swept if key != "seed"]
         found: dict[tuple[str, ...], list[Run]] = {}
-        for job, identity in zip(self._jobs, self._fingerprints, strict=True):
+        once = dict(zip(self._fingerprints, self._jobs, strict=True))  # seed=0,0 is one run
+        for identity, job in once.items():
             # One that was finished before counts, unless it was to be repeated.
             runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else own)
             found.setdefault(tuple(job[key] for key in keys), []).extend(runs[:1])
-        whole = sum(map(len, found.values())) == len(self._jobs)
+        whole = sum(map(len, found.values())) == len(once)
         store.client.set_terminated(parent.info.run_id, "FINISHED" if whole else "FAILED")
         if not store.find(**own):
             store.client.delete_run(parent.info.run_id)
@@ -218,28 +202,3 @@ def _share_cores(launcher: DictConfig) -> None:
     if parallel != 1:
         count = cores if parallel < 0 else min(parallel, cores)
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores // count)))
-
-
-def _seconds(store: "Store", config: DictConfig) -> float | None:
-    """Return how long the last finished run of the same row and simulator took, s.
-
-    Where there is none, the published table tells: its seconds per epoch times the epochs, and a third more
-    for the evaluation.
-    """
-    finished = store.find("FINISHED", row=config.row, simulator=config.data.name)
-    if finished:
-        info = finished[0].info
-        return (info.end_time - info.start_time) / 1e3
-    published, wanted = ROOT / "docs" / "results" / "table.csv", (config.row, config.data.name)
-    if not published.is_file():
-        return None
-    with published.open(newline="") as file:
-        for line in csv.DictReader(file):
-            if (line["row"], line["simulator"]) == wanted and line["seconds_per_epoch"]:
-                return 5 + 1.3 * config.trainer.max_epochs * float(line["seconds_per_epoch"])
-    return None
-
-
-def _clock(seconds: float) -> str:
-    minutes = math.ceil(seconds / 60)
-    return f"{seconds:.0f} s" if seconds < 90 else f"{minutes} min"

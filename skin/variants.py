@@ -1,6 +1,7 @@
 """The result of a sweep: mean and deviation over seeds of each of its variants."""
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
@@ -48,7 +49,9 @@ def log(
     store.log_metrics(parent, metrics)
     columns = dict.fromkeys(name for row in rows for name in row)
     table = {name: [row.get(name) for row in rows] for name in columns}
-    store.client.log_table(parent.info.run_id, table, "variants.json")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MLflow 3.17 chooses columns in a way that pandas 3 deprecates
+        store.client.log_table(parent.info.run_id, table, "variants.json")
 
 
 def _moments(runs: Sequence[Run]) -> dict[str, float]:

@@ -30,7 +30,7 @@ reload
 trained
 hardware
 plot
-console variants
+console progress variants
 run
 sweep
 commands

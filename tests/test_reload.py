@@ -14,7 +14,8 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import CONF, ROOT, Evaluation, Tracking, checked, plain
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.reload import TAG, changed, find, operating_point, restore
+from skin.identity import RENAMED
+from skin.reload import TAG, changed, configuration, find, operating_point, restore
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -230,6 +231,15 @@ def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store,
     with pytest.raises(InputError, match=rf"{name} of run .* is damaged or does not fit") as refused:
         restore(store, store.client.get_run(run.info.run_id), learner, data)
     assert "\n" not in str(refused.value)
+
+
+def test_a_class_that_moved_since_is_found_under_its_name_of_now(store, monkeypatch):
+    monkeypatch.setitem(RENAMED, "skin.learners.thresholds.Rules", "skin.learner.rules.Rules")
+    with store.run("moved", {"learned": "rules.json"}) as run:
+        text = "learner: {_target_: skin.learners.thresholds.Rules}"
+        store.client.log_text(run.info.run_id, text, "config.yaml")
+    found = configuration(store, run)
+    assert found == {"learner": {"_target_": "skin.learner.rules.Rules"}}
 
 
 def test_a_run_without_its_files_is_refused(store):

@@ -80,30 +80,36 @@ def test_no_threads_are_refused(configured):
 
 
 def logged(folder):
-    """Return name, status and number of training losses of every run."""
+    """Return (name, status, losses of validation by epoch) of every run that is no sweep, oldest first."""
     with sqlite3.connect(folder / "m.db") as database:
         found = database.execute(
-            "select name, status, (select count(*) from metrics where metrics.run_uuid = runs.run_uuid "
-            "and key = 'train_loss') from runs where name not like 'sweep%' order by name"
+            "select name, status, (select group_concat(value) from metrics "
+            "where metrics.run_uuid = runs.run_uuid and key = 'val_loss') "
+            "from runs where name not like 'sweep%' order by start_time"
         ).fetchall()
     database.close()
-    return found
+    return [(name, status, [float(loss) for loss in losses.split(",")]) for name, status, losses in found]
 
 
 @pytest.mark.slow
 def test_two_processes_make_one_run(run, tmp_path):
     """The second one, which Lightning starts as the command again, neither logs nor prints."""
+    given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
     two = ["trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu"]
-    done = run(tmp_path, "train", *SMALL, *two)
+    done = run(tmp_path, "train", *given, *two)
     assert done.returncode == 0, done.stderr
-    ((name, *others),) = logged(tmp_path)
-    assert others == ["FINISHED", 1]
+    ((name, status, losses),) = logged(tmp_path)
+    assert status == "FINISHED"
     assert "devices=2 strategy=ddp" in name
     assert done.stdout.count("overall/accuracy") == 1
     assert len([line for line in done.stderr.splitlines() if line.startswith("dangerous")]) == 1
     assert "GLOBAL_RANK" not in done.stderr
-    again = run(tmp_path, "train", *SMALL)  # on one process
-    assert "did this before" in again.stdout
+    alone = run(tmp_path, "train", *given)
+    assert "did this before" in alone.stdout
+    alone = run(tmp_path, "train", *given, "tracking.resume=false")
+    assert alone.returncode == 0, alone.stderr
+    assert losses == pytest.approx(logged(tmp_path)[1][2], rel=1e-5)
+    assert len(losses) == 2
 
 
 @pytest.mark.slow
@@ -111,7 +117,8 @@ def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
     done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two)
     assert done.returncode == 0, done.stderr
-    assert [others for name, *others in logged(tmp_path)] == [["FINISHED", 1]]
+    ((_, status, losses),) = logged(tmp_path)
+    assert (status, len(losses)) == ("FINISHED", 1)
 
 
 @pytest.mark.slow

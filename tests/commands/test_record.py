@@ -193,5 +193,5 @@ def test_what_cannot_be_recorded_is_one_sentence(record, tmp_path, lives, reason
 def test_a_silence_that_is_none_is_refused(record):
     refused(
         record(*FREE, "device.port=socket://127.0.0.1:1", "device.silence=-1"),
-        r"device\.silence must be in s",
+        r"device\.silence=-1 must be",
     )

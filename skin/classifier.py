@@ -68,7 +68,9 @@ class TouchClassifier(pl.LightningModule):
         widths = [fusion.width * (2 if summary else 1), *hidden]
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
-            layers += [*_dropped(dropout), nn.Linear(before, after), activation_of(activation)]
+            # Where nothing is dropped there is no layer for it, so that older weights keep their names.
+            dropped = [nn.Dropout(dropout)] if dropout else []
+            layers += [*dropped, nn.Linear(before, after), activation_of(activation)]
         self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
         self.task = task
         self._make_optimizer, self._warmup = optimizer, warmup
@@ -149,11 +151,6 @@ class TouchClassifier(pl.LightningModule):
         rate = optimizer.defaults["lr"]
         schedule = OneCycleLR(optimizer, rate, steps, pct_start=self._warmup, cycle_momentum=False)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-
-def _dropped(share: float) -> list[nn.Module]:
-    """Return a dropout as a list; none where nothing is dropped, so that older weights keep their names."""
-    return [nn.Dropout(share)] if share else []
 
 
 class _Standardised(nn.BatchNorm1d):

@@ -127,7 +127,9 @@ class _Batches:
     def __iter__(self) -> Iterator[Touches]:
         data = self.data
         if self.split != "train":
-            yield from map(data.touches(self.split).__getitem__, self._slices())
+            touches = data.touches(self.split)
+            for start in range(0, len(touches), data.batch_size):
+                yield touches[start : start + data.batch_size]
             return
         epoch = data.trainer.current_epoch if data.trainer else 0
         touches = data.touches(self.split, epoch)
@@ -146,7 +148,3 @@ class _Batches:
         if trainer is None or trainer.world_size == 1 or len(batch) < 2 * trainer.world_size:
             return batch
         return batch[trainer.global_rank :: trainer.world_size]
-
-    def _slices(self) -> Iterator[slice]:
-        size = self.data.batch_size
-        return (slice(start, start + size) for start in range(0, len(self.data.touches(self.split)), size))

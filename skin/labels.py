@@ -17,6 +17,7 @@ __all__ = [
     "Measures",
     "Task",
     "Thresholds",
+    "longest_run",
     "measure",
     "movie_labels",
     "sliding",
@@ -200,7 +201,7 @@ def measure(
     places = centre[index]
     distance = torch.linalg.vector_norm(places - places[torch.arange(len(places)), first][:, None], dim=-1)
     travel = distance.where(touched, 0).amax(1)
-    return Measures(area, travel, _longest_run(touched), pressure)
+    return Measures(area, travel, longest_run(touched), pressure)
 
 
 def _means(frames: Tensor, footprints: Tensor, cell: tuple[float, float]) -> tuple[Tensor, Tensor]:
@@ -215,13 +216,11 @@ def _means(frames: Tensor, footprints: Tensor, cell: tuple[float, float]) -> tup
     return means[:, :-3], means[:, -2:] / means[:, -3:-2].clamp(min=1e-30)
 
 
-def _longest_run(touched: Tensor) -> Tensor:
-    """Return the length of the longest run of true values along the last axis of (B, T)."""
-    run = longest = torch.zeros(len(touched), dtype=torch.long, device=touched.device)
-    for column in touched.long().unbind(1):
-        run = (run + 1) * column
-        longest = torch.maximum(longest, run)
-    return longest
+def longest_run(active: Tensor) -> Tensor:
+    """Return the length of the longest run of true values over time, (B, ...), of active (B, T, ...)."""
+    passed = active.cumsum(dim=1, dtype=torch.int32)
+    before = torch.where(active, 0, passed).cummax(dim=1).values
+    return (passed - before).amax(dim=1)
 
 
 def movie_labels(

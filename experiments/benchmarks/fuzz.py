@@ -51,7 +51,10 @@ def fuzz(
     Raises:
         Exception: whatever the decoder raises; it should not.
     """
-    rng, decoder = Random(f"{spoken} {sensors} {seed}"), Decoder(sensors, _format(spoken))
+    rng, decoder = (
+        Random(f"{spoken} {sensors} {seed}"),
+        Decoder(sensors, "binary" if spoken == "binary" else "text"),
+    )
     stream = _Stream(rng, spoken, sensors)
     oracle = _Oracle(stream)
     for number in range(count):
@@ -72,10 +75,6 @@ def fuzz(
         "missed": missed,
         "wrong": oracle.wrong,
     }
-
-
-def _format(spoken: Spoken):
-    return "binary" if spoken == "binary" else "text"
 
 
 class _Stream:

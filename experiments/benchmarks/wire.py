@@ -124,7 +124,7 @@ class _Tally:
     def figures(self, stats: Stats, check: Check) -> dict[str, float]:
         """Return what became of the frames."""
         spoilt = _spoilt(self.count)
-        glued = np.array([_glued(number) for number in np.flatnonzero(spoilt).tolist()], dtype=bool)
+        glued = np.array([_kind(number)[0] == 2 for number in np.flatnonzero(spoilt).tolist()], dtype=bool)
         intact = ~spoilt
         # The line that another glues itself to is lost with it.
         intact[np.minimum(np.flatnonzero(spoilt)[glued] + 1, self.count - 1)] = False
@@ -176,10 +176,6 @@ def _spoilt(count: int) -> np.ndarray:
 def _kind(number: int) -> tuple[int, np.random.Generator]:
     draw = np.random.default_rng((2, number))
     return int(draw.integers(6)), draw
-
-
-def _glued(number: int) -> bool:
-    return _kind(number)[0] == 2
 
 
 def _spoil(number: int, line: bytes) -> bytes:

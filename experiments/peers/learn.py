@@ -20,7 +20,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from sklearn.linear_model import LogisticRegression, RidgeCV
-from sklearn.preprocessing import StandardScaler
+from sklearn.pipeline import FeatureUnion, Pipeline, make_pipeline, make_union
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 LEARNT = ("train", "validation")
 ALPHAS = np.logspace(-3, 6, 19)  # aeon stops at 1e3; leave-one-out asks for more here
@@ -33,7 +34,6 @@ LIBRARIES = {
 }
 
 Answer = Callable[[str], np.ndarray]  # of the name of a set
-Transform = Callable[[np.ndarray, bool], np.ndarray]  # of readings; True fits it to them
 
 
 def readings(folder: Path, name: str) -> np.ndarray:
@@ -83,51 +83,31 @@ def lightgbm(folder: Path, seed: int, jobs: int) -> tuple[Answer, float, int]:
     return answer, seconds, sum(tree["num_leaves"] for tree in trees)
 
 
-def flat(jobs: int, seed: int) -> Transform:
+def flat(jobs: int, seed: int) -> Pipeline:
     """Return a transform to the plain readings: what the ridge makes without any kernel."""
-    scale = StandardScaler()
-
-    def transform(x: np.ndarray, first: bool) -> np.ndarray:
-        flattened = x.reshape(len(x), -1)
-        return scale.fit_transform(flattened) if first else scale.transform(flattened)
-
-    return transform
+    return make_pipeline(FunctionTransformer(lambda x: x.reshape(len(x), -1)), StandardScaler())
 
 
-def minirocket(jobs: int, seed: int) -> Transform:
+def minirocket(jobs: int, seed: int) -> Pipeline:
     """Return the transform of aeon's MiniRocketClassifier (Dempster et al. 2021), scaled as there."""
     from aeon.transformations.collection.convolution_based import MiniRocket
 
-    kernels, scale = MiniRocket(n_jobs=jobs, random_state=seed), StandardScaler(with_mean=False)
-
-    def transform(x: np.ndarray, first: bool) -> np.ndarray:
-        return (
-            scale.fit_transform(kernels.fit_transform(x)) if first else scale.transform(kernels.transform(x))
-        )
-
-    return transform
+    return make_pipeline(MiniRocket(n_jobs=jobs, random_state=seed), StandardScaler(with_mean=False))
 
 
-def multirocket_hydra(jobs: int, seed: int) -> Transform:
+def multirocket_hydra(jobs: int, seed: int) -> FeatureUnion:
     """Return the transform of aeon's MultiRocketHydraClassifier (Dempster et al. 2023), scaled as there."""
     from aeon.classification.convolution_based._hydra import _SparseScaler
     from aeon.transformations.collection.convolution_based import HydraTransformer, MultiRocket
 
-    hydra, sparse = HydraTransformer(n_jobs=jobs, random_state=seed), _SparseScaler()
-    rocket, scale = MultiRocket(n_jobs=jobs, random_state=seed), StandardScaler()
-
-    def transform(x: np.ndarray, first: bool) -> np.ndarray:
-        if first:
-            parts = sparse.fit_transform(hydra.fit_transform(x)), scale.fit_transform(rocket.fit_transform(x))
-        else:
-            parts = sparse.transform(hydra.transform(x)), scale.transform(rocket.transform(x))
-        return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts], axis=1)
-
-    return transform
+    single = FunctionTransformer(partial(np.asarray, dtype=np.float32))
+    hydra = HydraTransformer(n_jobs=jobs, random_state=seed), _SparseScaler()
+    rocket = MultiRocket(n_jobs=jobs, random_state=seed), StandardScaler()
+    return make_union(make_pipeline(*hydra, single), make_pipeline(*rocket, single))
 
 
 def ridge(
-    make: Callable[[int, int], Transform], folder: Path, seed: int, jobs: int
+    make: Callable[[int, int], Pipeline | FeatureUnion], folder: Path, seed: int, jobs: int
 ) -> tuple[Answer, float, int]:
     """Fit a ridge per label on transformed readings, each with the strength that leave-one-out likes best.
 
@@ -136,10 +116,10 @@ def ridge(
     """
     x, truth = readings(folder, "train"), labels(folder, "train")
     print("compiling", flush=True)
-    make(jobs, seed)(x[:32], True)
+    make(jobs, seed).fit_transform(x[:32])
     print("learning", flush=True)
     began, transform = time.perf_counter(), make(jobs, seed)
-    table = transform(x, True)
+    table = transform.fit_transform(x)
     targets = 2.0 * np.stack(list(truth.values()), axis=1) - 1
     model = RidgeCV(ALPHAS, alpha_per_target=True).fit(table, targets)
     del table
@@ -147,7 +127,7 @@ def ridge(
     def scores(name: str) -> np.ndarray:
         parts = readings(folder, name)
         return np.concatenate(
-            [model.predict(transform(parts[i : i + CHUNK], False)) for i in range(0, len(parts), CHUNK)]
+            [model.predict(transform.transform(parts[i : i + CHUNK])) for i in range(0, len(parts), CHUNK)]
         )
 
     held = labels(folder, "validation").values()

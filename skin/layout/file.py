@@ -42,7 +42,9 @@ class File(AbstractLayout):
             without a length, with its line.
     """
 
-    def __init__(self, path: str, footprint: Footprint = (0.01, 0.01), depth: float | None = None) -> None:
+    def __init__(
+        self, path: str | Path, footprint: Footprint = (0.01, 0.01), depth: float | None = None
+    ) -> None:
         self.path = _find(path)
         self.places = _read(self.path)
         self.footprint, self.depth = footprint, depth
@@ -60,7 +62,7 @@ class File(AbstractLayout):
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _find(given: str) -> Path:
+def _find(given: str | Path) -> Path:
     places = candidates(given)
     for path in places:
         if path.is_file():

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from skin.labels import longest_run
 from skin.recording import Touches
 
 __all__ = ["above_idle", "measurements"]
@@ -45,13 +46,6 @@ def _valid(touches: Touches) -> Tensor:
     return torch.where(touches.valid, touches.readings, torch.zeros(()))
 
 
-def _longest(active: Tensor) -> Tensor:
-    """Return the longest run of true values over time, (B, K), of active (B, T, K)."""
-    passed = active.cumsum(dim=1, dtype=torch.int32)
-    before = torch.where(active, 0, passed).cummax(dim=1).values
-    return (passed - before).amax(dim=1).to(torch.float32)
-
-
 def _levels(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
     """How long and on how many sensors a touch exceeds absolute and relative levels."""
     highest = x.amax(dim=1)
@@ -62,20 +56,21 @@ def _levels(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
     above = peak[..., None] > levels
     strong = peak[..., None] > (shares * top)[:, None]
     much = frame[..., None] > (shares * frame.amax(dim=1, keepdim=True))[:, None]
-    runs = _longest(torch.cat([above, strong, much], dim=2)).split([len(LEVELS), len(SHARES), len(SHARES)], 1)
+    runs = longest_run(torch.cat([above, strong, much], dim=2)).float()
+    lasting, strongly, summed = runs.split([len(LEVELS), len(SHARES), len(SHARES)], 1)
 
     def most(level: float) -> Tensor:
         return (x > level).sum(dim=2).amax(dim=1)
 
     absolute = {
         "frames above {} N": above.sum(dim=1),
-        "longest run above {} N": runs[0],
+        "longest run above {} N": lasting,
         "sensors above {} N": (highest[..., None] > levels).sum(dim=1),
         "most sensors above {} N at once": torch.stack([most(level) for level in LEVELS], dim=1),
     }
     relative = {
-        "longest run above {} of the peak": runs[1],
-        "longest run of the sum above {} of its peak": runs[2],
+        "longest run above {} of the peak": strongly,
+        "longest run of the sum above {} of its peak": summed,
         "sensors above {} of the peak": (highest[..., None] > (shares * top)[:, None]).sum(dim=1),
         "sensors above {} of the peak at once": (at_peak[..., None] > (shares * top)[:, None]).sum(dim=1),
     }

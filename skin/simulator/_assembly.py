@@ -104,21 +104,17 @@ class Structure:
 
     def deflection(self, sensors: Sensors, levels: np.ndarray) -> sparse.csr_matrix:
         """Return rows (S, N) that read the motion into the skin at each sensor's x, y on an interface, m."""
-        return -self._read(self._hats(sensors), levels, dof=2)
+        return -self.shift(sensors, levels, axis=2)
 
     def shift(self, sensors: Sensors, levels: np.ndarray, axis: int) -> sparse.csr_matrix:
-        """Return rows (S, N) that read the motion along x (axis 0) or y (1), if free, at each sensor, m."""
-        return self._read(self._hats(sensors), levels, dof=axis)
-
-    def _hats(self, sensors: Sensors) -> np.ndarray:
-        """Return how much each node of an interface counts at each sensor's x, y, (S, ny+1, nx+1)."""
-        weights = np.ones((len(sensors), 1, 1))
-        for axis in (1, 0):
-            steps = sensors.positions[:, axis] / self.body.cell[axis]
-            # Linear between the nearest two lines of nodes: a hat around each.
-            hats = np.clip(1 - np.abs(steps[:, None] - np.arange(self.body.cells[axis] + 1)), 0, None)
-            weights = weights * (hats[:, :, None] if axis == 1 else hats[:, None, :])
-        return weights
+        """Return rows (S, N) that read the motion along x (axis 0), y (1) or up (2) at each sensor, m."""
+        steps = sensors.positions[:, :2, None] / np.array(self.body.cell)[:, None]
+        # Linear between the nearest two lines of nodes: a hat around each.
+        x, y = (
+            np.clip(1 - np.abs(steps[:, one] - np.arange(count + 1)), 0, None)
+            for one, count in enumerate(self.body.cells)
+        )
+        return self._read(y[:, :, None] * x[:, None, :], levels, dof=axis)
 
     def carried(self, sensors: Sensors, levels: np.ndarray) -> sparse.csr_matrix:
         """Return rows (S, N) that read the force in the beams below each sensor's footprint, N.

@@ -189,10 +189,8 @@ def _lines(data: bytes) -> list[Line]:
 def _binary_counts(data: bytes) -> list[int]:
     counts = []
     for piece in data.split(b"\0")[:-1]:
-        try:
+        with suppress(FrameError):
             counts.append(len(decode_frame(piece).values))
-        except FrameError:
-            continue
     return counts
 
 

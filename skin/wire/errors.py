@@ -12,7 +12,7 @@ class SkinTouched(InputError):  # noqa: N818
     """No baseline can be taken, because something touches the skin."""
 
 
-class SkinTimeout(TimeoutError):  # noqa: N818 - the name says what happened, as TimeoutError's does
+class _TooFewFramesError(Exception):
     """Fewer frames came than were asked for.
 
     Attributes:
@@ -24,13 +24,9 @@ class SkinTimeout(TimeoutError):  # noqa: N818 - the name says what happened, as
         self.frames = list(frames)
 
 
-class SkinDisconnected(ConnectionError):  # noqa: N818
-    """The skin was unplugged, or a recording has ended.
+class SkinTimeout(_TooFewFramesError, TimeoutError):  # noqa: N818 - named as TimeoutError is
+    """They did not come in time."""
 
-    Attributes:
-        frames: those that came before, of those that were asked for.
-    """
 
-    def __init__(self, message: str, frames: Sequence[Frame] = ()) -> None:
-        super().__init__(message)
-        self.frames = list(frames)
+class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818
+    """The skin was unplugged, or a recording has ended."""

@@ -89,10 +89,9 @@ class Wire:
         frames = self._decoder.feed(data, now) if data else []
         if frames:
             self._prepare()
-        elif data and not frames and (refusal := self._decoder.refusal()):
-            raise refusal
-        if frames:
             self._check_clock(frames, now)
+        elif data and (refusal := self._decoder.refusal()):
+            raise refusal
         if now - self._said_at >= 1:
             self._say(now)
         return [self._judged(frame) for frame in frames]

@@ -104,7 +104,9 @@ def open_skin(
     chosen, sensors = Settings(**settings), None if layout is None else len(layout)
     decoder = None
     if opener is None and port == "simulated":
-        connect = _player(_simulated(device, chosen.realtime))
+        if device is None:
+            raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
+        connect = _player(Player(_strips(device), device.rate, chosen.realtime))
     elif opener is None and port.endswith((".parquet", ".csv")):
         connect = _player(_recorded(port, sensors, chosen.realtime))
     else:
@@ -154,12 +156,6 @@ def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
             "as in layout=file layout.path=FILE.csv"
         )
     return Player(_pieces(touches), touches.rate, realtime)
-
-
-def _simulated(device: "Streamed | None", realtime: bool) -> Player:
-    if device is None:
-        raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
-    return Player(_strips(device), device.rate, realtime)
 
 
 def _strips(device: "Streamed") -> Iterator[Piece]:

@@ -101,3 +101,9 @@ def test_what_is_no_layout_is_refused_by_name(sensors, text, says):
 def test_a_missing_file_is_refused_with_where_it_was_looked_for(path):
     with pytest.raises(InputError, match=r"no layout file .*: looked for .*layout.path=FILE.csv"):
         File(path)
+
+
+def test_a_script_may_give_a_path(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("x_m,y_m\n0.1,0.1\n")
+    assert len(File(path).sensors(BODY)) == 1

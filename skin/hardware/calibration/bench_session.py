@@ -113,7 +113,13 @@ def _gauge_columns(session: Session) -> dict[str, np.ndarray]:
     gauge = session.gauge
     force, press = gauge.at(session.time)
     row = gauge.first[np.maximum(press, 0)]
-    columns = {"force": force, "x_m": gauge.place[row, 0], "y_m": gauge.place[row, 1]}
-    columns |= {"indenter": gauge.indenter[row], "radius_m": gauge.radius[row], "angle": gauge.angle[row]}
-    columns |= {"press": press}
+    columns = {
+        "force": force,
+        "x_m": gauge.place[row, 0],
+        "y_m": gauge.place[row, 1],
+        "indenter": gauge.indenter[row],
+        "radius_m": gauge.radius[row],
+        "angle": gauge.angle[row],
+        "press": press,
+    }
     return {name: np.ma.masked_array(values, press < 0) for name, values in columns.items()}

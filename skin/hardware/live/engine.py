@@ -91,12 +91,9 @@ class Engine:
 
     def _restart(self) -> None:
         patience = self._patience
-
-        def slow() -> Debounce:
-            return Debounce(patience.label, patience.label)
-
-        self._touch = slow()
-        self._labels = {name: slow() for name in self.task.gated}
+        slow = patience.label, patience.label
+        self._touch = Debounce(*slow)
+        self._labels = {name: Debounce(*slow) for name in self.task.gated}
         self._labels |= {"dangerous": Debounce(patience.alarm, patience.calm)}
 
     def add(self, frame: Frame) -> None:

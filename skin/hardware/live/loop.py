@@ -7,7 +7,6 @@ import numpy as np
 
 from skin.hardware.live.board import Board
 from skin.hardware.live.engine import Engine
-from skin.hardware.live.verdict import Verdict
 from skin.signal.frame import Frame
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
@@ -95,12 +94,9 @@ class Session:
         if verdict is None:
             self._board.say(None, f"filling the window: {100 * self._engine.window.filled:.0f} %")
         else:
-            self._count(verdict)
+            self._delays.append(monotonic() - verdict.t_host)
+            self.verdicts += 1
             self._board.say(verdict)
-
-    def _count(self, verdict: Verdict) -> None:
-        self._delays.append(monotonic() - verdict.t_host)
-        self.verdicts += 1
 
     def _tell(self) -> None:
         now = monotonic()

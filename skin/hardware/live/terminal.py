@@ -8,6 +8,7 @@ from datetime import datetime, timedelta
 from threading import Thread
 from typing import Any
 
+import numpy as np
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
@@ -29,6 +30,11 @@ _SHORT, _LONG = 3.0, 60.0  # s of contact after which it is told, and after whic
 _KEYS = "t and Enter: a new tare, nothing may touch the skin; Ctrl-C ends"
 # Dark blue, teal, yellow, white: lighter means more to any eye.
 _SCALE = ((13, 22, 48), (24, 92, 122), (92, 170, 120), (240, 200, 70), (255, 250, 230))
+_MIXED = [
+    np.interp(np.arange(256), np.linspace(0, 255, len(_SCALE)), channel)
+    for channel in zip(*_SCALE, strict=True)
+]
+_COLOURS = ["#{:02x}{:02x}{:02x}".format(*rgb) for rgb in np.round(_MIXED).astype(int).T.tolist()]
 
 
 @contextmanager
@@ -113,17 +119,9 @@ def _map(image: Any) -> Text:
     text = Text()
     for upper, lower in zip(image[::2], image[1::2], strict=True):
         for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
-            text.append("▀", Style(color=_colour(above), bgcolor=_colour(below)))
+            text.append("▀", Style(color=_COLOURS[above], bgcolor=_COLOURS[below]))
         text.append("\n")
     return text
-
-
-def _colour(level: int) -> str:
-    place = level / 255 * (len(_SCALE) - 1)
-    lower = min(int(place), len(_SCALE) - 2)
-    share = place - lower
-    mixed = [round(a + share * (b - a)) for a, b in zip(_SCALE[lower], _SCALE[lower + 1], strict=True)]
-    return "#{:02x}{:02x}{:02x}".format(*mixed)
 
 
 def _said(look: Look) -> RenderableType:

@@ -171,8 +171,10 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
     made = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
     try:
         return get_type_hints(made, include_extras=True)
-    except NameError:  # classes of others may use names that only type checkers know
-        return {}
+    except NameError:
+        if target.__module__.startswith("skin."):
+            raise
+        return {}  # others may use names that only type checkers know
 
 
 def _plain(hint: Any) -> bool:

@@ -69,12 +69,13 @@ def _measure_skin(study: Study, folder: Path) -> None:
     from hydra import compose
 
     from experiments.studies.measures import Subject
+    from experiments.studies.tables import publish
     from skin.build import build_device
 
     if study.measure is None:
         raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
     config = checked(compose("train", [*words(study.test), *given()]))
-    found = study.measure(Subject(config, build_device(config)))
-    print(found.line)
-    if found.publish:
-        print(*found.publish(f"{study.name}: {study.about}", folder / f"study_{study.name}"), sep="\n")
+    page = study.measure(Subject(config, build_device(config))).page
+    print(
+        page.about, *publish(page, f"{study.name}: {study.about}", folder / f"study_{study.name}"), sep="\n"
+    )

@@ -1,7 +1,6 @@
 """Figure 5 of the report, the table of what embeddings tell, and the verdicts."""
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from statistics import fmean, stdev
 
 import numpy as np
@@ -12,13 +11,12 @@ from sklearn.manifold import TSNE
 
 from experiments.studies.comparison import conclude, paired, verdict
 from experiments.studies.embedding.probe import FRAME, Found
-from experiments.studies.tables import markdown
-from skin.files import write
-from skin.plot.figures import COLOURS, save
+from experiments.studies.tables import Page
+from skin.plot.figures import COLOURS
 
-__all__ = ["lines", "planes", "publish", "spaces", "statements", "text"]
+__all__ = ["lines", "page", "planes", "spaces", "statements"]
 
-_ABOUT = """
+_ABOUT = """\
 The labels: accuracy on held-out touches of an SVM (radial basis functions on standardised vectors, cost
 chosen by cross-validation on the training touches). Graph embeddings and "readings, one frame" see the
 strongest frame of a touch alone, the encoder and "readings, window" all: one frame does not tell how long
@@ -30,16 +28,12 @@ usually is, they are all equal.
 _Figure = Callable[[Found], float]
 
 
-def text(found: Sequence[Found], names: Sequence[str]) -> str:
-    """Return the table and the verdicts, as Markdown."""
-    table = markdown(lines(found, names), "What an SVM reads in embeddings, accuracy in per cent")
-    return f"{table}{_ABOUT}\n" + "".join(f"- {line}\n" for line in statements(found, names))
-
-
-def publish(found: Sequence[Found], names: Sequence[str], title: str, path: Path) -> list[Path]:
-    """Write the table and figure 5 of the report, of the first seed, to ``path`` with .md and .png."""
+def page(found: Sequence[Found], names: Sequence[str]) -> Page:
+    """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
+    table = lines(found, names)
+    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in statements(found, names))
     figure = spaces([one for one in found if one.seed == found[0].seed], names)
-    return [write(text(found, names), path.with_suffix(".md")), save(figure, path.with_suffix(".png"))]
+    return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
 
 
 def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:

@@ -1,18 +1,17 @@
 """Files and one line on the errors of a learner by margin."""
 
 import math
-from pathlib import Path
+from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.studies.tables import as_csv, markdown
+from experiments.studies.tables import Page
 from skin.evaluation.margins import ALARM, Faint, Margins, Span
-from skin.files import write
 from skin.labels import OPPOSITE, TOUCH
-from skin.plot.figures import COLOURS, save
+from skin.plot.figures import COLOURS
 
-__all__ = ["line", "publish"]
+__all__ = ["line", "page"]
 
 _MEASURES = {
     "big": "area",
@@ -25,14 +24,9 @@ _NEAR = (0.9, 1.1)  # times its threshold
 _FAINT = 1.0  # N
 
 
-def publish(found: Margins, title: str, path: Path) -> list[Path]:
-    """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
-    sections = [markdown(table, heading).replace("# ", "## ", 1) for heading, table in _tables(found).items()]
-    paths = [path.with_name(path.name + ending) for ending in (".md", ".csv", ".png")]
-    write(f"# {title}\n\n{line(found)}\n\n" + "\n".join(sections), paths[0])
-    write(_csv(found), paths[1])
-    save(_figure(found, title), paths[2])
-    return paths
+def page(found: Margins, title: str) -> Page:
+    """Return the tables, the CSV and the figure, under a title."""
+    return Page(line(found), _tables(found), _csv(found), _figure(found, title))
 
 
 def line(found: Margins) -> str:
@@ -92,9 +86,9 @@ def _span(one: Span | Faint) -> str:
     return f"above {one.low:g}" if math.isinf(one.high) else f"{one.low:g} to {one.high:g}"
 
 
-def _csv(found: Margins) -> str:
+def _csv(found: Margins) -> list[Sequence[object]]:
     """Return every figure as ``label,by,low,high,touches,said,wrong``."""
-    head = ["label", "by", "low", "high", "touches", "said", "wrong"]
+    head: list[object] = ["label", "by", "low", "high", "touches", "said", "wrong"]
     spans = [
         [name, "threshold", one.low, one.high, one.count, one.said, one.wrong]
         for name, each in found.spans.items()
@@ -105,7 +99,7 @@ def _csv(found: Margins) -> str:
         for name in TOUCH.names
         for one in found.faint
     ]
-    return as_csv([head, *spans, *faint])
+    return [head, *spans, *faint]
 
 
 def _figure(found: Margins, title: str) -> Figure:

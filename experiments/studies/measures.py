@@ -3,10 +3,8 @@
 Measures import late, so that a mistake in their settings is reported at once.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
 from annotated_types import Ge, Gt
@@ -19,6 +17,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
     from omegaconf import DictConfig
 
+    from experiments.studies.tables import Page
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learner.base import AbstractLearner
@@ -81,6 +80,11 @@ class Subject:
             raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
         return self.finished
 
+    @property
+    def title(self) -> str:
+        """The name of the run, for pages and figures."""
+        return f"{self.of.run.info.run_name}, run {self.of.run.info.run_id[:8]}"
+
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm."""
         from skin.evaluation.operating_point import OperatingPoint
@@ -97,13 +101,11 @@ class Measured:
 
     Attributes:
         metrics: name -> value; shares are of 1.
-        line: what matters most, for a person; empty where the metrics tell it.
-        publish: writes files to a path without an ending, under a title; None: there are none.
+        page: what is published; None where the metrics tell everything.
     """
 
-    metrics: dict[str, float] = field(default_factory=dict)
-    line: str = ""
-    publish: Callable[[str, Path], list[Path]] | None = None
+    metrics: dict[str, float]
+    page: "Page | None" = None
 
 
 class Measure(Protocol):
@@ -153,11 +155,11 @@ class Margins:
     gestures: Annotated[int, Ge(1)] = 20000
 
     def __call__(self, subject: Subject) -> Measured:
-        from experiments.studies import margins as page
+        from experiments.studies.margins import page
         from skin.evaluation.margins import margins
 
         found = margins(subject.of.learner, subject.device, self.gestures, subject.point())
-        return Measured({}, page.line(found), partial(page.publish, found))
+        return Measured({}, page(found, subject.title))
 
 
 class Streams(Course):
@@ -167,14 +169,13 @@ class Streams(Course):
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies import sliding as page
+        from experiments.studies.sliding import page
         from skin.evaluation.sliding import slide
 
-        shown = partial(
-            track, description=subject.of.run.info.run_name, console=Console(stderr=True), transient=True
-        )
+        console = Console(stderr=True)
+        shown = partial(track, description=subject.title, console=console, transient=True)
         found = slide(subject.of.learner, subject.device, self, subject.point(), shown)
-        return Measured(found.metrics(), page.line(found), partial(page.publish, found))
+        return Measured(found.metrics(), page(found, subject.title))
 
 
 @dataclass(frozen=True)
@@ -199,8 +200,7 @@ class Holds:
     def __call__(self, subject: Subject) -> Measured:
         from rich.progress import track
 
-        from experiments.studies.tables import as_csv
-        from skin.files import write
+        from experiments.studies.tables import Page
         from skin.hardware.live import start
         from skin.hardware.live.holds import FIELDS, courses
         from skin.hardware.live.verdict import Patience
@@ -212,11 +212,7 @@ class Holds:
         table = [FIELDS, *courses(engine, device, self.gestures, self.rate, partial(track, transient=True))]
         told = (zip(FIELDS, values, strict=True) for values in table[1:])
         lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
-
-        def publish(title: str, path: Path) -> list[Path]:
-            return [write(as_csv(table), path.with_suffix(".csv"))]
-
-        return Measured({}, "\n".join(lines), publish)
+        return Measured({}, Page("\n".join(lines), {"Time to alarm": table}, table))
 
 
 @dataclass(frozen=True)
@@ -231,14 +227,11 @@ class Motion:
 
     def __call__(self, subject: Subject) -> Measured:
         from experiments.studies.motion import change
-        from skin.files import write
+        from experiments.studies.tables import Page
 
         device = subject.device.simulated("how sensors move is known in simulation only")
         found = change(device, self.gestures)
-        text = f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"
-        return Measured(
-            {}, text, lambda title, path: [write(f"# {title}\n\n{text}\n", path.with_suffix(".md"))]
-        )
+        return Measured({}, Page(f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"))
 
 
 class Embeddings(Probing):
@@ -248,8 +241,8 @@ class Embeddings(Probing):
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies import embedding_spaces as page
         from experiments.studies.embedding.probe import probe
+        from experiments.studies.embedding_spaces import page
         from skin.balance import announce
 
         device, learner = subject.device, subject.finished.learner if subject.finished else None
@@ -258,4 +251,4 @@ class Embeddings(Probing):
         steps = probe(device, self, learner)
         found = list(track(steps, "probing", count, console=Console(stderr=True)))
         names = device.task.names
-        return Measured({}, page.text(found, names), partial(page.publish, found, names))
+        return Measured({}, page(found, names))

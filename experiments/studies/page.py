@@ -11,10 +11,10 @@ from rich.console import Console
 from experiments.studies.comparison import Paired
 from experiments.studies.outcomes import UNITS, Difference, Outcome, conclusions, differences, lines, values
 from experiments.studies.study import Study
-from experiments.studies.tables import as_csv, markdown, show
+from experiments.studies.tables import Page, show
+from experiments.studies.tables import publish as write_page
 from experiments.studies.trials import Trial
-from skin.files import write
-from skin.plot.figures import COLOURS, save
+from skin.plot.figures import COLOURS
 
 __all__ = ["figure", "measured", "publish", "statements", "table"]
 
@@ -98,19 +98,16 @@ def publish(
     console = console or Console()
     changed = differences(study, trials)
     tables = {
-        title: table(trials, study.metrics),
+        "Variants": table(trials, study.metrics),
         f"Differences in {_heading(study.metrics[0])}": compared(changed, study.metrics[0]),
         "Statements": statements(conclusions(study.statements, trials)),
     }
     told = {name: each for name, each in tables.items() if len(each) > 1}
-    write("\n#".join(markdown(each, name) for name, each in told.items()), path.with_suffix(".md"))
-    write(_csv(study, trials), path.with_suffix(".csv"))
+    drawn = figure(trials, study.metrics[0], study.about) if any(one.run for one in trials) else None
+    print(title)
     for name, each in told.items():
         show(each, name, console, wrapped=("statement", "measured"))
-    paths = [path.with_suffix(ending) for ending in (".md", ".csv")]
-    if any(one.run for one in trials):
-        paths.append(save(figure(trials, study.metrics[0], study.about), path.with_suffix(".png")))
-    print(*paths, sep="\n")
+    print(*write_page(Page("", told, _csv(study, trials), drawn), title, path), sep="\n")
 
 
 def figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
@@ -137,7 +134,7 @@ def figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
     return drawn
 
 
-def _csv(study: Study, trials: Sequence[Trial]) -> str:
+def _csv(study: Study, trials: Sequence[Trial]) -> list[Sequence[object]]:
     """Return a line per finished trial."""
     names = ["variant", "seed", *(["condition", "device"] if study.conditions else [])]
     head = [*names, "run", *study.metrics]
@@ -150,7 +147,7 @@ def _csv(study: Study, trials: Sequence[Trial]) -> str:
         for one in trials
         if one.run
     ]
-    return as_csv([head, *body])
+    return [head, *body]
 
 
 def _heading(metric: str) -> str:

@@ -1,31 +1,23 @@
 """Files and one line on an evaluation on streams."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from experiments.studies.tables import as_csv, markdown
+from experiments.studies.tables import Page
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.sliding import Sliding
-from skin.files import write
-from skin.plot.figures import COLOURS, save
+from skin.plot.figures import COLOURS
 
-__all__ = ["line", "publish"]
+__all__ = ["line", "page"]
 
 
-def publish(found: Sliding, title: str, path: Path) -> list[Path]:
-    """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
-    sections = [markdown(table, heading).replace("# ", "## ", 1) for heading, table in _tables(found).items()]
+def page(found: Sliding, title: str) -> Page:
+    """Return the tables, the CSV and the figure, under a title."""
     learnt = "windows of streams" if found.streamed else "whole touches"
     about = f"Trained on {learnt}, tried on windows of streams; {found.point.sentence()}."
-    text = f"# {title}\n\n{about}\n\n" + "\n".join(sections)
-    paths = [path.with_name(path.name + ending) for ending in (".md", ".csv", ".png")]
-    write(text, paths[0])
-    write(_csv(found), paths[1])
-    save(_figure(found, title), paths[2])
-    return paths
+    return Page(f"{line(found)}\n\n{about}", _tables(found), _csv(found), _figure(found, title))
 
 
 def line(found: Sliding) -> str:
@@ -83,7 +75,7 @@ def _tables(found: Sliding) -> dict[str, list[list[str]]]:
     }
 
 
-def _csv(found: Sliding) -> str:
+def _csv(found: Sliding) -> list[Sequence[object]]:
     """Return every figure as ``measure,name,at,value``."""
     table: list[Sequence[object]] = [["measure", "name", "at", "value"]]
     for one in found.bins:
@@ -98,7 +90,7 @@ def _csv(found: Sliding) -> str:
     table.append(["threshold, N", "threshold", "", f"{found.threshold:.4f}"])
     table.append(["stream, h", "", "", found.hours])
     table += (["window", "overall", window, value] for window, value in found.lengths.items())
-    return as_csv(table)
+    return table
 
 
 def _figure(found: Sliding, title: str) -> Figure:

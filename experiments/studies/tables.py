@@ -1,16 +1,50 @@
-"""Tables as CSV, as Markdown and on a terminal; the head is their first line."""
+"""Tables as CSV, as Markdown and on a terminal, and pages of them; the head is their first line."""
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
+from matplotlib.figure import Figure
+from rich import table as terminal
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
-__all__ = ["as_csv", "markdown", "percent", "show"]
+from skin.files import write
+from skin.plot.figures import save
+
+__all__ = ["Page", "as_csv", "markdown", "percent", "publish", "show"]
+
+Table = Sequence[Sequence[str]]
 
 _WIDEST = 200  # characters
+
+
+@dataclass(frozen=True)
+class Page:
+    """What is published of a measurement.
+
+    Attributes:
+        about: what matters most, for a person.
+        tables: heading -> table.
+        data: every figure, as the table of the CSV file; empty: there is no such file.
+        figure: of the most important ones; None: there is none.
+    """
+
+    about: str
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    data: Sequence[Sequence[object]] = ()
+    figure: Figure | None = None
+
+
+def publish(page: Page, title: str, path: Path) -> list[Path]:
+    """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
+    sections = [f"#{markdown(table, heading)}" for heading, table in page.tables.items()]
+    parts = [f"# {title}\n", *([f"{page.about}\n"] if page.about else []), *sections]
+    paths = [write("\n".join(parts), path.with_name(f"{path.name}.md"))]
+    paths += [write(as_csv(page.data), path.with_name(f"{path.name}.csv"))] if page.data else []
+    return paths + ([save(page.figure, path.with_name(f"{path.name}.png"))] if page.figure else [])
 
 
 def as_csv(table: Iterable[Sequence[object]]) -> str:
@@ -20,7 +54,7 @@ def as_csv(table: Iterable[Sequence[object]]) -> str:
     return buffer.getvalue()
 
 
-def markdown(table: Sequence[Sequence[str]], title: str) -> str:
+def markdown(table: Table, title: str) -> str:
     """Return a table as Markdown, below its title."""
     lines = ["| " + " | ".join(line) + " |" for line in table]
     return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
@@ -34,9 +68,7 @@ def percent(value: str, deviation: str = "") -> str:
     return f"{100 * float(value):.1f}{spread}"
 
 
-def show(
-    table: Sequence[Sequence[str]], title: str, console: Console | None = None, wrapped: Sequence[str] = ()
-) -> None:
+def show(table: Table, title: str, console: Console | None = None, wrapped: Sequence[str] = ()) -> None:
     """Print a table, all numbers whole, however narrow the terminal is.
 
     Args:
@@ -46,7 +78,7 @@ def show(
         wrapped: the columns that may be broken into lines.
     """
     console = console or Console()
-    shown = Table(title=escape(title), box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    shown = terminal.Table(title=escape(title), box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for name in table[0]:
         shown.add_column(escape(name), no_wrap=name not in wrapped)
     for line in table[1:]:

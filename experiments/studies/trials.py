@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from experiments.studies.measures import Accuracy, Finished, Measure, Subject
 from experiments.studies.runs import Planned
 from experiments.studies.study import Study, Variant, given, words
+from experiments.studies.tables import publish
 from skin.build import build_data, build_device, build_learner
 from skin.config import checked, fingerprint
 from skin.learner.base import AbstractLearner
@@ -115,11 +116,10 @@ class _Run:
         with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
             found = what(subject)
             self.store.log_metrics(logged, found.metrics)
-            self.store.client.set_tag(logged.info.run_id, "outcome", found.line)
-            if found.publish is not None:
+            self.store.client.set_tag(logged.info.run_id, "outcome", found.page.about if found.page else "")
+            if found.page is not None:
                 stem = f"{type(what).__name__.lower()}_{own.row}_{logged.info.run_id[:8]}"
-                title = f"{self.run.info.run_name}, run {self.run.info.run_id[:8]}"
-                found.publish(title, Path(made) / stem)
+                publish(found.page, subject.title, Path(made) / stem)
                 self.store.client.log_artifacts(logged.info.run_id, made)
         return self.store.client.get_run(logged.info.run_id)
 

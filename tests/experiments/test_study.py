@@ -89,7 +89,7 @@ def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     page = (tmp_path / "r" / "smoke" / "study_transformer.md").read_text()
     assert "SMOKE" in done.stdout
     assert "SMOKE" in page
-    body = page.split("\n\n")[1].splitlines()[2:]
+    body = page.split("\n\n")[2].splitlines()[2:]
     assert [line.count("(1 failed) | failed |") for line in body] == [0, 1, 1]
     assert done.stderr.count("failed: model.pooling=attention must be 'mean' or 'max'") == 2
 

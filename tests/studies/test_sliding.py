@@ -6,7 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from experiments.studies.sliding import line, publish
+from experiments.studies.sliding import line, page
+from experiments.studies.tables import publish
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.sliding import Bin, Sliding
@@ -36,7 +37,9 @@ def test_the_line_says_what_matters():
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    return publish(FOUND, "rules fem 0", tmp_path_factory.mktemp("results") / "stream_rules")
+    return publish(
+        page(FOUND, "rules fem 0"), "rules fem 0", tmp_path_factory.mktemp("results") / "stream_rules"
+    )
 
 
 def test_a_person_reads_the_same(files):
@@ -50,7 +53,8 @@ def test_a_person_reads_the_same(files):
         "| 60 | cannot (made for 30) |",
     ):
         assert row in text
-    assert text.startswith("# rules fem 0\n\nTrained on whole touches")
+    assert text.startswith("# rules fem 0\n\naccuracy 50.0 %")
+    assert "\n\nTrained on whole touches" in text
 
 
 def test_a_program_reads_the_same(files):

@@ -14,8 +14,6 @@ from skin.recording import Recording
 from skin.touch.gesture import GestureSettings
 from skin.touch.stream import touched
 
-__all__ = ["announce", "balance", "check", "lines", "told_by"]
-
 
 def announce(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
     """Print the balance of the gestures that a simulated device is trained on, and check it.

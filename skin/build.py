@@ -14,8 +14,6 @@ from skin.settings import check_groups, configured
 if TYPE_CHECKING:
     from skin.datamodule import TouchData
 
-__all__ = ["build_data", "build_device", "build_learner"]
-
 
 def build_device(config: DictConfig) -> AbstractDevice:
     """Return the source of touches, with its body, layout and, where it has one, its simulator."""

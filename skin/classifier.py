@@ -15,8 +15,6 @@ from skin.labels import Task
 from skin.model._activation import activation as activation_of
 from skin.representation.base import Frames
 
-__all__ = ["Batch", "MakeOptimizer", "TouchClassifier", "probabilities"]
-
 Batch = tuple[Frames, Tensor]
 MakeOptimizer = Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer]
 

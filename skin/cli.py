@@ -12,8 +12,6 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-__all__ = ["main", "verbs"]
-
 
 def verbs() -> dict[str, str]:
     """Return the module of each verb."""

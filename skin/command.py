@@ -1,6 +1,6 @@
 """Commands: functions of a configuration that Hydra composes from what the command line asks for."""
 
-from skin import interrupt  # isort: skip
+from skin import interrupt  # noqa: F401  # isort: skip
 import os
 import signal
 import sys
@@ -17,10 +17,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import CONF, checked
+from skin.config import checked
+from skin.paths import CONF
 from skin.refusal import Refused, refusal
-
-__all__ = ["command", "interrupt"]
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
 

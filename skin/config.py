@@ -3,7 +3,7 @@
 Only Hydra is imported here: ``--help`` and a mistyped key must not import torch.
 """
 
-from skin import interrupt  # isort: skip
+from skin import interrupt  # noqa: F401  # isort: skip
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import isnan
@@ -15,21 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from skin.errors import InputError
 from skin.identity import digest
-from skin.paths import CONF, ROOT
 from skin.refusal import sentence
-
-__all__ = [
-    "CONF",
-    "PARENT",
-    "ROOT",
-    "Config",
-    "DictConfig",
-    "checked",
-    "fingerprint",
-    "interrupt",
-    "overrides",
-    "plain",
-]
 
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""

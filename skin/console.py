@@ -3,8 +3,6 @@
 import logging
 import warnings
 
-__all__ = ["quiet"]
-
 
 def quiet() -> None:
     """Quieten Lightning's remarks on hardware and logging, and torch's on a change in its own insides."""

@@ -16,8 +16,6 @@ from skin.representation.base import AbstractRepresentation
 from skin.settings import checked
 from skin.signal.augmentation import Augmentation
 
-__all__ = ["MakeRepresentation", "TouchData"]
-
 MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
 
 

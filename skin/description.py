@@ -10,8 +10,6 @@ from skin.body._memory import require_memory
 from skin.labels import Task
 from skin.settings import ONCE, check
 
-__all__ = ["check_rows", "task_of"]
-
 _Count = Annotated[int, Ge(1), Le(2**31 - 1)]  # rows, gestures and frames are numbered in 32 bits
 _Extent = Annotated[float, Gt(0), Lt(1e9)]
 

@@ -1,7 +1,5 @@
 """The exception for bad input; its message says what to change."""
 
-__all__ = ["InputError"]
-
 
 class InputError(ValueError):
     """Bad input from a person: a configuration, a file, a layout.

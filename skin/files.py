@@ -9,8 +9,6 @@ from tempfile import NamedTemporaryFile
 
 from skin.errors import InputError
 
-__all__ = ["results", "tabular", "unwritable", "whole", "write"]
-
 
 def results(out: str | None) -> Path:
     """Return the folder that ``out=`` names, relative to the current one; None: ``results``."""

@@ -10,8 +10,6 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["arrays", "settings"]
-
 _TEXT = 1 << 20  # bytes: the largest configuration is some kB
 _DEEP = 50  # levels: the deepest configuration has 6
 _BYTES = 1 << 30

@@ -9,8 +9,6 @@ from typing import Any
 from skin import __version__
 from skin.paths import candidates
 
-__all__ = ["RENAMED", "digest", "renamed"]
-
 RENAMED: dict[str, str] = {}
 """Class as older configurations name it -> its name now. Who moves a class of an option adds a line."""
 

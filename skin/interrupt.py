@@ -3,8 +3,6 @@
 import sys
 from types import TracebackType
 
-__all__: list[str] = []
-
 _usual = sys.excepthook
 
 

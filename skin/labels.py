@@ -9,20 +9,6 @@ from torch import Tensor
 
 from skin.settings import ONCE, checked
 
-__all__ = [
-    "OPPOSITE",
-    "TOUCH",
-    "TOUCH_OR_NOT",
-    "TOUCH_SLIDING",
-    "Measures",
-    "Task",
-    "Thresholds",
-    "longest_run",
-    "measure",
-    "movie_labels",
-    "sliding",
-]
-
 _PART = 256
 _STRAIGHT = 0.5
 

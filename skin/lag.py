@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor
 
-__all__ = ["lagged", "peaks", "rounded", "unloading"]
-
 
 def lagged(readings: Tensor, time_constant: Tensor, time: Tensor) -> Tensor:
     """Return readings (B, T, S) behind a first-order lag that starts at rest.

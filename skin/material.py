@@ -10,9 +10,6 @@ from pydantic import PositiveFloat
 from skin.errors import InputError
 from skin.settings import checked, configured
 
-__all__ = ["MATERIALS", "Material", "Relaxation"]
-
-
 Ratio = Annotated[float, Gt(-1), Lt(1)]
 
 

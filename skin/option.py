@@ -1,7 +1,5 @@
 """The name of an option: of a simulator, device, model, ..."""
 
-__all__ = ["option"]
-
 
 def option(made: object) -> str:
     """Return the name of the option that an object, its class or its factory is: that of its module.

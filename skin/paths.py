@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-__all__ = ["BUNDLED", "CONF", "ROOT", "candidates"]
-
 _PACKAGE = Path(__file__).parent
 ROOT = _PACKAGE.parent
 """The repository, where the package is imported from one."""

@@ -13,8 +13,6 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.sensors import Sensors
 
-__all__ = ["check", "warn_of_surface"]
-
 
 class _Range(NamedTuple):
     low: float

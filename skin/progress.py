@@ -12,8 +12,6 @@ from skin.paths import ROOT
 if TYPE_CHECKING:
     from skin.tracking import Store
 
-__all__ = ["Progress", "clock", "seconds"]
-
 
 class Progress:
     """Counts jobs and estimates what is left.

@@ -11,8 +11,6 @@ from torch import Tensor
 from skin.errors import InputError
 from skin.labels import Task
 
-__all__ = ["Recording", "Touches", "digest", "join"]
-
 
 @dataclass(frozen=True)
 class Touches:

@@ -10,9 +10,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from skin.errors import InputError
 
-__all__ = ["Refused", "refusal", "sentence"]
-
-
 # What a disk or its owner refuses; everything else that the system says is an error of ours.
 _DISK = frozenset(
     (

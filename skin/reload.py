@@ -24,8 +24,6 @@ from skin.learner.base import AbstractLearner
 from skin.tracking import Store
 from skin.trust import vet
 
-__all__ = ["TAG", "changed", "configuration", "find", "operating_point", "restore"]
-
 TAG = "operating_point"
 """Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
 

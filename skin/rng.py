@@ -6,8 +6,6 @@ import numpy as np
 
 from skin.errors import InputError
 
-__all__ = ["Stream", "generator"]
-
 
 class Stream(IntEnum):
     """What randomness is for; the test gestures have a stream that takes no seed of a training."""

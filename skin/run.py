@@ -37,8 +37,6 @@ from skin.reload import TAG
 from skin.settings import imported
 from skin.tracking import Store
 
-__all__ = ["PARENT", "SWEPT", "changed", "conclude", "describe", "simulator", "tags", "train"]
-
 SWEPT = "SKIN_SWEPT"
 """Environment variable by which a sweep tells its jobs which settings it sweeps."""
 

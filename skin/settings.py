@@ -17,8 +17,6 @@ from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 from skin.errors import InputError
 from skin.trust import resolved
 
-__all__ = ["ONCE", "RISING", "check", "check_groups", "checked", "configured", "imported"]
-
 _Made = TypeVar("_Made")
 
 _LIBRARIES = ("torch.", "torch_geometric.")  # which check their own settings

@@ -28,8 +28,6 @@ from skin.files import tabular, whole
 from skin.labels import Task
 from skin.recording import Recording, Touches
 
-__all__ = ["read", "write"]
-
 FORMAT = 1
 UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m", "size": "m", "rate": "Hz"}
 

@@ -7,8 +7,6 @@ import torch
 from skin.body.base import AbstractBody
 from skin.recording import Recording
 
-__all__ = ["line", "summarise"]
-
 
 def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
     """Return what a simulated data set is like, as shares of 1 and SI units.

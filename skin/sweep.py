@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from skin.tracking import Store
 
-__all__ = ["Sweep", "jobs"]
-
 
 def jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
     """Return what Hydra's sweeper will choose in each job of a multirun, in its order.

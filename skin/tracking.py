@@ -28,12 +28,10 @@ from mlflow.exceptions import MlflowException
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
 
-from skin.config import ROOT, Tracking
+from skin.config import Tracking
 from skin.errors import InputError
 from skin.files import whole
-from skin.paths import BUNDLED
-
-__all__ = ["Store", "commit", "ends_on_signal"]
+from skin.paths import BUNDLED, ROOT
 
 _PROCESS = "process"
 _SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one

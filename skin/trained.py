@@ -15,8 +15,6 @@ from skin.recording import Touches
 from skin.reload import configuration, find, operating_point, restore
 from skin.tracking import Store
 
-__all__ = ["Trained", "load_run", "trained"]
-
 _FEW = 10  # gestures, where only their shape matters
 
 

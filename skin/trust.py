@@ -7,8 +7,6 @@ from typing import Any
 
 from skin.errors import InputError
 
-__all__ = ["GROUPS", "resolved", "vet"]
-
 GROUPS = (
     "body",
     "layout",

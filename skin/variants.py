@@ -10,8 +10,6 @@ from mlflow.entities import Run
 
 from skin.tracking import Store
 
-__all__ = ["log", "title"]
-
 _MAIN = ("/overall/accuracy", "/alarm_recall", "/false_alarm_rate", "/degrees")
 _LEGAL = re.compile(r"[\w.\- ]+")  # part of the name of a metric in MLflow
 

@@ -32,9 +32,9 @@ from filelock import FileLock
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from skin.config import ROOT
 from skin.device.base import AbstractDevice
 from skin.labels import TOUCH
+from skin.paths import ROOT
 from skin.recording import Touches
 
 CONF = ROOT / "conf"

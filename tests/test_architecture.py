@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from skin.config import CONF, ROOT
+from skin.paths import CONF, ROOT
 
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from skin.cli import main, verbs
-from skin.config import ROOT
+from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
 OTHERS = ["bench", "peers", "study", "table", "validate"]

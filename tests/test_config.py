@@ -10,8 +10,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import ReadonlyConfigError
 
 from skin.build import build_device, build_learner
-from skin.config import CONF, ROOT, checked, fingerprint, plain
+from skin.config import checked, fingerprint, plain
 from skin.errors import InputError
+from skin.paths import CONF, ROOT
 
 GROUPS = ("body", "layout", "simulator", "contact", "device", "representation", "model", "fusion", "learner")
 ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

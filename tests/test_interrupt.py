@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from skin.config import ROOT
+from skin.paths import ROOT
 
 # As early as the first import of ours, and in the middle of a heavy one.
 MOMENTS = ["skin.interrupt", "torch._C"]

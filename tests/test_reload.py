@@ -11,10 +11,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import CONF, ROOT, Evaluation, Tracking, checked, plain
+from skin.config import Evaluation, Tracking, checked, plain
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.identity import RENAMED
+from skin.paths import CONF, ROOT
 from skin.reload import TAG, changed, configuration, find, operating_point, restore
 from skin.tracking import Store
 

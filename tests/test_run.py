@@ -6,8 +6,9 @@ import sqlite3
 import pytest
 
 import skin.run
-from skin.config import ROOT, checked
+from skin.config import checked
 from skin.errors import InputError
+from skin.paths import ROOT
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import skin
-from skin.config import ROOT
+from skin.paths import ROOT
 
 SMALL = ["simulator=naive", "data.gestures=200", "device.test_gestures=32", "evaluation.devices=0"]
 SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64"]

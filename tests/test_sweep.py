@@ -10,8 +10,9 @@ from statistics import fmean, stdev
 import pytest
 from hydra import initialize_config_dir
 
-from skin.config import CONF, ROOT, Tracking
+from skin.config import Tracking
 from skin.errors import InputError
+from skin.paths import CONF, ROOT
 from skin.sweep import jobs
 from skin.tracking import Store
 

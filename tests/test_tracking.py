@@ -10,7 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from skin import tracking
-from skin.config import ROOT, Tracking
+from skin.config import Tracking
+from skin.paths import ROOT
 from skin.tracking import Store, commit
 
 # MLflow's own business with SQLAlchemy.

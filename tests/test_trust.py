@@ -2,8 +2,9 @@
 
 import pytest
 
-from skin.config import CONF, checked, plain
+from skin.config import checked, plain
 from skin.errors import InputError
+from skin.paths import CONF
 from skin.trust import GROUPS, vet
 
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]

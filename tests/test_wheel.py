@@ -9,7 +9,7 @@ import zipfile
 import pytest
 
 from skin.cli import verbs
-from skin.config import ROOT
+from skin.paths import ROOT
 
 SMALL = ["data.gestures=48", "device.test_gestures=48", "evaluation.safe_gestures=64"]
 SMALL += ["evaluation.devices=0", "evaluation.layouts=0", "evaluation.gestures=48"]

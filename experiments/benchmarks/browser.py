@@ -8,8 +8,6 @@ import urllib.request
 from base64 import b64decode
 from typing import Any
 
-__all__ = ["Browser", "installed"]
-
 _OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
 _PATIENCE = 180  # s
 

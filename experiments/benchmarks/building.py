@@ -12,8 +12,6 @@ from hydra.utils import instantiate
 
 from experiments.benchmarks.setting import configuration, peak_memory, seconds
 
-__all__ = ["measure"]
-
 
 def measure(simulator: str, repeats: int) -> dict[str, float]:
     """Return the seconds to build the default skin's operator (median) and the peak memory, bytes."""

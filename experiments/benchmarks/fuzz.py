@@ -21,8 +21,6 @@ from experiments.benchmarks.pieces import FORMATS, Spoken, binary, damaged, line
 from skin.signal.frame import Frame
 from skin.wire.decoder import Decoder
 
-__all__ = ["fuzz"]
-
 _HEAD = 10  # good frames at the beginning, so that the format shows
 _LENGTHS = (0, 1, 3, 20, 130, 500, 3000)  # bytes, at most, of a chunk; drawn alike
 _PERIOD = 2000  # microseconds

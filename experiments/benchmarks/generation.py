@@ -13,8 +13,6 @@ import numpy as np
 from experiments.benchmarks.setting import configuration, peak_memory
 from skin.build import build_device
 
-__all__ = ["measure"]
-
 GESTURES = 4038
 
 

@@ -25,8 +25,6 @@ from skin.model._pooling import POOLINGS, Pooling, Set2Set
 from skin.model.gcn import _Convolution
 from skin.representation.graph import adjacency, neighbours, normalised
 
-__all__ = ["convolutions", "measure", "poolings"]
-
 SENSORS = 25
 ROWS = {"temporal_graph": (64, (30, 30, 500)), "sequence_graph": (64 * 30, (1, 32, 128))}
 """Row -> graphs in a batch, and the number of features before and after each convolution."""

@@ -19,8 +19,6 @@ from skin.learner.network import Network
 from skin.signal.frame import Frame
 from skin.wire.conversion import Newtons
 
-__all__ = ["measure"]
-
 RATE = 100.0  # Hz, of the device
 ROW = "best_fresh"
 _WARM = 50  # verdicts that are not counted

@@ -15,8 +15,6 @@ from skin.simulator._assembly import Structure
 from skin.simulator._factors import factorised
 from skin.simulator.solid import hexahedra
 
-__all__ = ["direct_seconds_per_frame", "pynite_seconds_per_frame"]
-
 FRAMES = 20  # of the direct solve
 
 

@@ -14,8 +14,6 @@ from time import monotonic, sleep
 
 from experiments.benchmarks.browser import Browser, installed
 
-__all__ = ["measure"]
-
 _SIZE = 1100, 800  # pixels
 _LOOK = 0.1  # s between two looks at the page
 _LOOKS = 3  # in which a press must be seen

@@ -4,8 +4,6 @@ import struct
 from random import Random
 from typing import Literal
 
-__all__ = ["FORMATS", "Spoken", "binary", "damaged", "line", "senseless"]
-
 Spoken = Literal["crc16", "xor", "none", "binary"]
 FORMATS: tuple[Spoken, ...] = ("crc16", "xor", "none", "binary")
 """The checksum of lines, or binary frames."""

@@ -17,8 +17,6 @@ from skin.recording import Touches
 from skin.representation._pixels import pixel_of
 from skin.representation.graph import adjacency, neighbours
 
-__all__ = ["PLAIN", "Plain", "take_weights", "train_epoch"]
-
 PIXELS, SCALE, WINDOW, LABELS = 64, 10.0, 30, 4
 
 

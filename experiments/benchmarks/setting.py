@@ -14,9 +14,8 @@ from statistics import median
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from skin.config import CONF, checked
-
-__all__ = ["configuration", "machine", "peak_memory", "seconds", "versions"]
+from skin.config import checked
+from skin.paths import CONF
 
 
 def configuration(*overrides: str) -> DictConfig:

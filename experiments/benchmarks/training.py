@@ -9,8 +9,6 @@ from skin.console import quiet
 from skin.datamodule import TouchData
 from skin.learner.network import Network
 
-__all__ = ["measure"]
-
 
 def measure(row: str, repeats: int) -> dict[str, float]:
     """Return the median seconds per epoch on 4038 finite-element gestures, and the plain twin's times that.

@@ -23,8 +23,6 @@ from skin.wire.open import open_skin
 from skin.wire.skin import Skin, Stats
 from skin.wire.text import encode_line
 
-__all__ = ["decode_core_share", "soak"]
-
 SENSORS = 25
 _SPOILT = 0.01
 _WHOLE = 10  # lines at the beginning that are whole, so that the format shows

@@ -12,10 +12,12 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
+from omegaconf import DictConfig
 
 from skin.command import command
-from skin.config import ROOT, DictConfig, plain
+from skin.config import plain
 from skin.files import results
+from skin.paths import ROOT
 from skin.settings import check
 
 HERE = ROOT / "experiments"

@@ -10,12 +10,13 @@ and a ridge; ridge: the same ridge on the readings themselves. Peers run in an e
 import subprocess
 from pathlib import Path
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from experiments.peers import PEERS
 from skin.command import command
-from skin.config import ROOT, DictConfig, checked, plain
+from skin.config import checked, plain
 from skin.errors import InputError
+from skin.paths import ROOT
 
 SCRIPT = ROOT / "experiments" / "peers" / "learn.py"
 PYTHON = ROOT / ".venv-peers" / "bin" / "python"

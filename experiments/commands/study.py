@@ -12,9 +12,11 @@ resume. Writes study_<name>.md, .csv and .png into out=.
 import sys
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from experiments.studies.study import SMOKE, Study, given, words
 from skin.command import command
-from skin.config import DictConfig, checked
+from skin.config import checked
 from skin.errors import InputError
 from skin.files import results
 

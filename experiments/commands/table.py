@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Ge
+from omegaconf import DictConfig
 
 from skin.command import command
-from skin.config import ROOT, DictConfig, overrides, plain
+from skin.config import overrides, plain
 from skin.files import results
+from skin.paths import ROOT
 from skin.settings import check
 
 _TITLE = "Accuracy on the test gestures in per cent (the report's in brackets)"

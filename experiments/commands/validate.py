@@ -9,9 +9,12 @@ Writes physics.md, its pictures and physics.json. Exit code 1 if a law does not 
 import sys
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import ROOT, DictConfig, plain
+from skin.config import plain
 from skin.files import results
+from skin.paths import ROOT
 
 
 @command("validate")

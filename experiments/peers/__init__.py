@@ -1,5 +1,3 @@
 """Other libraries on the same touches; data go to their environment and back as files."""
 
-__all__ = ["PEERS"]
-
 PEERS = ("lightgbm", "minirocket", "multirocket_hydra", "ridge")

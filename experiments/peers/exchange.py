@@ -22,8 +22,6 @@ from skin.recording import Recording, Touches, digest
 from skin.signal.features import measurements
 from skin.storage import write
 
-__all__ = ["Foreign", "export"]
-
 SETS = "sets.json"
 ABOUT = "about.json"
 

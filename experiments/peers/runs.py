@@ -16,8 +16,6 @@ from skin.evaluation.report import evaluate
 from skin.run import conclude, describe, tags
 from skin.tracking import Store
 
-__all__ = ["learn"]
-
 _SOURCES = ("seed", "touch", "body", "layout", "simulator", "device", "data", "evaluation")
 
 

@@ -5,8 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
-__all__ = ["FEWEST", "Paired", "conclude", "paired", "verdict"]
-
 FEWEST = 3
 """Paired seeds below which every verdict is ``undecided``."""
 

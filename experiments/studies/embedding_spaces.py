@@ -14,8 +14,6 @@ from experiments.studies.embedding.probe import FRAME, Found
 from experiments.studies.tables import Page
 from skin.plot.figures import COLOURS
 
-__all__ = ["lines", "page", "planes", "spaces", "statements"]
-
 _ABOUT = """\
 The labels: accuracy on held-out touches of an SVM (radial basis functions on standardised vectors, cost
 chosen by cross-validation on the training touches). Graph embeddings and "readings, one frame" see the

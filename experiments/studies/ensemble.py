@@ -20,8 +20,6 @@ from skin.reload import restore
 from skin.run import conclude, describe, simulator, tags
 from skin.tracking import Store
 
-__all__ = ["WAYS", "average", "combine", "decisions", "disagreement", "vote"]
-
 Way = Callable[[Tensor, Task], Tensor]
 
 

@@ -11,8 +11,6 @@ from skin.evaluation.margins import ALARM, Faint, Margins, Span
 from skin.labels import OPPOSITE, TOUCH
 from skin.plot.figures import COLOURS
 
-__all__ = ["line", "page"]
-
 _MEASURES = {
     "big": "area",
     "dynamic": "travel",

@@ -23,20 +23,6 @@ if TYPE_CHECKING:
     from skin.learner.base import AbstractLearner
     from skin.tracking import Store
 
-__all__ = [
-    "Accuracy",
-    "Embeddings",
-    "Finished",
-    "Holds",
-    "Margins",
-    "Measure",
-    "Measured",
-    "Motion",
-    "SelfShare",
-    "Streams",
-    "Subject",
-]
-
 
 @dataclass(frozen=True)
 class Finished:

@@ -11,8 +11,6 @@ from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.representation.graph import neighbours
 
-__all__ = ["NO_EFFECT", "Change", "change"]
-
 NO_EFFECT = 0.01
 """Relative change of distance below which a graph that follows the sensors can make no difference."""
 _CHUNK = 500

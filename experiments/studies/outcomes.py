@@ -9,8 +9,6 @@ from experiments.studies.comparison import Paired, conclude, paired, verdict
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
 
-__all__ = ["UNITS", "Difference", "Outcome", "conclusions", "differences", "lines", "values"]
-
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
 """Metrics that are no shares -> their unit."""
 

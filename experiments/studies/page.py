@@ -16,8 +16,6 @@ from experiments.studies.tables import publish as write_page
 from experiments.studies.trials import Trial
 from skin.plot.figures import COLOURS
 
-__all__ = ["figure", "measured", "publish", "statements", "table"]
-
 _HEADINGS = {
     "same/dangerous/alarm_recall": "recall",
     "same/dangerous/false_alarm_rate": "false alarms",

@@ -22,8 +22,6 @@ from skin.simulator.naive import Naive
 from skin.touch.sampler import Movie
 from skin.tracking import Store
 
-__all__ = ["draw_runs", "draw_skin"]
-
 _SPEEDS = np.linspace(0.003, 0.020, 7)
 
 

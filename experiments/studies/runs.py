@@ -22,8 +22,6 @@ from skin.reload import find
 from skin.run import simulator
 from skin.tracking import Store
 
-__all__ = ["Planned", "finished", "known", "multirun", "trained"]
-
 
 @dataclass(frozen=True)
 class Planned:

@@ -10,8 +10,6 @@ from skin.evaluation.alarm import Alarms
 from skin.evaluation.sliding import Sliding
 from skin.plot.figures import COLOURS
 
-__all__ = ["line", "page"]
-
 
 def page(found: Sliding, title: str) -> Page:
     """Return the tables, the CSV and the figure, under a title."""

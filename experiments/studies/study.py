@@ -10,12 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
-from skin.config import CONF, checked, overrides, plain
+from skin.config import checked, overrides, plain
 from skin.errors import InputError
+from skin.paths import CONF
 from skin.settings import check
 from skin.sweep import jobs
-
-__all__ = ["SMOKE", "Statement", "Study", "Variant", "given", "sweeps", "variants", "words"]
 
 SMOKE = (
     "data.gestures=80",

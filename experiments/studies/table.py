@@ -15,20 +15,6 @@ from experiments.studies.runs import finished
 from experiments.studies.tables import percent
 from skin.tracking import Store
 
-__all__ = [
-    "ACCURACIES",
-    "ALARM",
-    "COLUMNS",
-    "LABELS",
-    "Cell",
-    "as_csv",
-    "collect",
-    "grid",
-    "report_values",
-    "rows",
-    "show",
-]
-
 ACCURACIES = ("overall", "big", "dynamic", "press", "dangerous")
 ALARM = {"dangerous_recall": "dangerous/alarm_recall", "false_alarms": "dangerous/false_alarm_rate"}
 """Label in the table -> metric; at the threshold that is stored with each run."""

@@ -8,12 +8,11 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.peers import PEERS
 from experiments.studies.ensemble import WAYS, combine
 from experiments.studies.runs import finished
-from skin.config import CONF, checked
+from skin.config import checked
+from skin.paths import CONF
 from skin.run import simulator
 from skin.sweep import jobs
 from skin.tracking import Store
-
-__all__ = ["Entries"]
 
 # They stand in the table as soon as a run of theirs has finished.
 OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in (*WAYS, *PEERS)))

@@ -14,8 +14,6 @@ from rich.markup import escape
 from skin.files import write
 from skin.plot.figures import save
 
-__all__ = ["Page", "as_csv", "markdown", "percent", "publish", "show"]
-
 Table = Sequence[Sequence[str]]
 
 _WIDEST = 200  # characters

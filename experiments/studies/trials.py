@@ -23,8 +23,6 @@ from skin.learner.base import AbstractLearner
 from skin.reload import TAG, changed, configuration, restore
 from skin.tracking import Store
 
-__all__ = ["Trial", "trials"]
-
 
 @dataclass(frozen=True)
 class Trial:

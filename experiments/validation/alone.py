@@ -13,8 +13,6 @@ from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator.solid import Solid, hexahedra, readings
 
-__all__ = ["main"]
-
 
 def main(threads: int, cells: int, path: str) -> None:
     """Write an operator, readings of random frames and the pressure under a ball to x.npz."""

@@ -16,19 +16,6 @@ from skin.simulator._elastic import Elastic
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import hexahedra, readings
 
-__all__ = [
-    "SLABS",
-    "balance",
-    "confined_compression",
-    "even_pressure",
-    "patch_test",
-    "reciprocity",
-    "skin",
-    "sleeve",
-    "stack",
-    "wide_arm",
-]
-
 # The default skin, from the surface down.
 SLABS = (Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49))
 _LAYERS: Any = tuple(

@@ -9,8 +9,6 @@ from skin.body.sheet import Sheet
 from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
 
-__all__ = ["ALL", "FACES", "WALLS", "block", "graded", "held", "row_means", "solve"]
-
 # Faces of a block, as indices into its nodes (depth, y, x).
 FACES: dict[str, tuple[int | slice, ...]] = {
     "left": (slice(None), slice(None), 0),

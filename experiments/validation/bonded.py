@@ -14,8 +14,6 @@ from skin.sensors import Sensors
 from skin.simulator._hexahedra import Hexahedra
 from skin.simulator.solid import readings
 
-__all__ = ["convergence", "default_mesh", "no_locking", "thin_layer"]
-
 _SIDE = 0.16
 _LOADED = (0.06, 0.10, 0.06, 0.10)
 _PLACES = np.array([[0.08, 0.08], [0.105, 0.08], [0.12, 0.08]])

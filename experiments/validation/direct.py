@@ -21,8 +21,6 @@ from skfem.helpers import ddot, div, sym_grad, trace
 
 from skin.simulator._hexahedra import Hexahedra
 
-__all__ = ["Frame", "locking", "solve_frame"]
-
 _GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["Curve", "Finding", "Law", "Outcome", "Picture", "compared"]
-
 
 @dataclass(frozen=True)
 class Finding:

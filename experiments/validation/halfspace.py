@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["SQUARE_PUNCH", "HalfSpace", "Hertz", "round_punch", "square_punch"]
-
 # F / (E* d side) of a rigid square punch is pi times the capacitance of a unit square plate over 4 pi eps0:
 # both ask for the density whose 1/r potential is even. 0.3667874 is F. H. Read's (J. Comput. Phys. 133,
 # 1997).

@@ -4,8 +4,6 @@ from experiments.validation import basics, bonded, others, thick
 from experiments.validation.finding import Law
 from skin.errors import InputError
 
-__all__ = ["LAWS", "chosen"]
-
 LAWS = (
     Law("patch", "A uniform strain on the surface of distorted elements is the same strain inside.",
         "linear algebra", basics.patch_test),

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Slab", "bonded_layer", "patch", "patch_mean", "waves"]
-
 
 @dataclass(frozen=True)
 class Slab:

@@ -27,8 +27,6 @@ from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
 from skin.simulator.solid import Solid, hexahedra, readings
 
-__all__ = ["creep", "equation_ten", "naive", "plates_and_beams", "single_frames", "threads"]
-
 _DRAGON: Any = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
 _ECOFLEX: Any = {"material": "EcoFlex 00-30", "thickness": 0.005}
 _FOAM: Any = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thickness": 0.003}

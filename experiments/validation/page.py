@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 from experiments.validation.finding import Finding, Law, Outcome, Picture
 from skin.files import whole, write
 
-__all__ = ["as_json", "draw", "page", "publish"]
-
 Results = Sequence[tuple[Law, Outcome]]
 
 _HEAD = """# Physics, proved

@@ -15,8 +15,6 @@ from skin.contact._grain import with_grain
 from skin.contact._unilateral import solve as press
 from skin.simulator._hexahedra import Hexahedra
 
-__all__ = ["boussinesq", "cerruti", "flat_punch", "hertz"]
-
 _YOUNG, _RATIO, _HALF = 170e3, 0.45, 0.01
 _STAR = _YOUNG / (1 - _RATIO**2)
 # A quarter of the block is solved: two faces are mirrors, or the opposite of mirrors under forces along x.

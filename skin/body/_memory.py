@@ -4,8 +4,6 @@ import psutil
 
 from skin.errors import InputError
 
-__all__ = ["require_memory"]
-
 
 def require_memory(needed: float, what: str, mend: str) -> None:
     """Raise unless ``needed`` bytes are free on this machine.

@@ -6,8 +6,6 @@ import numpy as np
 
 from skin.rng import Stream, generator
 
-__all__ = ["along", "factors"]
-
 
 def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
     """Return independent log-normal numbers with mean 1 and standard deviation ``variation``.

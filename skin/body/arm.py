@@ -12,8 +12,6 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.settings import checked
 
-__all__ = ["Arm"]
-
 
 @checked("body")
 @dataclass(frozen=True)

@@ -20,8 +20,6 @@ from skin.settings import checked, configured
 if TYPE_CHECKING:
     from skin.sensors import Sensors
 
-__all__ = ["AbstractBody", "Layer", "overlaps"]
-
 # What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
 _BYTES_PER_CELL = 25 * 8 + 30 * 4
 

@@ -8,8 +8,6 @@ import numpy as np
 from skin.body.base import AbstractBody
 from skin.settings import checked
 
-__all__ = ["Sheet"]
-
 
 @checked("body")
 @dataclass(frozen=True)

@@ -11,8 +11,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, plain
+from skin.config import plain
 from skin.errors import InputError
 
 

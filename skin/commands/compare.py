@@ -9,8 +9,10 @@ out=; run= compares the predictions of a run, too.
 
 from typing import TYPE_CHECKING
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, plain
+from skin.config import plain
 from skin.errors import InputError
 from skin.files import results
 

@@ -9,8 +9,10 @@ import signal
 from contextlib import suppress
 from types import FrameType
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, plain
+from skin.config import plain
 from skin.errors import InputError
 
 _FORMATS = ("text", "binary")

@@ -6,8 +6,10 @@
 Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its own with that id.
 """
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, overrides
+from skin.config import overrides
 from skin.files import results
 
 

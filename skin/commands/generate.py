@@ -5,8 +5,10 @@
 Prints a summary of the touches, and warns where a shape tells a label.
 """
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, fingerprint, plain
+from skin.config import fingerprint, plain
 from skin.errors import InputError
 
 

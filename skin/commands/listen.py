@@ -8,8 +8,10 @@ Listens for seconds=, or until Ctrl-C.
 import signal
 from contextlib import suppress
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, plain
+from skin.config import plain
 from skin.errors import InputError
 
 _KEYS = ("baudrate", "format", "limits", "timeout")

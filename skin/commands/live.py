@@ -11,8 +11,10 @@ import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig, overrides, plain
+from skin.config import overrides, plain
 
 if TYPE_CHECKING:
     from skin.hardware.live.settings import Settings

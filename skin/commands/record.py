@@ -10,8 +10,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig
 from skin.errors import InputError
 
 

@@ -6,8 +6,9 @@
 A run that finished with the same configuration is skipped; tracking.resume=false trains it again.
 """
 
+from omegaconf import DictConfig
+
 from skin.command import command
-from skin.config import DictConfig
 
 
 @command()

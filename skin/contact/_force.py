@@ -11,8 +11,6 @@ from skin.contact._unilateral import Equilibrium
 from skin.labels import measure
 from skin.touch.problem import ContactProblem
 
-__all__ = ["Found", "seek"]
-
 # A peak is met when it is this near to what is wanted; an end of its range must be met better than any other
 # before the draw is given up there, so that it does not matter from which side the search has come.
 _NEAR = 1.03

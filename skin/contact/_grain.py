@@ -6,8 +6,6 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 
-__all__ = ["with_grain"]
-
 # Lowest eigenvalue of square cells on a half-space (that of the chessboard pattern), times E / (1 - nu^2) h.
 _CHESSBOARD = 0.34
 

@@ -5,8 +5,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Equilibrium", "solve"]
-
 # Problems solved at once: their vectors then stay in the cache.
 _PART = 256
 # Errors under pressure this much smaller than the tolerance are rounding: no direction is taken from them.

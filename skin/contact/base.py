@@ -5,8 +5,6 @@ from typing import ClassVar
 
 from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
-__all__ = ["AbstractContact"]
-
 
 class AbstractContact(ABC):
     """Turns what touches the skin into pressure on its cells.

@@ -10,8 +10,6 @@ from skin.contact.base import AbstractContact
 from skin.simulator.base import AbstractSimulator
 from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
-__all__ = ["Prescribed"]
-
 
 @final
 class Prescribed(AbstractContact):

@@ -17,8 +17,6 @@ from skin.settings import checked
 from skin.simulator.base import AbstractSimulator
 from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
-__all__ = ["Rigid"]
-
 
 @final
 @checked("contact")

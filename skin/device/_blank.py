@@ -8,8 +8,6 @@ from skin.device.base import AbstractDevice, Split
 from skin.labels import Task
 from skin.recording import Touches
 
-__all__ = ["Blank"]
-
 
 @dataclass
 class Blank(AbstractDevice):

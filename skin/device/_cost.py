@@ -13,8 +13,6 @@ from rich.progress import wrap_file
 
 from skin.errors import InputError
 
-__all__ = ["CAPTURES", "CHANNELS", "COLUMNS", "FULL", "ROWS", "SOURCE", "Captures", "read", "refusal"]
-
 SOURCE = "https://doi.org/10.4121/uuid:5ef62345-3b3e-479c-8e1d-c922748c9b29"
 ROWS, CAPTURES = 1_496_855, 7805
 """How long the published file is."""

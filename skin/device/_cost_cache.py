@@ -13,8 +13,6 @@ from skin.files import whole
 from skin.foreign import arrays
 from skin.simulator._store import folder
 
-__all__ = ["captures"]
-
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 1
 

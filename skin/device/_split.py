@@ -6,8 +6,6 @@ from torch import Tensor
 from skin.device.base import Split
 from skin.rng import Stream, generator
 
-__all__ = ["parts", "rows"]
-
 
 def parts(count: int) -> dict[Split, slice]:
     """Return which of ``count`` gestures, in the order of the split, each part has."""

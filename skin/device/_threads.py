@@ -6,8 +6,6 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["in_threads"]
-
 _T = TypeVar("_T")
 
 

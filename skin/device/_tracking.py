@@ -11,8 +11,6 @@ from skin.signal.imperfection import Imperfection
 from skin.simulator.base import AbstractSimulator
 from skin.touch.sampler import Movie, TouchSampler
 
-__all__ = ["Tracker", "estimated", "oracle"]
-
 _GESTURES = 1024
 _PENALTIES = np.logspace(-2, 6, 9)
 

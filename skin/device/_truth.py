@@ -12,8 +12,6 @@ from skin.sensors import Sensors
 from skin.simulator._relaxation import Relaxing, relaxes
 from skin.simulator.base import AbstractSimulator
 
-__all__ = ["misplaced", "modelled", "refuse_relaxation"]
-
 
 def misplaced(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
     """Return sensors beside their places.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # only their names are needed here
     from skin.wire.skin import Skin
     from skin.wire.source import Source
 
-__all__ = ["AbstractDevice", "AbstractSimulated", "AbstractWired", "Split"]
-
 Split = Literal["train", "validation", "holdout", "test"]
 
 

@@ -19,8 +19,6 @@ from skin.recording import Touches
 from skin.rng import Stream, generator
 from skin.sensors import Sensors
 
-__all__ = ["GESTURES", "VARIANTS", "Cost"]
-
 GESTURES = (
     "grab",
     "hit",

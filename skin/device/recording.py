@@ -15,8 +15,6 @@ from skin.storage import read
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
-__all__ = ["Recorded"]
-
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
 
 

@@ -31,8 +31,6 @@ from skin.wire.tare import Tare, settle
 from skin.wire.text import Header
 from skin.wire.transport import open_wire
 
-__all__ = ["Serial"]
-
 _LABELS = ("announced", "prompted", "none")
 _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
 

@@ -34,8 +34,6 @@ from skin.touch.stream import Strip, draw_timeline, touched
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
-__all__ = ["Simulated"]
-
 _BATCH = 1024
 _VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__}
 

@@ -7,8 +7,6 @@ import torch
 from scipy.stats import binomtest, chi2
 from torch import Tensor
 
-__all__ = ["Alarms", "Reached", "count_alarms"]
-
 
 @dataclass(frozen=True)
 class Alarms:

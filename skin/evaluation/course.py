@@ -8,8 +8,6 @@ from pydantic import PositiveFloat, PositiveInt
 
 from skin.settings import RISING, checked
 
-__all__ = ["Course"]
-
 
 @checked("measure")
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ from skin.evaluation.report import Answers
 from skin.labels import TOUCH, Measures, Thresholds
 from skin.signal.features import above_idle
 
-__all__ = ["ALARM", "Faint", "Margins", "Span", "margins", "spans"]
-
 ALARM = "alarm"
 """Name of the verdict "dangerous" at the operating point; that of the label is at 0.5."""
 

@@ -16,8 +16,6 @@ from torchmetrics.functional.classification import (
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.labels import Task
 
-__all__ = ["angles", "confusion", "metrics"]
-
 
 def metrics(
     probabilities: Tensor, labels: Tensor, task: Task, point: OperatingPoint | None = None

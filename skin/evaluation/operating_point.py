@@ -18,8 +18,6 @@ from skin.recording import Touches
 if TYPE_CHECKING:
     from skin.evaluation.report import Answers
 
-__all__ = ["ENOUGH", "LABEL", "OperatingPoint", "check", "choose", "gestures", "lowest", "read"]
-
 LABEL = "dangerous"
 ENOUGH = 2000
 """Safe gestures; where 2 % are wanted, the true rate is then 1.4 to 2.7 % (95 %). 5000: 1.6 to 2.4 %."""

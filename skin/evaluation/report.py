@@ -21,8 +21,6 @@ from skin.labels import Task
 from skin.layout.scattered import Scattered
 from skin.recording import Touches
 
-__all__ = ["Answers", "Report", "columns", "evaluate"]
-
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
 SHARES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")

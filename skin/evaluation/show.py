@@ -8,8 +8,6 @@ from rich.table import Table
 
 from skin.evaluation.report import SHARES, Report
 
-__all__ = ["number", "report", "table"]
-
 
 def report(found: Report, title: str, console: Console | None = None) -> None:
     """Print one line per label and one column per set of touches, accuracies in per cent, errors in degrees.

@@ -19,8 +19,6 @@ from skin.evaluation.report import Answers
 from skin.labels import TOUCH_OR_NOT, Task
 from skin.signal.contact_threshold import Gate, Threshold, gates, rise
 
-__all__ = ["Bin", "Sliding", "bins", "slide"]
-
 _CHUNK = 1024
 _EDGES = (0.2, 0.4, 0.6, 0.8)
 

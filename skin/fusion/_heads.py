@@ -9,8 +9,6 @@ from torch import Tensor, nn
 from skin.model._attention import encoder
 from skin.model._pooling import Reduced
 
-__all__ = ["HEADS", "Head"]
-
 Head = Literal["mean", "max", "conv", "lstm", "gru", "attention+gru", "residual", "transformer"]
 
 

@@ -10,8 +10,6 @@ from skin.errors import InputError
 from skin.model.base import AbstractModel, Kind
 from skin.representation.base import Frames
 
-__all__ = ["AbstractFusion", "MakeModel"]
-
 
 class MakeModel(Protocol):
     """A model short of what the data decide."""

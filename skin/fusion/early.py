@@ -9,8 +9,6 @@ from skin.fusion.base import AbstractFusion, MakeModel
 from skin.model.base import Kind
 from skin.representation.base import Frames
 
-__all__ = ["Early"]
-
 
 class Early(AbstractFusion):
     """Stacks the frames as channels of one image or as features of one graph (report, 3.2.2 and 3.2.3).

@@ -11,8 +11,6 @@ from skin.model.base import Kind
 from skin.representation.base import Frames
 from skin.settings import checked
 
-__all__ = ["Late"]
-
 
 @checked("fusion")
 class Late(AbstractFusion):

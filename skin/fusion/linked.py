@@ -10,8 +10,6 @@ from skin.fusion.base import AbstractFusion, MakeModel
 from skin.model.base import Kind
 from skin.representation.base import Frames
 
-__all__ = ["Linked", "link"]
-
 
 def link(adjacency: Tensor, window: int) -> Tensor:
     """Return the normalised adjacency (T S, T S) of a graph that holds one copy of a sensor graph per frame.

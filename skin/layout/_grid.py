@@ -6,8 +6,6 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Lt
 
-__all__ = ["Tilt", "grid", "rosette"]
-
 Tilt = Annotated[float, Ge(0), Lt(math.pi / 2)]
 """Angle between the normals of a sensor and of the surface, rad."""
 

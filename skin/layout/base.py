@@ -9,8 +9,6 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.sensors import Sensors
 
-__all__ = ["AbstractLayout", "Footprint", "place"]
-
 Footprint = tuple[PositiveFloat, PositiveFloat]
 """Extent (x, y) over which a sensor feels, m."""
 

@@ -13,8 +13,6 @@ from skin.paths import candidates
 from skin.sensors import Sensors
 from skin.settings import checked
 
-__all__ = ["File"]
-
 _NEED = (
     "a layout has the columns x_m, y_m and optionally depth_m, in metres from the upper left corner, and "
     "normal_x, normal_y, normal_z, which way a sensor faces"

@@ -9,8 +9,6 @@ from skin.layout.base import AbstractLayout, Footprint, place
 from skin.sensors import Sensors
 from skin.settings import checked
 
-__all__ = ["Grid"]
-
 
 @checked("layout")
 class Grid(AbstractLayout):

@@ -12,8 +12,6 @@ from skin.layout.base import AbstractLayout, Footprint, place
 from skin.sensors import Sensors
 from skin.settings import checked
 
-__all__ = ["Scattered"]
-
 
 @checked("layout")
 class Scattered(AbstractLayout):

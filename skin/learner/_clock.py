@@ -8,8 +8,6 @@ from typing import Any
 
 from pytorch_lightning import Callback, Trainer
 
-__all__ = ["Clock"]
-
 
 class Clock(Callback):
     """Measures the training part of every epoch, from its start to the end of its last batch.

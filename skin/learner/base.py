@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from skin.datamodule import TouchData
 
-__all__ = ["AbstractLearner"]
-
 
 class AbstractLearner(ABC):
     """Learns the labels of touches, whether by gradient descent, by boosting or by rules.

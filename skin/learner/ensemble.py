@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from skin.datamodule import TouchData
 
-__all__ = ["Ensemble"]
-
 
 class Ensemble(AbstractLearner):
     """Trains its members on the same touches, each from a seed of its own, and averages what they say.

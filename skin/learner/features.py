@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from skin.datamodule import TouchData
 
-__all__ = ["Features"]
-
 
 class Features(AbstractLearner):
     """Measures about 130 numbers on a touch and boosts decision trees on them, one ensemble per label.

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
-__all__ = ["Network"]
-
 CHUNK = 64  # touches at a time when predicting: fastest, and bounds memory to a few hundred MB
 
 

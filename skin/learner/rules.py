@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from skin.datamodule import TouchData
 
-__all__ = ["Rule", "Rules"]
-
 LOOK_AT = {
     "big": ("sensors above", "most sensors above"),
     "dynamic": ("path of", "reach of", "extent of", "way of"),

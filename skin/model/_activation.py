@@ -4,8 +4,6 @@ from torch import nn
 
 from skin.errors import InputError
 
-__all__ = ["activation"]
-
 
 def activation(name: str) -> nn.Module:
     """Return relu, elu or silu as a module.

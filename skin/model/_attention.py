@@ -4,8 +4,6 @@ from torch import nn
 
 from skin.errors import InputError
 
-__all__ = ["encoder"]
-
 
 def encoder(
     width: int, heads: int, layers: int, feedforward: int, dropout: float, setting: str

@@ -11,8 +11,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-__all__ = ["POOLINGS", "Pooling", "Reduced"]
-
 Pooling = Literal["max", "mean", "attention", "set2set"]
 
 STEPS = 3  # of Set2Set

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Cells", "Plan", "convolve_and_pool", "dense", "linear", "plan"]
-
 TAPS = 9  # of a 3x3 kernel
 WINDOW = 4  # a pooled cell sees 4x4 inputs
 

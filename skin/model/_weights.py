@@ -9,8 +9,6 @@ from torch import Tensor, nn
 from skin.errors import InputError
 from skin.paths import candidates
 
-__all__ = ["find", "load"]
-
 _OFFICIAL = "efficientnet_b0_rwightman-7f5810bc.pth"
 _SOURCE = f"https://download.pytorch.org/models/{_OFFICIAL}"
 _WAYS = "model.weights=random trains from scratch"

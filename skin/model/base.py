@@ -7,8 +7,6 @@ from torch import Tensor, nn
 
 from skin.errors import InputError
 
-__all__ = ["AbstractModel", "Kind"]
-
 Kind = Literal["image", "graph", "readings"]
 
 

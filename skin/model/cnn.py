@@ -12,8 +12,6 @@ from skin.errors import InputError
 from skin.model import _sparse
 from skin.model.base import AbstractModel, Kind
 
-__all__ = ["Cnn"]
-
 SPARSE = 32  # images with fewer than one active pixel in so many go the short way
 
 

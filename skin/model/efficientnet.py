@@ -12,8 +12,6 @@ from skin.model import _weights
 from skin.model._mbconv import Bottleneck, unit
 from skin.model.base import AbstractModel, Kind
 
-__all__ = ["EfficientNet"]
-
 # Table 1 of Tan and Le (2019): ratio, kernel, stride of the first block, channels, blocks
 STAGES = (
     (1, 3, 1, 16, 1),

@@ -14,8 +14,6 @@ from skin.model._pooling import POOLINGS, Pooling
 from skin.model.base import AbstractModel, Kind
 from skin.settings import checked
 
-__all__ = ["Gcn"]
-
 Norm = Literal["none", "layer", "batch", "instance"]
 
 

@@ -10,8 +10,6 @@ from skin.errors import InputError
 from skin.model._activation import activation as activation_of
 from skin.model.base import AbstractModel, Kind
 
-__all__ = ["Mlp"]
-
 
 class Mlp(AbstractModel):
     """Dense layers on the vector of readings: sensors keep their identity, so it serves one layout only.

@@ -13,8 +13,6 @@ from skin.errors import InputError
 from skin.model._pooling import POOLINGS, Pooling
 from skin.model.base import AbstractModel, Kind
 
-__all__ = ["Pyg"]
-
 
 class Pyg(AbstractModel):
     """A network of PyTorch Geometric on the graph of sensors, then one vector per graph.

@@ -10,8 +10,6 @@ from skin.model._attention import encoder
 from skin.model.base import AbstractModel, Kind
 from skin.settings import checked
 
-__all__ = ["Transformer"]
-
 Pooling = Literal["mean", "max"]
 
 

@@ -21,8 +21,6 @@ from skin.plot.view import FORCE, Draw, Scene, clear, norm, places, space_and_tr
 from skin.representation._pixels import centres
 from skin.representation.interp import weights
 
-__all__ = ["VIEWS", "Scene", "still", "thinning", "write"]
-
 _FASTEST, _LONGEST = 25.0, 100  # frames per second, frames
 _PIXELS = 48
 _COLOURS = 96

@@ -16,8 +16,6 @@ from skin.files import whole, write
 from skin.labels import Task
 from skin.plot.figures import confusions, save
 
-__all__ = ["page", "publish", "verdicts"]
-
 
 def page(found: Report, task: Task, title: str, about: str) -> str:
     """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.

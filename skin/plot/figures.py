@@ -10,17 +10,6 @@ from torch import Tensor
 
 from skin.files import whole
 
-__all__ = [
-    "COLOURS",
-    "confusions",
-    "force_and_reading",
-    "images",
-    "misclassified",
-    "overview",
-    "save",
-    "traces",
-]
-
 Layout = tuple[tuple[float, float], float]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -18,8 +18,6 @@ from skin.recording import Touches
 from skin.rng import Stream, generator
 from skin.wire.segmentation import sentence
 
-__all__ = ["Gestures", "Pair", "marked", "read", "touches"]
-
 _IDLE = 30  # frames before a simulated gesture, which give its baseline
 
 

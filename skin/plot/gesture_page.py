@@ -10,8 +10,6 @@ from skin.plot.gesture_comparison import Gestures
 from skin.plot.press_comparison import Verdicts, agreement
 from skin.wire.segmentation import sentence
 
-__all__ = ["figure", "page"]
-
 
 def page(found: Gestures, verdicts: Verdicts | None, about: str) -> str:
     """Return a page in Markdown.

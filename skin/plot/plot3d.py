@@ -14,8 +14,6 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from skin.body.base import AbstractBody
 from skin.plot.view import FORCE, Draw, Scene, clear, norm, space_and_traces, traces
 
-__all__ = ["sensors_in_space", "skin_in_space"]
-
 _ELEVATION, _AZIMUTH = 38.0, -62.0  # degrees, of the eye
 # Towards the eye; y is drawn upside down, so that the chart is seen from outside as it is in flat pictures.
 _EYE = np.array(

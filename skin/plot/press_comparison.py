@@ -18,8 +18,6 @@ from skin.recording import Touches
 from skin.rng import Stream, generator
 from skin.signal.resampling import resample
 
-__all__ = ["Comparison", "Press", "Verdicts", "agreement", "compare", "figure", "page", "read", "touches"]
-
 
 @dataclass(frozen=True)
 class Press:

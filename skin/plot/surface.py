@@ -13,8 +13,6 @@ from skin.simulator._assembly import Constraint, Structure
 from skin.simulator._factors import factorised
 from skin.simulator.base import AbstractSimulator
 
-__all__ = ["deflection", "draw_surface", "surface", "surface_motion"]
-
 
 def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "vertical") -> np.ndarray:
     """Return how far every node moves into the skin, (F, layers, ny + 1, nx + 1), m, from the table up.

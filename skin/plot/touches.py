@@ -14,8 +14,6 @@ from skin.plot.animation import Scene
 from skin.plot.surface import surface_motion
 from skin.recording import Touches
 
-__all__ = ["recorded", "simulated"]
-
 
 @torch.no_grad()
 def simulated(

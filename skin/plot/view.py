@@ -12,8 +12,6 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 
-__all__ = ["FORCE", "Draw", "Scene", "clear", "norm", "places", "space_and_traces", "traces"]
-
 FORCE = "viridis"  # colours of forces
 
 

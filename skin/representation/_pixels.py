@@ -5,8 +5,6 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-__all__ = ["Pixels", "centres", "pixel_of"]
-
 Pixels = Annotated[int, Ge(8)]
 """Edge length of a square image."""
 

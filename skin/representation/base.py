@@ -8,8 +8,6 @@ from torch import Tensor, nn
 
 from skin.recording import Touches
 
-__all__ = ["AbstractRepresentation", "Frames", "channels"]
-
 
 class Frames(NamedTuple):
     """Touches as a network takes them.

@@ -10,8 +10,6 @@ from skin.representation.base import AbstractRepresentation, Frames
 from skin.representation.image import Image
 from skin.settings import checked
 
-__all__ = ["Fourier"]
-
 
 @checked("representation")
 class Fourier(AbstractRepresentation):

@@ -15,8 +15,6 @@ from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
 
-__all__ = ["Graph", "adjacency", "neighbours", "normalised", "self_share", "typical_distance"]
-
 Edges = Literal["knn", "delaunay"]
 Weight = Literal["exp", "distance", "stiffness", "none"]
 Positions = Literal["layout", "deformed"]

@@ -10,8 +10,6 @@ from skin.representation._pixels import Pixels, pixel_of
 from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
 
-__all__ = ["Image"]
-
 
 @checked("representation")
 class Image(AbstractRepresentation):

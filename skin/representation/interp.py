@@ -15,8 +15,6 @@ from skin.representation._pixels import Pixels, centres
 from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
 
-__all__ = ["Interpolation", "weights"]
-
 Method = Literal["nearest", "linear", "cubic"]
 
 

@@ -9,8 +9,6 @@ from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.signal.features import measurements
 
-__all__ = ["Measured"]
-
 _IDLE = 8
 
 

@@ -6,8 +6,6 @@ from torch import Tensor
 
 from skin.representation.base import AbstractRepresentation, Frames, channels
 
-__all__ = ["Readings"]
-
 
 class Readings(AbstractRepresentation):
     """Keeps the readings as a vector: the sensors keep their identity, their places are not told.

@@ -10,8 +10,6 @@ from skin.errors import InputError
 from skin.recording import Touches
 from skin.settings import checked
 
-__all__ = ["Augmentation"]
-
 _IDLE = 8
 _MARGIN = 2  # frames that a touch may last beyond what stands out
 

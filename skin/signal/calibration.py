@@ -14,8 +14,6 @@ from skin.errors import InputError
 from skin.foreign import settings
 from skin.paths import candidates
 
-__all__ = ["BROKEN", "QUANTITIES", "Calibration", "read", "write"]
-
 FORMAT = 1
 QUANTITIES = {
     "gain": 1.0,

@@ -4,8 +4,6 @@ from math import ceil
 
 import numpy as np
 
-__all__ = ["DRIFT", "Contact"]
-
 DRIFT = 0.2 / 600  # N/s: 0.2 N in ten minutes
 _RELEASE = 0.3  # s below the threshold that end a contact
 

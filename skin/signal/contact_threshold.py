@@ -11,8 +11,6 @@ from skin.errors import InputError
 from skin.labels import Task
 from skin.recording import Touches
 
-__all__ = ["Gate", "Threshold", "gates", "rise"]
-
 Gate = Callable[[Touches, Tensor], Tensor]
 """From windows and their probabilities (B, L) to which of them are said to be touched, (B,), bool."""
 

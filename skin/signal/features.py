@@ -6,8 +6,6 @@ from torch import Tensor
 from skin.labels import longest_run
 from skin.recording import Touches
 
-__all__ = ["above_idle", "measurements"]
-
 LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle; the noise is about 0.05 N
 SHARES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)  # of the touch's own peak
 IDLE = 0.2  # a touch rests for at least a fifth of its window

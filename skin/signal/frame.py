@@ -6,8 +6,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-__all__ = ["After", "Check", "Counters", "Frame", "FrameError"]
-
 Check = Literal["crc16", "xor", "none"]
 After = Literal["", "gap", "cut", "reset", "reconnect"]
 """What lies before a frame: nothing; lost frames; another touch of a recording; a restart of the device; an

@@ -14,8 +14,6 @@ from skin.lag import lagged, rounded, unloading
 from skin.settings import check
 from skin.signal.calibration import Calibration, read
 
-__all__ = ["Constants", "Imperfection", "ImperfectionSettings"]
-
 _IDLE_FRAMES = 30
 
 

@@ -9,8 +9,6 @@ from skin.errors import InputError
 if TYPE_CHECKING:
     from skin.signal.frame import Frame
 
-__all__ = ["Resampled", "Window", "check_rate", "resample"]
-
 _SLOWER = 1.05  # a ceramic resonator may be that wrong, and a frame may be lost
 _FEW = 8  # frames from which no rate can be estimated
 _MANY = 256  # frames over which it is estimated

@@ -6,8 +6,6 @@ from torch import Tensor
 from skin.recording import Touches
 from skin.signal.features import above_idle
 
-__all__ = ["bearings"]
-
 SHARES = (0.1, 0.25, 0.5)  # of the touch's own peak: a frame beyond is active
 _FORCE = 0.1  # N, twice the noise: what weighs less is no part of a centre
 

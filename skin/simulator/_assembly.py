@@ -17,8 +17,6 @@ from skin.errors import InputError
 from skin.sensors import Sensors
 from skin.simulator import _beam, _plate
 
-__all__ = ["Constraint", "Structure"]
-
 Constraint = Literal["vertical", "free"]
 
 # The degrees of freedom (u, v, w, rx, ry, rz) that supports leave free above the table.

@@ -7,8 +7,6 @@ import numpy as np
 
 from skin.material import Material
 
-__all__ = ["stiffness"]
-
 # Local axes in the rows: x runs up the beam, y along the sheet's y, z against the sheet's x. PyNite turns an
 # upright member without rotation like this.
 _AXES = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])

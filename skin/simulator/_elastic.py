@@ -16,8 +16,6 @@ from skin.files import whole
 from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
 
-__all__ = ["Elastic"]
-
 _AT_ONCE = 32  # right-hand sides
 
 

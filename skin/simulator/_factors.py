@@ -3,8 +3,6 @@
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-__all__ = ["factorised"]
-
 
 def factorised(stiffness: sp.csc_matrix) -> SuperLU:
     """Return the factors of a matrix that is symmetric and positive definite.

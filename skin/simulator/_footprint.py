@@ -4,8 +4,6 @@ import numpy as np
 
 from skin.sensors import Sensors
 
-__all__ = ["quadrature"]
-
 _GAUSS = np.array([-1.0, 1.0]) / np.sqrt(3)
 
 

@@ -15,8 +15,6 @@ from skfem import BilinearForm, CellBasis, ElementHex0, ElementHex1, ElementVect
 from skfem.helpers import ddot, div, sym_grad
 from skfem.refdom import RefHex
 
-__all__ = ["Hexahedra"]
-
 _CORNERS = RefHex.p.T.astype(int)  # (8, 3): scikit-fem's order of an element's nodes
 
 

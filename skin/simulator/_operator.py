@@ -16,8 +16,6 @@ from skin.simulator import _store
 from skin.simulator._assembly import Structure
 from skin.simulator._factors import factorised
 
-__all__ = ["Operator", "build", "cached"]
-
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 2
 _HERE = Path(__file__).parent

@@ -8,8 +8,6 @@ import numpy as np
 
 from skin.material import Material
 
-__all__ = ["pressure_load", "stiffness"]
-
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 # Powers (of x, of y) of the twelve terms of the deflection (Melosh 1963).
 _POWERS = np.array(

@@ -13,8 +13,6 @@ from skin.simulator._assembly import Structure
 if TYPE_CHECKING:
     from Pynite import FEModel3D
 
-__all__ = ["displacements", "model", "solve"]
-
 
 def model(structure: Structure, pressure: np.ndarray) -> "FEModel3D":
     """Return a PyNite model of a sheet under pressure (H, W), Pa, ready to be analysed.

@@ -14,8 +14,6 @@ from skin.lag import lagged
 from skin.sensors import Sensors
 from skin.simulator.base import AbstractSimulator, Response
 
-__all__ = ["Relaxing", "elastic", "relaxes", "speeds", "times"]
-
 _APART = 1.2
 
 

@@ -16,8 +16,6 @@ from skin.errors import InputError
 from skin.files import whole
 from skin.foreign import arrays
 
-__all__ = ["folder", "hashed", "kept"]
-
 
 def folder(given: str | Path | None) -> Path:
     """Return where arrays are kept: as given, else by the variable SKIN_CACHE, else the user's cache."""

@@ -11,8 +11,6 @@ from skin.simulator._assembly import Structure
 from skin.simulator._factors import factorised
 from skin.simulator._hexahedra import Hexahedra
 
-__all__ = ["largest", "solid_rows", "squeeze"]
-
 # Components xx, yy, zz, yz, xz, xy, and how often each stands in the tensor.
 _PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 _TIMES = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])

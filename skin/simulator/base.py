@@ -11,8 +11,6 @@ from skin.option import option
 from skin.sensors import Sensors
 from skin.touch.movie import Movie
 
-__all__ = ["AbstractSimulator", "Response", "flatten"]
-
 
 class Response(NamedTuple):
     """What the skin answers to a pressure, before any imperfection of a device.

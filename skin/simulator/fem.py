@@ -18,8 +18,6 @@ from skin.simulator._store import folder
 from skin.simulator._strain import largest, squeeze
 from skin.simulator.base import AbstractSimulator, Response, flatten
 
-__all__ = ["PlatesAndBeams", "Reading"]
-
 Reading = Literal["equation10", "interface"]
 
 

@@ -10,8 +10,6 @@ from skin.body.base import AbstractBody
 from skin.sensors import Sensors
 from skin.simulator.base import AbstractSimulator, Response, flatten
 
-__all__ = ["Naive"]
-
 
 class Naive(AbstractSimulator):
     """Reads the pressure of the cell that holds the sensor, times the area of its footprint: no mechanics.

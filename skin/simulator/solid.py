@@ -23,8 +23,6 @@ from skin.simulator._hexahedra import Hexahedra
 from skin.simulator._strain import largest, solid_rows
 from skin.simulator.base import AbstractSimulator, Response, flatten
 
-__all__ = ["Solid", "hexahedra", "readings"]
-
 _HERE = Path(__file__).parent
 _SOURCES = [
     *sorted((_HERE.parent / "body").glob("*.py")),

@@ -12,8 +12,6 @@ from skin.touch.shapes import Shapes
 if TYPE_CHECKING:
     from skin.touch.gesture import Draws, GestureSettings
 
-__all__ = ["Fit", "draw_bodies"]
-
 _TRIES = 2000
 _PROBES = 500
 _RARE = 0.01

@@ -8,8 +8,6 @@ import torch
 from skin.touch.gesture import Draws, GestureSettings, fold
 from skin.touch.problem import Trajectories
 
-__all__ = ["Course", "course"]
-
 
 class Course(NamedTuple):
     """Trajectories and the way that they take.

@@ -14,8 +14,6 @@ from skin.settings import RISING, checked, configured
 from skin.touch._bodies import Fit, draw_bodies
 from skin.touch.shapes import Shapes
 
-__all__ = ["Draws", "GestureSettings", "draw_gestures", "draw_paths", "fold", "heading"]
-
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
 

@@ -13,8 +13,6 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 from skin.errors import InputError
 from skin.paths import BUNDLED, candidates
 
-__all__ = ["check", "hulls", "load", "pyramid"]
-
 _FOLDER = BUNDLED / "data" / "shapes"
 
 

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from skin.labels import sliding
 
-__all__ = ["Movie", "join"]
-
 
 @dataclass(frozen=True)
 class Movie:

@@ -9,8 +9,6 @@ from torch import Tensor
 from skin.touch.gesture import GestureSettings
 from skin.touch.shapes import Shapes
 
-__all__ = ["Contact", "ContactProblem", "ContactResult", "Trajectories"]
-
 
 class ContactProblem(NamedTuple):
     """What is touched, and how touches of it are judged.

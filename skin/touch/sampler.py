@@ -19,8 +19,6 @@ from skin.touch.movie import Movie, join
 from skin.touch.problem import Contact, ContactProblem, ContactResult
 from skin.touch.shapes import Shapes
 
-__all__ = ["Movie", "TouchSampler", "balanced", "join"]
-
 _ATTEMPTS = 50
 _AHEAD = 64
 # For how many of these attempts a fitted shape is kept; then any other may take its place.

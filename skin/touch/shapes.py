@@ -15,8 +15,6 @@ from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
 from skin.touch.images import hulls, load, pyramid
 
-__all__ = ["Shapes", "Solids"]
-
 # Frames rendered at once: their sampling grid (32 KiB a frame on 32 x 32 cells) then stays in the cache.
 _CELLS_AT_ONCE = 128 * 1024
 _POINTS = 4

@@ -13,8 +13,6 @@ from skin.labels import TOUCH_OR_NOT
 from skin.recording import Recording
 from skin.touch.sampler import Movie, TouchSampler, join
 
-__all__ = ["Look", "Strip", "Timeline", "draw_timeline", "touched"]
-
 _LEAST = 16
 
 

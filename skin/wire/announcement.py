@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from skin.wire.checksum import crc16
 from skin.wire.transport import ByteStream
 
-__all__ = ["Announcement", "Tap", "encode", "parse"]
-
 _KNOWN = ("number", "seq", "frames")
 _LONGEST = 4096  # bytes
 _KEPT = 64  # announcements, where nobody takes them

@@ -5,8 +5,6 @@ import numpy as np
 from skin.errors import InputError
 from skin.wire.errors import SkinTouched
 
-__all__ = ["median", "rest"]
-
 _FEWEST = 10  # frames
 # As multiples of the noise and of the smallest step seen.
 _MOVED = 8.0, 3.0  # within the frames

@@ -15,17 +15,6 @@ import numpy as np
 from skin.signal.frame import FrameError
 from skin.wire.checksum import crc16
 
-__all__ = [
-    "Kind",
-    "Payload",
-    "decode_comment",
-    "decode_frame",
-    "encode_comment",
-    "encode_frame",
-    "stuff",
-    "unstuff",
-]
-
 Kind = Literal["u16", "i16", "f32"]
 
 _MAGIC = 0xA5

@@ -4,8 +4,6 @@ import binascii
 from functools import reduce
 from operator import xor
 
-__all__ = ["crc16", "xor8"]
-
 
 def crc16(data: bytes) -> int:
     """Return CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF; ``123456789`` gives 0x29B1."""

@@ -8,8 +8,6 @@ from skin.errors import InputError
 from skin.signal.calibration import Calibration
 from skin.wire.text import Header
 
-__all__ = ["Newtons", "newtons"]
-
 
 @dataclass(frozen=True)
 class Newtons:

@@ -8,8 +8,6 @@ from skin.wire.detect import Format, Found, Raw, Speech, detect, refusal
 from skin.wire.sequence import HostClock, Order
 from skin.wire.text import Header, parse_header
 
-__all__ = ["Decoder"]
-
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must

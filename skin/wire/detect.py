@@ -14,8 +14,6 @@ from skin.wire.binary import decode_comment, decode_frame
 from skin.wire.sequence import steps
 from skin.wire.text import Header, Line, parse_header, parse_line
 
-__all__ = ["Binary", "Format", "Raw", "Speech", "Text", "clock_stands_still", "detect", "refusal"]
-
 Format = Literal["auto", "text", "binary"]
 
 _LINES, _FRAMES = 3, 2

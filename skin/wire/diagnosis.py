@@ -11,8 +11,6 @@ from skin.signal.frame import Frame
 from skin.wire.skin import Skin
 from skin.wire.text import encode_header
 
-__all__ = ["Listener"]
-
 _KEPT = 10_000  # frames of which channels are told
 _SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
 

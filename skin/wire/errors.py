@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from skin.errors import InputError
 from skin.signal.frame import Frame
 
-__all__ = ["SkinDisconnected", "SkinTimeout", "SkinTouched"]
-
 
 class SkinTouched(InputError):  # noqa: N818
     """No baseline can be taken, because something touches the skin."""

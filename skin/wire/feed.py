@@ -15,8 +15,6 @@ from skin.wire.detect import clock_stands_still
 from skin.wire.health import Health, Limits, State
 from skin.wire.transport import ByteStream
 
-__all__ = ["Feed", "Piece", "Player", "Wire"]
-
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 _log = logging.getLogger("skin.wire")

@@ -4,8 +4,6 @@ from typing import Literal
 
 import numpy as np
 
-__all__ = ["Health", "Limits", "State"]
-
 State = Literal["ok", "saturated", "stuck", "dead"]
 Limits = tuple[float | None, float | None]
 

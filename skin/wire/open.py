@@ -23,8 +23,6 @@ from skin.wire.transport import ByteStream, open_wire
 if TYPE_CHECKING:
     from skin.recording import Touches
 
-__all__ = ["Settings", "Streamed", "open_skin"]
-
 _STRIP = 600.0  # s of simulated touches in one piece
 
 

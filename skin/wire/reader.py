@@ -12,8 +12,6 @@ from skin.signal.frame import Frame
 from skin.wire.errors import SkinDisconnected
 from skin.wire.feed import Feed
 
-__all__ = ["Reader"]
-
 _log = logging.getLogger("skin.wire")
 
 _PAUSE = 0.002  # s between two looks at the port: fewer and larger pieces, a tenth of the work

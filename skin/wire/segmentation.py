@@ -17,8 +17,6 @@ from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
 from skin.wire.announcement import Tap
 
-__all__ = ["AbstractDirector", "Announced", "Continuous", "Prompted", "Take", "plan", "sentence", "typed"]
-
 Labels = Mapping[str, int]
 
 _LATE = 0.25  # share of an announced window that may be missed at its beginning

@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 from skin.signal.frame import After, FrameError
 
-__all__ = ["HostClock", "Order", "Place"]
-
 _WRAP = 2**32  # microseconds: 71.6 minutes
 _WRAPS = (2**16, 2**32)  # of seq: what firmware counts in
 _ACROSS = 4096  # frames that may be missing where seq wraps

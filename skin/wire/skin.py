@@ -15,8 +15,6 @@ from skin.wire.health import State
 from skin.wire.reader import Reader
 from skin.wire.text import Header
 
-__all__ = ["Skin", "Stats"]
-
 
 @dataclass(frozen=True)
 class Stats:

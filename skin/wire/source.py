@@ -6,8 +6,6 @@ from skin.wire.conversion import newtons
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare
 
-__all__ = ["Source"]
-
 
 @dataclass(frozen=True)
 class Source:

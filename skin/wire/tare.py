@@ -15,8 +15,6 @@ from skin.wire.errors import SkinTouched
 from skin.wire.skin import Skin
 from skin.wire.text import Header
 
-__all__ = ["Meaning", "Tare", "settle"]
-
 Meaning = Callable[[np.ndarray | None, Header | None], Newtons]
 """From a baseline (S,), or None, and what a device tells of itself to what its values mean; InputError where
 nobody knows."""

@@ -12,8 +12,6 @@ from typing import NamedTuple
 from skin.signal.frame import Check, FrameError
 from skin.wire.checksum import crc16, xor8
 
-__all__ = ["Header", "Line", "encode_header", "encode_line", "parse_header", "parse_line"]
-
 
 class Line(NamedTuple):
     """The numbers of a line, and what protects them."""

@@ -14,8 +14,6 @@ except ImportError:  # Windows
 else:
     _Gone = termios.error
 
-__all__ = ["ByteStream", "open_wire"]
-
 _WAIT = 0.1  # s
 _CONNECT = 5.0  # s
 # Who only reads never notices that the other side lost its power; by default the system asks after two hours.

@@ -8,7 +8,7 @@ import tty
 
 import pytest
 
-from skin.config import ROOT
+from skin.paths import ROOT
 from skin.wire.text import Header, encode_header, encode_line
 
 LISTEN = "-m", "skin", "listen"

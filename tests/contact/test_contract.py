@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from skin.build import build_device
-from skin.config import CONF, checked
+from skin.config import checked
 from skin.errors import InputError
+from skin.paths import CONF
 
 OPTIONS = sorted(path.stem for path in (CONF / "contact").glob("*.yaml"))
 SMALL = ("body.cells=[16,16]", "layout=grid", "data.gestures=40", "device.test_gestures=32")

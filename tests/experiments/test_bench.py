@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from skin.config import ROOT
+from skin.paths import ROOT
 
 GENERATION = ROOT / "experiments" / "benchmarks" / "generation.py"
 

@@ -14,7 +14,8 @@ from sklearn.frozen import FrozenEstimator
 
 from experiments.peers.exchange import export
 from skin.build import build_device
-from skin.config import ROOT, Evaluation, Tracking, checked, fingerprint
+from skin.config import Evaluation, Tracking, checked, fingerprint
+from skin.paths import ROOT
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

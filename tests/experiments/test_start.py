@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from skin.cli import verbs
-from skin.config import ROOT
+from skin.paths import ROOT
 
 HEAVY = re.compile(r"\| +(torch|mlflow|pytorch_lightning|numpy|scipy)$", re.MULTILINE)
 KEPT = {"train", "evaluate", "generate", "record", "live", "reproduce_table"}

@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from experiments.studies.study import SMOKE
-from skin.config import ROOT, checked, fingerprint
+from skin.config import checked, fingerprint
+from skin.paths import ROOT
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments.validation.index import LAWS
-from skin.config import ROOT
+from skin.paths import ROOT
 
 
 @pytest.mark.slow

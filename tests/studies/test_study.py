@@ -7,8 +7,9 @@ from omegaconf import OmegaConf
 
 from experiments.studies.comparison import Paired, verdict
 from experiments.studies.study import Study, variants
-from skin.config import CONF, checked, fingerprint
+from skin.config import checked, fingerprint
 from skin.errors import InputError
+from skin.paths import CONF
 
 NAMES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from experiments.studies.table import COLUMNS, LABELS, Cell, as_csv, grid, report_values, rows, show
 from experiments.studies.tables import markdown
-from skin.config import CONF, ROOT
 from skin.files import write
+from skin.paths import CONF, ROOT
 
 REPORT = {("temporal_graph", "fem", "overall"): 0.732, ("temporal_graph", "fem", "big"): 0.646}
 

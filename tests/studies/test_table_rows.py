@@ -3,7 +3,7 @@
 from hydra import initialize_config_dir
 
 from experiments.studies.table_rows import Entries
-from skin.config import CONF
+from skin.paths import CONF
 
 
 def test_the_table_has_the_rows_of_its_sweep_and_those_of_other_commands():

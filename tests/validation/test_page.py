@@ -9,8 +9,8 @@ import pytest
 from experiments.validation.finding import Curve, Finding, Law, Outcome, Picture, compared
 from experiments.validation.index import LAWS, chosen
 from experiments.validation.page import as_json, page, publish
-from skin.config import ROOT
 from skin.errors import InputError
+from skin.paths import ROOT
 
 MISS = Outcome([compared("this", 1.2, 1.0, 0.1), compared("that", 1.0, 1.0, 0.1)], ["a remark"])
 LAW = Law("gravity", "Things fall.", "an apple", lambda quick: MISS)

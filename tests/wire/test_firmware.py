@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from skin.config import ROOT
+from skin.paths import ROOT
 from skin.wire.decoder import Decoder
 from skin.wire.text import Header
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skin.config import ROOT
+from skin.paths import ROOT
 from skin.wire.binary import encode_frame
 from skin.wire.decoder import Decoder
 from skin.wire.text import encode_line, parse_line

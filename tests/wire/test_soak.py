@@ -4,7 +4,7 @@ import importlib.util
 
 import pytest
 
-from skin.config import ROOT
+from skin.paths import ROOT
 
 pytestmark = pytest.mark.slow
 

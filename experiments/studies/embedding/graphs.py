@@ -10,8 +10,6 @@ import numpy as np
 
 from skin.errors import InputError
 
-__all__ = ["doc2vec", "invariant", "levels", "line_graph", "subtrees"]
-
 _POWERS = 5
 _EIGENVALUES = 10
 _BINS = 20

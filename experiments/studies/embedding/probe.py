@@ -18,16 +18,6 @@ from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.representation.graph import adjacency, neighbours
 
-__all__ = [
-    "FRAME",
-    "Found",
-    "Space",
-    "accuracy",
-    "explained",
-    "probe",
-    "strongest",
-]
-
 FRAME = "readings, one frame"
 
 # No training draws from these, and no layout of data/layouts is among the scattered ones.

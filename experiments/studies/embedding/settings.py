@@ -6,8 +6,6 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen
 
-__all__ = ["Probing"]
-
 
 @dataclass(frozen=True)
 class Probing:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import theilslopes
 
-__all__ = ["Idle", "clip_and_gain", "decay", "idle", "quantum"]
-
 _BLOCKS = 200
 _POINTS = 400
 _MAD = 1.4826

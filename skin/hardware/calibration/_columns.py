@@ -15,8 +15,6 @@ from skin.body._memory import require_memory
 from skin.errors import InputError
 from skin.files import tabular, whole, write
 
-__all__ = ["load", "numbers", "save"]
-
 _KEY = b"skin_session"
 _RECORDED = b"time,seq,raw_"  # of skin record: all its columns are numbers
 _NUMBERS = b"0123456789+-.e,"

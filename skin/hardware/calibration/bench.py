@@ -12,8 +12,6 @@ from skin.hardware.calibration.bench_session import Session
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.hardware.calibration.protocol import true_readings
 
-__all__ = ["Bench", "bench"]
-
 _BEFORE, _AFTER = 0.2, 1.0  # s around a press in which a skin is not idle
 _FEWEST = 50  # idle frames
 _SUDDEN = 2  # frames that a release may take

@@ -13,8 +13,6 @@ from skin.hardware.calibration._columns import load, numbers, save
 from skin.hardware.calibration.gauge import GAUGE, Gauge
 from skin.settings import checked
 
-__all__ = ["Session", "read", "write"]
-
 _OTHER = ("time", "t_us", "seq", *GAUGE)
 
 

@@ -13,8 +13,6 @@ from skin.hardware.calibration.bench import Bench
 from skin.lag import lagged, peaks
 from skin.signal.calibration import Calibration
 
-__all__ = ["fit"]
-
 _PRESSED = 0.05  # of the largest true reading: less tells no gain
 _SURE = 6.0  # standard errors above 0: less is no answer either
 _LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated

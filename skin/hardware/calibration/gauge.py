@@ -15,8 +15,6 @@ from skin.hardware.calibration._columns import load, numbers
 from skin.simulator.base import AbstractSimulator
 from skin.touch.shapes import Shapes
 
-__all__ = ["GAUGE", "Gauge", "of_table", "per_newton", "read"]
-
 GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
 """Columns beside ``time``; the first three are needed."""
 _PAUSE = 1.0  # s without a row end a press

@@ -13,8 +13,6 @@ from skin.lag import lagged
 from skin.signal.calibration import Calibration
 from skin.signal.imperfection import Imperfection
 
-__all__ = ["Outcome", "estimate", "hold_out", "judge", "predicted"]
-
 _FELT = 0.05  # of the press's strongest reading: sensors that count
 _LOADED = 0.2  # of a press's peak: frames in which its force is estimated
 _CLIPPED = 0.95

@@ -13,8 +13,6 @@ from skin.hardware.calibration.bench_session import Session, write
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.settings import configured
 
-__all__ = ["Protocol", "demo", "emulate", "true_readings"]
-
 
 @dataclass(frozen=True)
 class Protocol:

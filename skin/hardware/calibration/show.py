@@ -9,8 +9,6 @@ from rich.table import Table
 from skin.hardware.calibration.outcome import Outcome
 from skin.signal.calibration import QUANTITIES, Calibration
 
-__all__ = ["about", "show"]
-
 _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 

@@ -23,8 +23,6 @@ from skin.wire.binary import encode_comment, encode_frame
 from skin.wire.segmentation import sentence
 from skin.wire.text import Header, encode_header, encode_line
 
-__all__ = ["Emulator", "Settings"]
-
 _HEADER = 1.0  # s from one header to the next
 _LOOK = 0.05  # s between two looks whether somebody came
 

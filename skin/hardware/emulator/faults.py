@@ -10,8 +10,6 @@ from pydantic import NonNegativeFloat, NonNegativeInt
 
 from skin.errors import InputError
 
-__all__ = ["BANNER", "KINDS", "Faults"]
-
 BANNER = b"\x00\xff\x00ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805f0\r\n"
 """What an ESP32 says at 115200 baud when it starts, after two bytes of noise."""
 

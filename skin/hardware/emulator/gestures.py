@@ -12,8 +12,6 @@ from skin.device.base import AbstractSimulated
 from skin.rng import Stream, generator
 from skin.touch.sampler import balanced
 
-__all__ = ["Converter", "Gesture", "alike", "gestures", "in_time"]
-
 _BATCH = 16  # every combination of the labels once
 _EDGE = 0.25  # of a frame, in which force rises and falls
 

@@ -11,8 +11,6 @@ from time import monotonic, sleep
 
 from skin.errors import InputError
 
-__all__ = ["AbstractOutlet", "outlet"]
-
 _PATIENCE = 1.0  # s that a reader may be late before bytes are lost, as in a device without flow control
 _PAUSE = 0.002  # s until a full buffer is tried again
 

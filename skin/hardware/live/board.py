@@ -10,8 +10,6 @@ from skin.hardware.live.verdict import Verdict
 from skin.signal.frame import Frame
 from skin.wire.conversion import Newtons
 
-__all__ = ["Board", "Facts", "Look"]
-
 _KEPT = 8192  # frames that a view may be late by
 
 

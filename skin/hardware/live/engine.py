@@ -17,8 +17,6 @@ from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
 from skin.wire.conversion import Newtons
 
-__all__ = ["Detection", "Engine"]
-
 
 @checked("detection")
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ from skin.rng import Stream, generator
 from skin.signal.frame import Frame
 from skin.wire.conversion import Newtons
 
-__all__ = ["COURSES", "FIELDS", "Outcome", "courses", "played", "summary", "trials"]
-
 FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "cleared_s")
 
 _IDLE = 4.0  # s without touch before each one

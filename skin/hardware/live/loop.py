@@ -12,8 +12,6 @@ from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare
 
-__all__ = ["Session"]
-
 _PATIENCE = 0.3  # s of silence after which no verdict holds
 _AT_ONCE = 1024  # frames
 _TOLD = 0.5  # s between two lines about the state

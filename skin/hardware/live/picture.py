@@ -6,8 +6,6 @@ from scipy.spatial import ConvexHull, Delaunay
 from skin.representation._pixels import centres
 from skin.representation.interp import weights
 
-__all__ = ["Picture"]
-
 _FEWEST = 3
 _INWARDS = 1e-6
 

@@ -9,8 +9,6 @@ from annotated_types import Ge, Gt, Le
 from skin.hardware.live.verdict import Patience
 from skin.settings import configured
 
-__all__ = ["Settings"]
-
 
 @dataclass(frozen=True)
 class Settings:

@@ -12,8 +12,6 @@ from skin.signal.contact_detection import DRIFT
 from skin.signal.contact_threshold import Threshold, rise
 from skin.trained import Trained
 
-__all__ = ["advice", "engine"]
-
 _FAINT = 0.3  # N that end a contact where nothing else is known
 _MANY = 4000  # windows of streams, a tenth of which tunes what touch is
 

@@ -21,8 +21,6 @@ from skin.hardware.live.picture import Picture
 from skin.hardware.live.verdict import Verdict
 from skin.wire.segmentation import typed
 
-__all__ = ["lines", "screen", "shown", "since"]
-
 _HERTZ = 8
 _PIXELS = 24
 _BAR = 20  # characters

@@ -9,8 +9,6 @@ from pydantic import NonNegativeFloat
 from skin.labels import OPPOSITE
 from skin.settings import checked
 
-__all__ = ["Debounce", "Patience", "Verdict"]
-
 
 @dataclass(frozen=True)
 class Verdict:

@@ -24,8 +24,6 @@ from skin.hardware.live.board import Board, Look
 from skin.hardware.live.picture import Picture
 from skin.hardware.live.terminal import since
 
-__all__ = ["HERTZ", "message", "served"]
-
 HERTZ = 33  # pictures a second: 30, and what a busy machine costs
 _PIXELS = 64
 _HOST = "127.0.0.1"

@@ -13,8 +13,6 @@ from filelock import FileLock, Timeout
 from skin.errors import InputError
 from skin.files import unwritable
 
-__all__ = ["Lines", "locked", "opened", "sealed"]
-
 _SUM = ', "sum": "'
 
 

@@ -28,8 +28,6 @@ from skin.signal.frame import Frame
 from skin.wire.conversion import Newtons
 from skin.wire.segmentation import Take
 
-__all__ = ["Log", "Stored", "check", "read"]
-
 
 class Log:
     """A session that is being written; one that exists is resumed.

@@ -17,8 +17,6 @@ from skin.signal.resampling import Resampled, Window
 from skin.wire.conversion import Newtons
 from skin.wire.segmentation import Take
 
-__all__ = ["read"]
-
 _log = logging.getLogger("skin.hardware.record")
 
 _IN_FRAMES = b"0123456789+-.e,\r"

@@ -18,8 +18,6 @@ from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import Continuous, Take
 from skin.wire.text import Header
 
-__all__ = ["finish", "record"]
-
 _log = logging.getLogger("skin.hardware.record")
 
 

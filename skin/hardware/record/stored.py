@@ -6,8 +6,6 @@ from typing import Any
 from skin.wire.conversion import Newtons
 from skin.wire.segmentation import Take
 
-__all__ = ["Stored"]
-
 _NAMED = 5  # lines or gestures, in a sentence
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.config import ROOT
+from skin.paths import ROOT
 
 
 @pytest.fixture(scope="module")

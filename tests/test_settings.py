@@ -66,6 +66,7 @@ def test_what_fits_is_taken():
         ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a valid integer"),
         ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
         ({"zzz": 1}, "thing has no setting zzz: it has count"),
+        ({1: 2}, "thing has no setting 1: it has count"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(wrong, said):

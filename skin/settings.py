@@ -64,7 +64,7 @@ def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, wh
     parameters = signature(target).parameters
     hints = _hints(target)
     required = [key for key, its in parameters.items() if its.default is its.empty]
-    for key, value in settings.items():
+    for key, value in zip(map(str, settings), settings.values(), strict=True):
         if key.startswith("_"):
             continue
         if key not in parameters:

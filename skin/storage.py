@@ -44,16 +44,15 @@ def write(recording: Recording, path: str | Path) -> Path:
     """
     path = tabular(path, "a recording")
     table, about = _table(recording), _describe(recording)
-    if path.suffix == ".parquet":
-        with whole(path) as partial:
+    with whole(path) as partial:
+        if path.suffix == ".parquet":
             text = json.dumps(about)
             table = table.replace_schema_metadata({"skin": text, "skin_sha256": _sha256(text.encode())})
             pa.parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
-        return path
-    # The table takes its place last: without it the sidecar means nothing.
-    with whole(path) as partial:
-        pa.csv.write_csv(table, partial)
-        files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
+        else:
+            pa.csv.write_csv(table, partial)
+            # The table takes its place last: without it the sidecar means nothing.
+            files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
     return path
 
 

@@ -1,5 +1,6 @@
 """A full disk costs one sentence: nothing is half-written, and what was there before stays."""
 
+import os
 import resource
 from contextlib import contextmanager
 
@@ -141,3 +142,10 @@ def test_errors_of_ours_keep_their_traceback():
     assert refusal(FileNotFoundError(2, "No such file", "x")) is None
     assert refusal(ZeroDivisionError()) is None
     assert "x.csv: Read-only" in str(refusal(OSError(30, "Read-only file system", "x.csv")))
+
+
+def test_a_file_has_reached_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
+    path, synced = tmp_path / "x.txt", []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append((os.fstat(file).st_size, path.exists())))
+    write("0123456789", path)
+    assert synced == [(10, False)]

@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live.settings import Settings
-from skin.settings import RISING, check, check_groups, checked, configured
+from skin.settings import ONCE, RISING, check, check_groups, checked, configured
 
 
 class Thing:
@@ -25,6 +25,7 @@ class Thing:
         on: bool = False,
         copies: Mapping[str, int] | None = None,
         span: Annotated[tuple[float, float], RISING] = (1, 10),
+        labels: Annotated[Sequence[str], ONCE] = (),
     ) -> None:
         pass
 
@@ -61,8 +62,11 @@ def test_what_fits_is_taken():
         ),
         ({"span": [2]}, r"thing.span=\[2\] has too few entries"),
         ({"span": [1, 2, 3]}, r"thing.span=\[1, 2, 3\] has too many entries"),
+        ({"labels": ["a", "b", "a"]}, r"thing.labels=\['a', 'b', 'a'\] must hold each name once"),
+        ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a valid integer"),
         ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
         ({"zzz": 1}, "thing has no setting zzz: it has count"),
+        ({1: 2}, "thing has no setting 1: it has count"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(wrong, said):

@@ -1,6 +1,6 @@
 """A graph convolutional network on the graph of sensors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
@@ -80,7 +80,7 @@ class Gcn(AbstractModel):
         sizes = [shape[-1], *widths]
         self.convolutions = nn.ModuleList(_Convolution(*pair) for pair in pairwise(sizes))
         self.activation = activation_of(activation)
-        self.norms = nn.ModuleList(_norm(norm, width) for width in widths[:-1])
+        self.norms = nn.ModuleList(_NORMS[norm](width) for width in widths[:-1])
         self.pooling = POOLINGS[pooling](sizes[-1])
         self.width = int(self.pooling.width)  # type: ignore[arg-type]
 
@@ -117,6 +117,9 @@ class _InstanceNorm(nn.Module):
         return (x - mean) * (variance + 1e-5).rsqrt() * self.weight + self.bias
 
 
-def _norm(name: Norm, width: int) -> nn.Module:
-    known = {"none": nn.Identity, "layer": nn.LayerNorm, "batch": _BatchNorm, "instance": _InstanceNorm}
-    return known[name](width)
+_NORMS: dict[Norm, Callable[[int], nn.Module]] = {
+    "none": nn.Identity,
+    "layer": nn.LayerNorm,
+    "batch": _BatchNorm,
+    "instance": _InstanceNorm,
+}

@@ -1,6 +1,7 @@
 """Touches on a curved body, drawn in three dimensions (report, figure 9)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -35,18 +36,16 @@ class _Shell:
 
     Attributes:
         body: whose.
-        lines: (ny + 1, nx + 1) nodes, in the chart, m: x and y.
     """
 
     body: AbstractBody
-    lines: tuple[np.ndarray, np.ndarray]
 
-    @classmethod
-    def of(cls, body: AbstractBody) -> "_Shell":
-        """Return the surface of a body."""
-        x, y = (np.linspace(0, body.size[axis], body.cells[axis] + 1) for axis in (0, 1))
-        grid_x, grid_y = np.meshgrid(x, y)
-        return cls(body, (grid_x, grid_y))
+    @cached_property
+    def lines(self) -> tuple[np.ndarray, ...]:
+        """The (ny + 1, nx + 1) nodes in the chart, m: x and y."""
+        return np.meshgrid(
+            *(np.linspace(0, self.body.size[axis], self.body.cells[axis] + 1) for axis in (0, 1))
+        )
 
     def surface(self, depth: np.ndarray) -> np.ndarray:
         """Return where the surface is, (ny + 1, nx + 1, 3), mm, pushed in by a depth (ny + 1, nx + 1), m."""
@@ -66,7 +65,7 @@ def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
     known = scene.known(scene.pressure if scene.moved is None else scene.moved)
     axis, right = space_and_traces(figure)
-    now, shell, most = traces(right, scene), _Shell.of(body), max(float(known.max()), 1e-9)
+    now, shell, most = traces(right, scene), _Shell(body), max(float(known.max()), 1e-9)
     stretch = 1.0
     if scene.moved is None:
         scale, what = Normalize(0, most / 1e3), "pressure, kPa"
@@ -93,7 +92,7 @@ def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
 def sensors_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     """Show each sensor's reading as a bar that stands out of the surface over its place."""
     axis, right = space_and_traces(figure)
-    now, colour, shell = traces(right, scene), norm(scene), _Shell.of(body)
+    now, colour, shell = traces(right, scene), norm(scene), _Shell(body)
     bare = np.broadcast_to(_SKIN, (*body.shape, 4))
     surface = shell.surface(np.zeros_like(shell.lines[0]))
     figure.colorbar(ScalarMappable(colour, FORCE), ax=axis, label="reading, N", shrink=0.6, pad=0.02)

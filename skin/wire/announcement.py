@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from skin.wire.checksum import crc16
+from skin.wire.text import crc16
 from skin.wire.transport import ByteStream
 
 _KNOWN = ("number", "seq", "frames")

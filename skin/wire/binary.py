@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from skin.signal.frame import FrameError
-from skin.wire.checksum import crc16
+from skin.wire.text import crc16
 
 Kind = Literal["u16", "i16", "f32"]
 

@@ -4,13 +4,28 @@ A line that starts with # is a comment. The header is one, best with a checksum 
 ``# skin proto=1 n=25 rate=100 unit=adc bits=10 id=arm-L``.
 """
 
+import binascii
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from math import isfinite
+from operator import xor
 from typing import NamedTuple
 
 from skin.signal.frame import Check, FrameError
-from skin.wire.checksum import crc16, xor8
+
+
+def crc16(data: bytes) -> int:
+    """Return CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF; ``123456789`` gives 0x29B1."""
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def xor8(data: bytes) -> int:
+    """Return all bytes combined by exclusive or, as NMEA 0183 does.
+
+    Weak: 2.0 % of double bit flips, 5.8 % of double lost bytes and 4.8 % of glued lines pass.
+    """
+    return reduce(xor, data, 0)
 
 
 class Line(NamedTuple):

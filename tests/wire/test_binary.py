@@ -7,7 +7,7 @@ import pytest
 
 from skin.signal.frame import FrameError
 from skin.wire.binary import decode_frame, encode_frame, stuff, unstuff
-from skin.wire.checksum import crc16
+from skin.wire.text import crc16
 
 RAMP = bytes(range(256))
 

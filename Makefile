@@ -68,7 +68,7 @@ ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 
-reproduce-table: $(READY)  ## train every model and print the table (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
+reproduce-table: $(READY)  ## train the models of the results table and print it (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
 	$(BIN)/skin table table.budget=$(BUDGET) table.seeds=$(SEEDS) \
 		$(if $(SIMULATORS),'table.simulators=[$(SIMULATORS)]')
 

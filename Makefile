@@ -1,4 +1,4 @@
-# `make` alone lists the targets. Everything runs in .venv, built once from pinned constraints.
+# Run `make` to list the targets. All targets use .venv, built from pinned constraints.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,14 +7,14 @@ BUDGET ?= full
 SEEDS ?= 1
 PEERS := .venv-peers
 TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs
-# Each rounds sums of floating-point numbers in its own way; the first is the suite's default.
+# Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
 NUMERICAL := $(addprefix tests/,body contact evaluation fusion hardware/calibration hardware/record layout learner model \
 	representation signal simulator studies/embedding test_classifier.py test_labels.py test_material.py touch \
 	validation wire/test_segmentation.py wire/test_tare.py)
 
-# Hundreds of tests start a command of this project: without bytecode each would compile it anew.
+# Hundreds of tests start a command of this project; without bytecode each of them would compile the modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
@@ -29,28 +29,28 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings]"
 	touch $@
 
-install: $(READY)  ## build .venv; the other targets call it
+install: $(READY)  ## create .venv; run by the other targets if needed
 
-test: $(READY)  ## the test suite; says which tests were skipped and why
+test: $(READY)  ## run the test suite; list skipped tests with the reason
 	$(TEST)
 
-roundings: $(READY)  ## the numerical tests (TESTS=tests: all) under settings that round differently
+roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several rounding settings
 	@failed=; for setting in $(ROUNDINGS); do \
 		echo "== $$setting"; env $$setting $(TEST) $(or $(TESTS),$(NUMERICAL)) || failed="$$failed $$setting"; \
 	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
 
-slow: $(PEERS)/.ready  ## the test suite under all of these settings, with the real peers
+slow: $(PEERS)/.ready  ## run the test suite under these settings, including the baseline libraries
 	$(MAKE) roundings TESTS=tests
 
-check: $(READY)  ## lint, format and types
+check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY)  ## speed and memory, into results/bench.json
+bench: $(READY)  ## measure speed and memory; write results/bench.json
 	$(BIN)/skin bench
 
-physics: $(READY)  ## check every law of mechanics against an independent solution
+physics: $(READY)  ## check the laws of mechanics against independent solutions
 	$(BIN)/skin validate
 
 $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt
@@ -60,7 +60,7 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 		--requirement experiments/peers/requirements.txt
 	touch $@
 
-peers: $(READY) $(PEERS)/.ready  ## LightGBM and aeon's ROCKETs on the same touches (SEEDS=3)
+peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs on the same touches (SEEDS=3)
 	$(BIN)/skin peers -m row=lightgbm,minirocket,multirocket_hydra 'seed=range($(SEEDS))'
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
@@ -68,9 +68,9 @@ ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 
-reproduce-table: $(READY)  ## train every row and print the table (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
+reproduce-table: $(READY)  ## train the models of the results table and print it (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
 	$(BIN)/skin table table.budget=$(BUDGET) table.seeds=$(SEEDS) \
 		$(if $(SIMULATORS),'table.simulators=[$(SIMULATORS)]')
 
-clean:  ## remove what the targets made, but keep results and runs
+clean:  ## remove environments and caches; keep results and runs
 	rm -rf $(VENV) $(PEERS) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

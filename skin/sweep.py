@@ -56,6 +56,12 @@ def _chosen(overrides: Iterable[str]) -> dict[str, str]:
     return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
 
 
+def _job(config: DictConfig) -> dict[str, str]:
+    """Return what a running job chooses, interpolations as they were written."""
+    words: Any = OmegaConf.to_container(config.hydra.overrides.task)
+    return _chosen(words)
+
+
 class Sweep(Callback):
     """Hydra's callback of every command: opens and closes the parent run, prints progress.
 
@@ -63,9 +69,13 @@ class Sweep(Callback):
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
     closed at exit. A parent that has no children by then, because each job was finished before or refused, is
     deleted.
+
+    Args:
+        parent: whether the jobs are runs; a command whose jobs run sweeps of their own has no parent run.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, parent: bool = True) -> None:
+        self._wanted = parent
         self._store: Store | None = None
         self._parent: Run | None = None
         self._resume = True
@@ -77,7 +87,7 @@ class Sweep(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the parent run and tell the jobs about it."""
-        if "tracking" not in config:
+        if not self._wanted or "tracking" not in config:
             return
         try:
             self._open(config)
@@ -132,7 +142,7 @@ class Sweep(Callback):
             print(f"{self._label(config)} was finished before", flush=True)
         else:
             print(f"{self._label(config)} took {clock(took)}", flush=True)
-        self._progress.finish(self._jobs.index(_chosen(config.hydra.overrides.task)), took, skipped)
+        self._progress.finish(self._jobs.index(_job(config)), took, skipped)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
@@ -169,7 +179,7 @@ class Sweep(Callback):
             log(store, parent, keys, done)
 
     def _label(self, config: DictConfig) -> str:
-        job = _chosen(config.hydra.overrides.task)
+        job = _job(config)
         chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
         return f"[{config.hydra.job.num + 1}/{len(self._jobs)}] {chosen}"
 

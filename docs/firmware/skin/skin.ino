@@ -1,18 +1,18 @@
-// A skin of analogue sensors: one line per frame, seq,t_us,v0,...,vN-1*HHHH (docs/hardware.md).
-// Tested on a computer with a stand-in for Arduino.h (tests/port/test_firmware.py), not on a board.
+// Send the values of analogue sensors: one line per frame, seq,t_us,v0,...,vN-1*HHHH (docs/hardware.md).
+// Tested on a computer with a stand-in for Arduino.h (tests/wire/test_firmware.py), not on a board.
 #include <Arduino.h>
 
 const uint8_t PINS[] = {A0, A1, A2, A3, A4, A5};  // in the order of the layout's rows
 const uint8_t N = sizeof(PINS);
 const uint32_t BAUD = 115200;         // 16 channels reach about 149 Hz at it, 64 channels 43 Hz
 const uint32_t PERIOD_US = 10000;     // 100 Hz
-const uint16_t BITS = 10;             // of the converter
-const uint16_t HEADER_EVERY = 500;    // frames, for those who listen later
+const uint16_t BITS = 10;             // resolution of the converter
+const uint16_t HEADER_EVERY = 500;    // frames between two headers
 
 char line[32 + 6 * N];
 uint32_t seq = 0, due_us = 0;
 
-// Behind a multiplexer: choose its channel here, wait until it has settled, then read.
+// With a multiplexer: select its channel here, wait until it has settled, then read.
 uint16_t readSensor(uint8_t sensor) { return analogRead(PINS[sensor]); }
 
 // CRC-16/CCITT-FALSE: "123456789" gives 0x29B1.

@@ -56,10 +56,10 @@ def _chosen(overrides: Iterable[str]) -> dict[str, str]:
     return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
 
 
-def _job(config: DictConfig) -> dict[str, str]:
-    """Return what a running job chooses, interpolations as they were written."""
+def _words(config: DictConfig) -> list[str]:
+    """Return the overrides of a command line or a job, with interpolations as they were written."""
     words: Any = OmegaConf.to_container(config.hydra.overrides.task)
-    return _chosen(words)
+    return words
 
 
 class Sweep(Callback):
@@ -103,7 +103,7 @@ class Sweep(Callback):
         """Make the folder that Hydra writes to, and the parent run."""
         settings = checked(_without_hydra(config)).tracking
         # Swept or not, Hydra lists only what belongs to jobs here.
-        self._jobs = jobs(list(config.hydra.overrides.task), config.hydra.sweeper.params or {})
+        self._jobs = jobs(_words(config), config.hydra.sweeper.params or {})
         self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
@@ -142,7 +142,7 @@ class Sweep(Callback):
             print(f"{self._label(config)} was finished before", flush=True)
         else:
             print(f"{self._label(config)} took {clock(took)}", flush=True)
-        self._progress.finish(self._jobs.index(_job(config)), took, skipped)
+        self._progress.finish(self._jobs.index(_chosen(_words(config))), took, skipped)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
@@ -179,7 +179,7 @@ class Sweep(Callback):
             log(store, parent, keys, done)
 
     def _label(self, config: DictConfig) -> str:
-        job = _job(config)
+        job = _chosen(_words(config))
         chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
         return f"[{config.hydra.job.num + 1}/{len(self._jobs)}] {chosen}"
 

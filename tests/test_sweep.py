@@ -222,3 +222,14 @@ def test_what_no_job_could_accept_is_refused_once():
     assert done.returncode == 2
     assert "typo" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_job_may_take_a_value_from_another_setting(run, tmp_path):
+    words = [*SMALL, "device.noise=0.05,0.1", "device.offset=${device.noise}"]
+    done = run(tmp_path, "train", "-m", *words, f"hydra.sweep.dir={tmp_path}/out")
+    assert done.returncode == 0, done.stderr
+    with sqlite3.connect(tmp_path / "m.db") as database:
+        found = database.execute("select name, status from runs where name like 'device.noise%'").fetchall()
+    database.close()
+    assert found == [("device.noise=0.05,0.1", "FINISHED")]

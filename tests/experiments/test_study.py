@@ -273,3 +273,13 @@ def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
     found = lines(tmp_path / "results" / "study_noise.csv")
     assert [line["variant"] for line in found] == ["noise=0.05", "noise=0.5"]
     assert "| noise=0.5 |  | " in (tmp_path / "results" / "study_noise.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_multirun_of_studies_is_no_run_itself(run, trained):
+    few = ["study=pair", "study.seeds=[0]", "study.rows=[rules]", "out=one,two"]
+    before = runs(trained)
+    done = run(trained, "study", "-m", *few, *NAIVE)
+    assert done.returncode == 0, done.stderr
+    assert [(trained / name / "study_pair.md").is_file() for name in ("one", "two")] == [True, True]
+    assert runs(trained) == before

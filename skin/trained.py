@@ -3,19 +3,17 @@
 from dataclasses import dataclass
 
 from mlflow.entities import Run
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from skin.build import build_data, build_device, build_learner
 from skin.config import Tracking, checked
 from skin.device.base import AbstractDevice
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.report import Answers
+from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.reload import configuration, find, operating_point, restore
 from skin.tracking import Store
-
-_FEW = 10  # gestures, where only their shape matters
 
 
 @dataclass(frozen=True)
@@ -23,7 +21,7 @@ class Trained:
     """A trained run.
 
     Attributes:
-        device: that it was trained on, with few gestures.
+        device: that it was trained on, or what its configuration was changed to.
         learner: trained.
         window: T, frames.
         positions: (S, 3), m.
@@ -32,7 +30,7 @@ class Trained:
     """
 
     device: AbstractDevice
-    learner: Answers
+    learner: AbstractLearner
     window: int
     positions: Tensor
     rate: float
@@ -81,13 +79,8 @@ def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> T
     Raises:
         InputError: what it learned does not fit the configuration.
     """
-    own = OmegaConf.create(OmegaConf.to_container(config))
-    assert isinstance(own, DictConfig)
-    if "gestures" in own.device:
-        own.device.gestures = _FEW
-        own.device.fresh = False
-    device, learner = build_device(own), build_learner(own)
-    data = build_data(own, device)
+    device, learner = build_device(config), build_learner(config)
+    data = build_data(config, device.blank())
     restore(store, run, learner, data)
     known = data.touches("train")
     point = operating_point(run, learner, stored, config.evaluation)

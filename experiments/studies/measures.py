@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learner.base import AbstractLearner
     from skin.tracking import Store
+    from skin.trained import Trained
 
 
 @dataclass(frozen=True)
@@ -32,13 +33,13 @@ class Finished:
         store: where it is.
         run: as MLflow has it.
         stored: its configuration.
-        learner: what it learned.
+        trained: what it learned, and the device that it was trained on.
     """
 
     store: "Store"
     run: "Run"
     stored: "DictConfig"
-    learner: "AbstractLearner"
+    trained: "Trained"
 
 
 @dataclass(frozen=True)
@@ -71,14 +72,16 @@ class Subject:
         """The name of the run, for pages and figures."""
         return f"{self.of.run.info.run_name}, run {self.of.run.info.run_id[:8]}"
 
+    @property
+    def learner(self) -> "AbstractLearner":
+        """What the run learned."""
+        return self.of.trained.learner
+
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm."""
         from skin.evaluation.operating_point import OperatingPoint
-        from skin.reload import operating_point
 
-        settings = self.config.evaluation
-        found = operating_point(self.of.run, self.of.learner, self.of.stored, settings)
-        return found or OperatingPoint.default(settings.false_alarm_rate)
+        return self.of.trained.point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ class Accuracy:
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
-        chances = subject.of.learner.probabilities(touches)
+        chances = subject.learner.probabilities(touches)
         found = metrics(chances, touches.labels, subject.device.task)
         return Measured({f"same/{name}": value for name, value in found.items()})
 
@@ -144,7 +147,7 @@ class Margins:
         from experiments.studies.margins import page
         from skin.evaluation.margins import margins
 
-        found = margins(subject.of.learner, subject.device, self.gestures, subject.point())
+        found = margins(subject.learner, subject.device, self.gestures, subject.point())
         return Measured({}, page(found, subject.title))
 
 
@@ -160,7 +163,7 @@ class Streams(Course):
 
         console = Console(stderr=True)
         shown = partial(track, description=subject.title, console=console, transient=True)
-        found = slide(subject.of.learner, subject.device, self, subject.point(), shown)
+        found = slide(subject.learner, subject.device, self, subject.point(), shown)
         return Measured(found.metrics(), page(found, subject.title))
 
 
@@ -231,7 +234,7 @@ class Embeddings(Probing):
         from experiments.studies.embedding_spaces import page
         from skin.balance import announce
 
-        device, learner = subject.device, subject.finished.learner if subject.finished else None
+        device, learner = subject.device, subject.learner if subject.finished else None
         announce(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)

@@ -17,11 +17,11 @@ from experiments.studies.measures import Accuracy, Finished, Measure, Subject
 from experiments.studies.runs import Planned
 from experiments.studies.study import Study, Variant, given, words
 from experiments.studies.tables import publish
-from skin.build import build_data, build_device, build_learner
+from skin.build import build_device
 from skin.config import checked, fingerprint
-from skin.learner.base import AbstractLearner
-from skin.reload import TAG, changed, configuration, restore
+from skin.reload import TAG, changed, configuration
 from skin.tracking import Store
+from skin.trained import Trained, trained
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,8 @@ class _Run:
         return configuration(self.store, self.run, self.config.trust)
 
     @cached_property
-    def learner(self) -> AbstractLearner:
-        own = checked(self.stored)
-        learner = build_learner(own)
-        restore(self.store, self.run, learner, build_data(own, build_device(own)))
-        return learner
+    def trained(self) -> Trained:
+        return trained(self.store, self.run, checked(self.stored), self.stored)
 
     def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
         """Return the run of MLflow that holds what a study measures on the device that overrides change."""
@@ -110,7 +107,7 @@ class _Run:
 
     def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str]) -> Run:
         """Measure, and log it beside the run."""
-        subject = Subject(own, build_device(own), Finished(self.store, self.run, self.stored, self.learner))
+        subject = Subject(own, build_device(own), Finished(self.store, self.run, self.stored, self.trained))
         with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
             found = what(subject)
             self.store.log_metrics(logged, found.metrics)

@@ -16,24 +16,23 @@ from skin.files import results
 @command("evaluate")
 def main(config: DictConfig) -> None:
     """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
-    from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
     from skin.evaluation.report import evaluate
     from skin.evaluation.show import report
     from skin.option import option
     from skin.plot.evaluation_page import publish, verdicts
-    from skin.reload import changed, configuration, find, operating_point, restore
+    from skin.reload import changed, configuration, find
     from skin.run import conclude
     from skin.tracking import Store
+    from skin.trained import trained
 
     quiet()
     store, folder = Store.open(config.tracking), results(config.out)
     run = find(store, config.run)
     stored, given = configuration(store, run, config.trust), overrides()
     config = changed(stored, config, given)
-    device, learner = build_device(config), build_learner(config)
-    restore(store, run, learner, build_data(config, device.blank()))
-    point = operating_point(run, learner, stored, config.evaluation)
+    of = trained(store, run, config, stored)
+    device, learner, point = of.device, of.learner, of.point
     touches = device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}

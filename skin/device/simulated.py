@@ -35,6 +35,7 @@ from skin.wire.open import open_skin
 from skin.wire.source import Source
 
 _BATCH = 1024
+_FEW = 10  # gestures
 _VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__}
 
 
@@ -132,6 +133,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
         return (self.constants.offset - self.constants.baseline).masked_fill(self.constants.dead, 0.0)
+
+    def blank(self) -> "Simulated":
+        """Return a device with few gestures: to restore a run, only their shape matters."""
+        return self.replace(gestures=_FEW, fresh=False)
 
     def replace(self, **changes: Any) -> "Simulated":
         """Return a device with other settings, such as ``seed=3`` for another device of the same kind."""

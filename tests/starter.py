@@ -28,7 +28,7 @@ WARM = (
     "mlflow.store.tracking.sqlalchemy_store",
     "pytorch_lightning.callbacks",
     "skfem",
-    "skin.learner.features",
+    "skin.learner.boosted_trees",
     "skin.learner.network",
     "skin.evaluation.show",
     "skin.run",

@@ -45,9 +45,9 @@ def readings(folder: Path, name: str) -> np.ndarray:
     return np.stack([column.reshape(about["gestures"], about["frames"]) for column in columns], axis=1)
 
 
-def measurements(folder: Path, name: str) -> np.ndarray:
-    """Return the engineered measurements of a set, (B, D), float32."""
-    table = pq.read_table(folder / "measurements" / f"{name}.parquet")
+def features(folder: Path, name: str) -> np.ndarray:
+    """Return the engineered features of a set, (B, D), float32."""
+    table = pq.read_table(folder / "features" / f"{name}.parquet")
     return np.stack([column.to_numpy() for column in table.columns], axis=1)
 
 
@@ -59,10 +59,10 @@ def labels(folder: Path, name: str) -> dict[str, np.ndarray]:
 
 
 def lightgbm(folder: Path, seed: int, jobs: int) -> tuple[Answer, float, int]:
-    """Boost trees on the measurements, one ensemble per label; validation says when to stop."""
+    """Train gradient-boosted trees on the features, one ensemble per label, with early stopping."""
     from lightgbm import LGBMClassifier, early_stopping
 
-    x, v = (measurements(folder, name) for name in LEARNT)
+    x, v = (features(folder, name) for name in LEARNT)
     truth, held = (labels(folder, name) for name in LEARNT)
     began, models = time.perf_counter(), []
     for label in truth:
@@ -77,7 +77,7 @@ def lightgbm(folder: Path, seed: int, jobs: int) -> tuple[Answer, float, int]:
     trees = [tree for model in models for tree in model.booster_.dump_model()["tree_info"]]
 
     def answer(name: str) -> np.ndarray:
-        table = measurements(folder, name)
+        table = features(folder, name)
         return np.stack([model.predict_proba(table)[:, 1] for model in models], axis=1)
 
     return answer, seconds, sum(tree["num_leaves"] for tree in trees)

@@ -41,7 +41,7 @@ def test_plates_do_not_bend_and_a_sentence_says_what_does(run, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("representation", ["image", "interp", "graph", "measured"])
+@pytest.mark.parametrize("representation", ["image", "interp", "graph", "features"])
 def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configured, representation):
     """Touches, labels and pictures live in the chart, so nothing but mechanics can tell the two apart."""
     shown = []

@@ -53,7 +53,7 @@ def answer(folder, known, device):
 
 def test_every_set_of_learning_and_evaluating_is_written(folder):
     assert tuple(json.loads((folder / "sets.json").read_text())) == NAMES
-    for kind in ("touches", "measurements"):
+    for kind in ("touches", "features"):
         assert {path.stem for path in (folder / kind).iterdir()} == set(NAMES)
 
 
@@ -67,11 +67,11 @@ def test_touches_read_back_as_the_device_felt_them(device, folder):
     assert (moved - device.touches("test").positions).norm(dim=1).max() > 1e-3
 
 
-def test_measurements_have_one_row_per_touch(folder):
-    table = pq.read_table(folder / "measurements" / "holdout_0.parquet")
+def test_features_have_one_row_per_touch(folder):
+    table = pq.read_table(folder / "features" / "holdout_0.parquet")
     assert table.num_rows == 6
     assert table.num_columns > 100
-    # a measurement that anyone can repeat: the largest reading of each touch
+    # a feature that is easy to compute again: the largest reading of each touch
     readings = read(folder / "touches" / "holdout_0.parquet").touches.readings
     assert table["raw sensor maximum 1"].to_pylist() == readings.amax(dim=(1, 2)).tolist()
 

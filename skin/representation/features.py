@@ -1,4 +1,4 @@
-"""Readings above their idle level, and what one would measure on the window."""
+"""Readings above their idle level, with engineered features of the window."""
 
 from typing import ClassVar, Literal
 
@@ -7,24 +7,24 @@ from torch import Tensor
 
 from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation, Frames, channels
-from skin.signal.features import measurements
+from skin.signal.features import engineered_features
 
 _IDLE = 8
 
 
-class Measured(AbstractRepresentation):
-    """Shows every sensor's excess over its idle level twice, and adds engineered measurements as a summary.
+class Features(AbstractRepresentation):
+    """Gives readings above their idle level on two scales, and engineered features as a summary.
 
-    What a boosted tree is told, a network is told too, beside the readings. The idle level of a sensor, the
-    mean of its eight lowest frames, is subtracted: a constant offset, which is another one in every device,
-    then cannot be learnt by heart. The second view is logarithmic, so that faint touches are seen.
+    A network then sees the readings and the features that boosted trees are trained on. The idle level of a
+    sensor is the mean of its eight lowest frames. It is subtracted, so that a network cannot learn the
+    constant offsets of one device. The second scale is logarithmic, which resolves weak touches.
 
     Args:
-        positions: (S, 3), m; the measurements need them.
+        positions: (S, 3), m; the features depend on them.
         size: extent (x, y) of the sheet, m; not used.
-        scale: N; the linear view is divided by it.
-        finest: N; the logarithmic view asinh(x / finest) is linear below it.
-        mask: append one feature per sensor that tells whether its reading is valid.
+        scale: N; readings on the linear scale are divided by it.
+        finest: N; the logarithmic scale asinh(x / finest) is linear below it.
+        mask: append one feature per sensor that is 1 where its reading is not valid.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "readings"
@@ -54,5 +54,5 @@ class Measured(AbstractRepresentation):
         excess = (raw - idle) * valid
         views = [excess / self.scale, torch.asinh(excess / self.finest) / 2, *values.unbind(-1)[1:]]
         touches = Touches(readings, valid, self.positions, None, 1.0)
-        summary = torch.stack([value.to(raw) for value in measurements(touches).values()], dim=1)
+        summary = torch.stack([value.to(raw) for value in engineered_features(touches).values()], dim=1)
         return Frames(torch.cat(views, dim=-1), None, summary.asinh())

@@ -1,10 +1,10 @@
-"""Readings above their idle level, beside engineered measurements."""
+"""Readings above their idle level, beside engineered features."""
 
 import pytest
 import torch
 
-from skin.representation.measured import Measured
-from skin.signal.features import measurements
+from skin.representation.features import Features
+from skin.signal.features import engineered_features
 
 TIME, SENSORS = 30, 5
 
@@ -15,7 +15,7 @@ def made():
     readings = 0.05 * torch.randn(6, TIME, SENSORS, generator=generator)
     readings[:, 10:18] += torch.rand(6, 1, SENSORS, generator=generator)
     positions = torch.rand(SENSORS, 3, generator=generator)
-    return Measured(positions, (1.0, 1.0)), readings, torch.ones_like(readings, dtype=torch.bool)
+    return Features(positions, (1.0, 1.0)), readings, torch.ones_like(readings, dtype=torch.bool)
 
 
 def test_a_constant_offset_is_not_seen(made):
@@ -35,8 +35,8 @@ def test_both_views_of_one_newton_above_idle(made):
     assert x.count_nonzero() == 2
 
 
-def test_the_summary_holds_every_measurement(made, made_up_device):
+def test_the_summary_holds_every_feature(made, made_up_device):
     represent, readings, valid = made
     summary = represent(readings, valid).summary
-    assert summary.shape == (6, len(measurements(made_up_device.touches("test"))))
+    assert summary.shape == (6, len(engineered_features(made_up_device.touches("test"))))
     assert torch.isfinite(summary).all()

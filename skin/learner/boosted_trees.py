@@ -1,4 +1,4 @@
-"""Learning by boosted trees on engineered measurements."""
+"""Gradient-boosted trees on engineered features."""
 
 import time
 from pathlib import Path
@@ -16,8 +16,8 @@ from skin.foreign import arrays
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
-from skin.signal.features import measurements
-from skin.signal.sliding_direction import bearings
+from skin.signal.features import engineered_features
+from skin.signal.sliding_direction import direction_features
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from skin.datamodule import TouchData
 
 
-class Features(AbstractLearner):
-    """Measures about 130 numbers on a touch and boosts decision trees on them, one ensemble per label.
+class BoostedTrees(AbstractLearner):
+    """Gradient-boosted decision trees on about 130 engineered features, one ensemble per label.
 
-    What a practitioner would try first; a network that does not beat it is not worth its cost. The
-    measurements know no sensor by number, so it takes any layout. Where the task has a direction, signed
-    measurements (:mod:`skin.signal.sliding_direction`) join them, and trees of least squares learn its
-    cosines.
+    This is the baseline that a network should beat. The features (:mod:`skin.signal.features`) do not depend
+    on the number or order of sensors, so any layout is accepted. Where the task has a direction, signed
+    features (:mod:`skin.signal.sliding_direction`) are added, and regression trees with a squared-error loss
+    predict its cosines.
 
     Args:
-        rounds: most trees per label; fewer if the validation loss stops falling.
-        learning_rate: share of each tree that is added.
-        patience: trees without a lower validation loss before stopping.
-        seed: of the trees' ties.
+        rounds: maximum number of trees per label; early stopping may use fewer.
+        learning_rate: shrinkage of each tree.
+        patience: number of trees without a lower validation loss before training stops.
+        seed: breaks ties between splits.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Features(AbstractLearner):
         self._task: Task | None = None
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
-        """Grow the trees on the training split, as many as the validation split likes."""
+        """Grow the trees on the training split; the validation loss decides how many."""
         table: dict[str, np.ndarray] = {}
         for split in ("train", "validation"):
             touches = data.touches(split)
@@ -68,18 +68,18 @@ class Features(AbstractLearner):
         self._grow(table, data.task)
 
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L), for touches of any layout; of a direction cosines."""
+        """Return the probability of each label, (B, L), for touches of any layout; cosines of a direction."""
         if self._task is None:
             raise RuntimeError("fit or load the learner first")
         matrix = _matrix(touches, self._task)
-        columns = [_told(model, matrix) for model in self._models]
+        columns = [_predict(model, matrix) for model in self._models]
         result = torch.from_numpy(np.stack(columns, axis=1)).to(torch.float32)
         return result / result.sum(dim=1, keepdim=True) if self._task.kind == "exclusive" else result
 
     def save(self, folder: Path) -> Path:
-        """Write the table that the trees grew from to ``features.npz`` in ``folder`` and return its path.
+        """Write the features and labels of the training data to ``features.npz`` and return its path.
 
-        Trees have no format that is safe to load; grown again from the same table they are the same.
+        No format for trees is safe to load. :meth:`load` grows the same trees again from the same data.
         """
         if self._fitted is None:
             raise RuntimeError("fit or load the learner first")
@@ -88,14 +88,14 @@ class Features(AbstractLearner):
         return path
 
     def load(self, data: "TouchData", path: Path) -> None:
-        """Grow the trees again from what ``save`` wrote; takes some seconds."""
+        """Grow the trees again from the file that :meth:`save` wrote; takes some seconds."""
         table = arrays(path)
         columns = _matrix(data.touches("train")[:1], data.task).shape[1]
         for split in ("train", "validation"):
             values, labels = table[split], table[f"{split}_labels"]
             if labels.ndim != 2 or labels.shape[1] != len(data.task):
                 known = labels.shape[-1] if labels.ndim else 0
-                raise ValueError(f"it has learnt {known} labels, not {', '.join(data.task.names)}")
+                raise ValueError(f"it was trained on {known} labels, not {', '.join(data.task.names)}")
             if values.shape != (len(labels), columns) or not {values.dtype.kind, labels.dtype.kind} <= set(
                 "f"
             ):
@@ -107,7 +107,7 @@ class Features(AbstractLearner):
     def _grow(self, table: dict[str, np.ndarray], task: Task) -> None:
         began = time.perf_counter()
         self._models = []
-        # A label is learnt from the touches in which it means something.
+        # Each label is trained on the touches for which it is defined.
         known, other = (
             task.counts(torch.from_numpy(table[f"{split}_labels"])).numpy()
             for split in ("train", "validation")
@@ -127,22 +127,22 @@ class Features(AbstractLearner):
                 self._models.append(model.fit(table["train"][rows], truth, **validation))
         self._fitted, self._task = table, task
         self.seconds_per_epoch = time.perf_counter() - began
-        # one number per leaf; scikit-learn counts leaves nowhere in public
+        # One number per leaf; scikit-learn has no public count of leaves.
         trees = [tree for model in self._models for trees in model._predictors for tree in trees]
         self.parameters = sum(tree.get_n_leaf_nodes() for tree in trees)
 
 
-def _told(
+def _predict(
     model: HistGradientBoostingClassifier | HistGradientBoostingRegressor, matrix: np.ndarray
 ) -> np.ndarray:
-    """Return the probability (B,) that trees give, or the cosine."""
+    """Return the predicted probability (B,), or the predicted cosine."""
     if isinstance(model, HistGradientBoostingRegressor):
         return model.predict(matrix).clip(-1, 1)
     return model.predict_proba(matrix)[:, 1]
 
 
 def _matrix(touches: Touches, task: Task) -> np.ndarray:
-    """Return the measurements as (B, D), float32."""
+    """Return the features as (B, D), float32."""
     here = touches.to("cpu")
-    columns = measurements(here) | (bearings(here) if task.direction else {})
+    columns = engineered_features(here) | (direction_features(here) if task.direction else {})
     return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()

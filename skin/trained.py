@@ -10,7 +10,7 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import Tracking, checked
 from skin.device.base import AbstractDevice
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.report import Answers
+from skin.evaluation.report import Predictor
 from skin.recording import Touches
 from skin.reload import configuration, find, operating_point, restore
 from skin.tracking import Store
@@ -32,7 +32,7 @@ class Trained:
     """
 
     device: AbstractDevice
-    learner: Answers
+    learner: Predictor
     window: int
     positions: Tensor
     rate: float

@@ -30,7 +30,7 @@ WARM = (
     "skfem",
     "skin.learner.boosted_trees",
     "skin.learner.network",
-    "skin.evaluation.show",
+    "skin.evaluation.metrics_table",
     "skin.run",
 )
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from skin.config import Evaluation
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.evaluation.operating_point import gestures
+from skin.evaluation.operating_point import threshold_gestures
 from skin.evaluation.report import columns
 from skin.files import whole
 from skin.files import write as write_text
@@ -26,7 +26,7 @@ SETS = "sets.json"
 ABOUT = "about.json"
 
 
-def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
+def export_touches(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
     """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
     ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``features/<set>.parquet`` hold the
@@ -47,7 +47,7 @@ def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> Non
             return
         shutil.rmtree(folder)
     learnt = {name: device.touches(name) for name in ("train", "validation")}
-    first = learnt | {"alarm": gestures(device, settings)}
+    first = learnt | {"alarm": threshold_gestures(device, settings)}
     known = {name: _export(touches, device, folder, name) for name, touches in first.items()}
     for column, sets in columns(device, settings).items():
         numbers = count()
@@ -60,13 +60,13 @@ def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> Non
     write_text(json.dumps(known, indent=1) + "\n", folder / SETS)
 
 
-class Foreign:
+class PeerPredictions:
     """Answers to touches with the probabilities that another environment wrote for them.
 
     It knows touches by their content alone, so an answer can never meet other touches than it was given for.
 
     Args:
-        folder: that :func:`export` filled.
+        folder: that :func:`export_touches` filled.
         peer: name of the folder in it with ``about.json`` (what the peer tells of itself) and, per set, a
             ``<set>.parquet`` with one column per label.
         task: what the labels mean.

@@ -62,7 +62,7 @@ def held(mesh: Hexahedra, faces: Mapping[str, tuple[int, ...]]) -> np.ndarray:
     return mask.ravel()
 
 
-def solve(
+def solve_block(
     mesh: Hexahedra, fixed: np.ndarray, forces: np.ndarray, stiffness: sp.csc_matrix | None = None
 ) -> np.ndarray:
     """Return how far nodes move (3 N, L), m, under nodal forces (3 N, L), N.

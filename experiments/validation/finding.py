@@ -46,7 +46,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Picture:
+class Plot:
     """Where a number tells too little.
 
     Attributes:
@@ -65,12 +65,12 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CheckResult:
     """What checking a law gave: findings, remarks for the page that are judged by nobody, and pictures."""
 
     findings: Sequence[Finding]
     remarks: Sequence[str] = ()
-    pictures: Sequence[Picture] = ()
+    pictures: Sequence[Plot] = ()
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,10 @@ class Law:
     name: str
     statement: str
     reference: str
-    check: Callable[[bool], Outcome] = field(repr=False)
+    check: Callable[[bool], CheckResult] = field(repr=False)
 
 
-def compared(case: str, ours: float, reference: float, tolerance: float) -> Finding:
+def relative_finding(case: str, ours: float, reference: float, tolerance: float) -> Finding:
     """Return the finding whose error is relative to the reference."""
     error = abs(ours - reference) / abs(reference) if reference else abs(ours)
     return Finding(case, ours, reference, error, tolerance)

@@ -37,7 +37,7 @@ class HalfSpace:
         """G, Pa."""
         return self.young / (2 * (1 + self.poisson))
 
-    def pressed(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def under_pressure(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return motion (P, 3), m, and stress (P, 3): zz, xz, yz, Pa, under pressure.
 
         Args:
@@ -51,7 +51,7 @@ class HalfSpace:
         stress = -3 * z[..., None] ** 2 / (2 * np.pi * r[..., None] ** 5) * np.stack([z, x, y], axis=-1)
         return _sum(motion, weights), _sum(stress, weights)
 
-    def dragged(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def under_shear(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the same under a traction of 1 Pa along x."""
         x, y, z, r, weights = self._about(places)
         rest = 1 - 2 * self.poisson

@@ -18,7 +18,7 @@ _END = 1.0003
 _STEPS = 24
 
 
-class Found(NamedTuple):
+class ForceSearch(NamedTuple):
     """Forces, one per gesture (B,).
 
     Attributes:
@@ -34,13 +34,13 @@ class Found(NamedTuple):
     pressure: torch.Tensor
 
 
-def seek(
+def find_force(
     solve: Callable[[np.ndarray, np.ndarray, torch.Tensor], tuple[Equilibrium, np.ndarray]],
     begin: torch.Tensor,
     peak: np.ndarray,
     wanted: np.ndarray,
     problem: ContactProblem,
-) -> Found:
+) -> ForceSearch:
     """Find loads at which single frames are big or small, dangerous or safe, as wanted.
 
     The load is first sought at which the highest cell has the drawn pressure (by secants of the logarithms).
@@ -61,12 +61,12 @@ def seek(
         here = torch.from_numpy(rows)
         equilibrium, lost = solve(rows, search.load[rows], search.pressure[here])
         search.pressure[here] = equilibrium.pressure.to(search.pressure)
-        highest, classes = _classes(equilibrium.pressure, problem)
-        rows = search.move(rows, search.judge(rows, highest, classes != wanted[rows], lost), highest)
+        peaks, classes = _classes(equilibrium.pressure, problem)
+        rows = search.move(rows, search.judge(rows, peaks, classes != wanted[rows], lost), peaks)
         if not len(rows):
             break
     search.result[search.failed] = np.nan
-    return Found(search.result, search.area, search.failed, search.pressure)
+    return ForceSearch(search.result, search.area, search.failed, search.pressure)
 
 
 @dataclass
@@ -83,7 +83,7 @@ class _Search:
         power: (B,), how the load grows with the peak: by the power of 3 under a ball, in proportion under a
             flat punch.
         last: (2, B), logarithms of the load tried last and of the peak that it made.
-        result, area, failed: as in :class:`Found`.
+        result, area, failed: as in :class:`ForceSearch`.
     """
 
     wanted: np.ndarray
@@ -102,7 +102,7 @@ class _Search:
     def of(
         cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, problem: ContactProblem
     ) -> "_Search":
-        """Begin at the drawn peaks (B,), Pa, within their ranges; the rest is as :func:`seek` has it."""
+        """Return a search that begins at the drawn peaks (B,), Pa, clipped to their ranges."""
         settings, cell = problem.settings, problem.shapes.body.cell
         ends = np.where(wanted[:, 1:], settings.dangerous_peak, settings.safe_peak)
         least, most = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
@@ -115,12 +115,12 @@ class _Search:
         result = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
         return cls(wanted, least, most, target, load, pressure, power, last, *result)
 
-    def judge(self, rows: np.ndarray, highest: np.ndarray, wrong: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    def judge(self, rows: np.ndarray, peak: np.ndarray, wrong: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Note which searches have ended, and where a met target with wrong classes moves.
 
         Args:
             rows: (b,), the gestures that were tried.
-            highest: (b,), Pa, their highest cell.
+            peak: (b,), Pa, their highest cell.
             wrong: (b, 2), bool, which of their classes are wrong.
             lost: (b,), bool, whose equilibrium was not found.
 
@@ -129,7 +129,7 @@ class _Search:
         """
         target, least, most = self.target[rows], self.least[rows], self.most[rows]
         up, down = ((wrong & side).any(1) for side in (self.wanted[rows], ~self.wanted[rows]))
-        away = np.abs(np.log(highest / target))
+        away = np.abs(np.log(peak / target))
         met = away < np.log(_NEAR)
         done = met & ~up & ~down
         self.result[rows[done]] = self.load[rows[done]]
@@ -142,13 +142,13 @@ class _Search:
             self.target[rows[side]] = _halfway(self.target[rows[side]], end[side])
         return ~done & ~over & ~lost
 
-    def move(self, rows: np.ndarray, goes_on: np.ndarray, highest: np.ndarray) -> np.ndarray:
+    def move(self, rows: np.ndarray, goes_on: np.ndarray, peak: np.ndarray) -> np.ndarray:
         """Set the next load of the searches that go on, (b,), and return their rows."""
-        tried = np.log(self.load[rows]), np.log(highest)
+        tried = np.log(self.load[rows]), np.log(peak)
         self.power[rows] = _power(self.power[rows], *tried, self.last[:, rows])
         self.last[:, rows] = tried
-        rows, highest = rows[goes_on], highest[goes_on]
-        step = self.power[rows] * (np.log(self.target[rows]) - np.log(highest))
+        rows, peak = rows[goes_on], peak[goes_on]
+        step = self.power[rows] * (np.log(self.target[rows]) - np.log(peak))
         self.load[rows] *= np.exp(np.clip(step, -1.5, 1.5))
         return rows
 

@@ -16,7 +16,7 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         pressure: (B, N), Pa, not negative.
-        residual: (B,), how far it is from fulfilling the conditions, as :func:`solve` measures it.
+        residual: (B,), how far it is from fulfilling the conditions, as :func:`solve_contact` measures it.
         iterations: (B,), how many were taken.
     """
 
@@ -25,7 +25,7 @@ class Equilibrium(NamedTuple):
     iterations: Tensor
 
 
-def solve(
+def solve_contact(
     compliance: Tensor,
     gap: Tensor,
     total: Tensor,

@@ -31,11 +31,9 @@ class Prescribed(AbstractContact):
         """Return pictures at the force at which the gesture's highest cell has the wanted pressure."""
         frames = problem.shapes.render(*trajectories.poses)
         # Equation 2: the drawn peak is the largest cell of the whole movie.
-        highest = (
-            (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
-        )
+        peak = (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
         width, height = problem.shapes.body.cell
-        force = trajectories.peak * (width * height) / highest
+        force = trajectories.peak * (width * height) / peak
         owner = torch.from_numpy(trajectories.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
         none = np.zeros(len(force), bool)

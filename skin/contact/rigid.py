@@ -9,9 +9,9 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from skin.body.base import AbstractBody
-from skin.contact._force import Found, seek
-from skin.contact._grain import with_grain
-from skin.contact._unilateral import Equilibrium, solve
+from skin.contact._checkerboard import stabilise_checkerboard
+from skin.contact._force import ForceSearch, find_force
+from skin.contact._unilateral import Equilibrium, solve_contact
 from skin.contact.base import AbstractContact
 from skin.settings import checked
 from skin.simulator.base import AbstractSimulator
@@ -63,7 +63,7 @@ class Rigid(AbstractContact):
     ) -> None:
         self.relief, self.fillet = relief, fillet
         self.tolerance, self.iterations = tolerance, iterations
-        self.compliance = with_grain(simulator.compliance().detach().cpu().double(), body).float()
+        self.compliance = stabilise_checkerboard(simulator.compliance().detach().cpu().double(), body).float()
 
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the pressure at the force that gives the wanted classes, if there is one."""
@@ -72,8 +72,8 @@ class Rigid(AbstractContact):
         gap = self.gap(trajectories, problem)
         full = np.zeros(len(trajectories.peak))
         np.maximum.at(full, trajectories.owner, trajectories.share)
-        telling = _telling(trajectories, full, gap, problem.footprints)
-        found, lost = self._sought(trajectories, gap, telling, problem)
+        reference = _reference_frames(trajectories, full, gap, problem.footprints)
+        found, lost = self._sought(trajectories, gap, reference, problem)
         force = found.load / full
         refused = np.isnan(force)
 
@@ -81,26 +81,26 @@ class Rigid(AbstractContact):
         rows, owner = torch.from_numpy(solved), torch.from_numpy(trajectories.owner[solved])
         totals = torch.from_numpy(force[trajectories.owner[solved]] * trajectories.share[solved] / cell)
         # A touch that stands still begins with what it was at its strongest.
-        stands = (trajectories.place[solved] == trajectories.place[telling][trajectories.owner[solved]]).all(
-            axis=1
-        )
+        stands = (
+            trajectories.place[solved] == trajectories.place[reference][trajectories.owner[solved]]
+        ).all(axis=1)
         start = found.pressure[owner] * torch.from_numpy(stands)[:, None]
-        states = solve(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
+        states = solve_contact(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
         missed = trajectories.owner[solved][(~(states.residual <= self.tolerance)).numpy()]
         lost += np.bincount(missed, minlength=len(force))
 
         frames = gap.isfinite().float()
         shares = torch.from_numpy(trajectories.share).float()[:, None]
         frames[rows] = states.pressure
-        highest = np.zeros(len(force))
-        np.maximum.at(highest, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
+        peak = np.zeros(len(force))
+        np.maximum.at(peak, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
         frames = (frames / shares).view(-1, *body.shape)
         # Other places of a path, or the mesh under a small object, may raise the peak beyond its range.
         settings = problem.settings
         dangerous = trajectories.wanted[:, 3]
-        refused |= highest > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
+        refused |= peak > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
         refused |= lost > 0
-        return ContactResult(frames, force, highest, refused, found.area, lost)
+        return ContactResult(frames, force, peak, refused, found.area, lost)
 
     def gap(self, trajectories: Trajectories, problem: ContactProblem) -> Tensor:
         """Return how far the object is above each cell when its highest point touches, (U, H * W), m.
@@ -118,20 +118,20 @@ class Rigid(AbstractContact):
         return lower - lower.amin(1, keepdim=True)
 
     def _sought(
-        self, trajectories: Trajectories, gap: Tensor, telling: np.ndarray, problem: ContactProblem
-    ) -> tuple[Found, np.ndarray]:
-        """Return the loads of each gesture's telling frame, and how many of these were not found."""
-        own = gap[torch.from_numpy(telling)]
+        self, trajectories: Trajectories, gap: Tensor, reference: np.ndarray, problem: ContactProblem
+    ) -> tuple[ForceSearch, np.ndarray]:
+        """Return the loads of each gesture's reference frame, and how many of these were not found."""
+        own = gap[torch.from_numpy(reference)]
         cell = problem.shapes.body.cell[0] * problem.shapes.body.cell[1]
 
         def solved(rows: np.ndarray, load: np.ndarray, start: Tensor) -> tuple[Equilibrium, np.ndarray]:
             total = torch.from_numpy(load / cell)
-            state = solve(
+            state = solve_contact(
                 self.compliance, own[torch.from_numpy(rows)], total, start, self.tolerance, self.iterations
             )
             return state, (~(state.residual <= self.tolerance)).numpy()
 
-        found = seek(
+        found = find_force(
             solved, own.isfinite().float(), trajectories.peak, trajectories.wanted[:, [0, 3]], problem
         )
         return found, found.failed.astype(np.int64)
@@ -153,7 +153,9 @@ def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
     return torch.from_numpy(below).float()
 
 
-def _telling(trajectories: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
+def _reference_frames(
+    trajectories: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor
+) -> np.ndarray:
     """Return the frame of each gesture that covers a sensor best, of those under its largest force, (B,)."""
     cover = (gap.isfinite().float() @ footprints.T).amax(1).double().numpy()
     strongest = trajectories.share >= full[trajectories.owner] * (1 - 1e-9)

@@ -11,7 +11,7 @@ from torch import Tensor
 from skin.device.base import AbstractDevice
 from skin.evaluation.alarm import Reached
 from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.report import Answers
+from skin.evaluation.report import Predictor
 from skin.labels import TOUCH, Measures, Thresholds
 from skin.signal.features import above_idle
 
@@ -70,7 +70,7 @@ class Faint:
 
 
 @dataclass(frozen=True)
-class Margins:
+class MarginReport:
     """What :func:`margins` found.
 
     Attributes:
@@ -86,7 +86,7 @@ class Margins:
     reached: Reached
 
 
-def margins(learner: Answers, device: AbstractDevice, gestures: int, point: OperatingPoint) -> Margins:
+def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: OperatingPoint) -> MarginReport:
     """Sort a learner's verdicts on whole test touches by what the labels are made of, and by strength.
 
     Args:
@@ -115,7 +115,7 @@ def margins(learner: Answers, device: AbstractDevice, gestures: int, point: Oper
     danger = TOUCH.names.index(LABEL)
     found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    return Margins(found, faint, point, point.reached(chances, labels, TOUCH))
+    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH))
 
 
 def spans(said: Tensor, shares: Tensor) -> list[Span]:

@@ -16,7 +16,7 @@ from skin.labels import Task
 from skin.recording import Touches
 
 if TYPE_CHECKING:
-    from skin.evaluation.report import Answers
+    from skin.evaluation.report import Predictor
 
 LABEL = "dangerous"
 ENOUGH = 2000
@@ -92,11 +92,11 @@ class OperatingPoint:
         return None
 
     def text(self) -> str:
-        """Return it as JSON, for :func:`read`."""
+        """Return it as JSON, for :func:`parse_operating_point`."""
         return json.dumps(asdict(self) | {"label": LABEL})
 
 
-def read(text: str) -> OperatingPoint | None:
+def parse_operating_point(text: str) -> OperatingPoint | None:
     """Return what :meth:`OperatingPoint.text` wrote; None for ``null``, a task without ``dangerous``.
 
     Raises:
@@ -127,7 +127,7 @@ def read(text: str) -> OperatingPoint | None:
     return point
 
 
-def check(settings: Evaluation) -> None:
+def check_evaluation(settings: Evaluation) -> None:
     """Raise InputError where no run can be evaluated, or no threshold chosen, as asked."""
     for name, least in (("devices", 0), ("layouts", 0), ("gestures", 1)):
         if getattr(settings, name) < least:
@@ -144,12 +144,12 @@ def check(settings: Evaluation) -> None:
         )
 
 
-def gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
+def threshold_gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     """Return the gestures on which the threshold is chosen.
 
     A simulated device draws fresh ones, until enough of them are safe; others give their validation split.
     """
-    check(settings)
+    check_evaluation(settings)
     simulation = device.simulation
     if simulation is None or LABEL not in device.task.names:
         return device.touches("validation")
@@ -165,28 +165,30 @@ def gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     return touches
 
 
-def choose(learner: "Answers", device: AbstractDevice, settings: Evaluation) -> OperatingPoint | None:
+def choose_operating_point(
+    learner: "Predictor", device: AbstractDevice, settings: Evaluation
+) -> OperatingPoint | None:
     """Return the operating point of a trained learner; None if its task has no label ``dangerous``.
 
     Args:
         learner: trained on ``device``.
-        device: gives the gestures, as :func:`gestures` says.
+        device: gives the gestures, as :func:`threshold_gestures` says.
         settings: the target rate and the number of safe gestures.
     """
     if LABEL not in device.task.names:
         return None
-    touches, target = gestures(device, settings), settings.false_alarm_rate
+    touches, target = threshold_gestures(device, settings), settings.false_alarm_rate
     assert touches.labels is not None  # it has learnt from them
     chances = learner.probabilities(touches)
     chance, dangerous = _column(chances, touches.labels, device.task)
     if dangerous.all():
         return OperatingPoint.default(target)
     seed = None if device.simulation is None else device.simulation.data_seed
-    point = OperatingPoint(lowest(chance[~dangerous], target), target, 0, 0, seed)
+    point = OperatingPoint(lowest_threshold(chance[~dangerous], target), target, 0, 0, seed)
     return replace(point, **asdict(point.reached(chances, touches.labels, device.task)))
 
 
-def lowest(safe: Tensor, target: float) -> float:
+def lowest_threshold(safe: Tensor, target: float) -> float:
     """Return the lowest threshold that keeps the false-alarm rate, a float32 number.
 
     Of n safe gestures k = floor(target (n + 1)) - 1 or fewer raise the alarm. A new safe one then raises it

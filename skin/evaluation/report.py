@@ -30,7 +30,7 @@ _SHOWN = (*SHARES, "/degrees")
 _UNDEFINED = "not defined, because the test has only gestures with this label or only gestures without it"
 
 
-class Answers(Protocol):
+class Predictor(Protocol):
     """What can be evaluated: a trained learner, or whatever else has an answer to touches."""
 
     def probabilities(self, touches: Touches) -> Tensor:
@@ -73,7 +73,7 @@ def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[
 
 
 def evaluate(
-    learner: Answers, device: AbstractDevice, settings: Evaluation, point: OperatingPoint | None
+    learner: Predictor, device: AbstractDevice, settings: Evaluation, point: OperatingPoint | None
 ) -> Report:
     """Try a trained learner on a device and, where it is simulated, on others like it.
 

@@ -155,41 +155,41 @@ def draw_paths(
         chance: (B, 5), 0 to 1.
 
     Returns:
-        start (B, 2) within the room (m), room (B, 2) (m), direction (rad), speed (m per frame), peak (Pa).
+        start (B, 2) within the span (m), span (B, 2) (m), direction (rad), speed (m per frame), peak (Pa).
     """
     dynamic, dangerous = labels[:, 1], labels[:, 3]
-    room = size - (gestures["high"] - gestures["low"])
+    span = size - (gestures["high"] - gestures["low"])
     slowest = np.maximum(settings.speed[0], settings.path / np.maximum(gestures["duration"] - 1, 1))
     speed = slowest + (settings.speed[1] - slowest) * chance[:, 3]
     least, most = np.where(dangerous[:, None], settings.dangerous_peak, settings.safe_peak).T
     return {
-        "start": chance[:, :2] * room,
-        "room": room,
+        "start": chance[:, :2] * span,
+        "span": span,
         "direction": np.where(dynamic, 2 * np.pi * chance[:, 2], 0.0),
         "speed": np.where(dynamic, speed, 0.0),
         "peak": least + (most - least) * chance[:, 4],
     }
 
 
-def fold(place: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Return places reflected at 0 and ``room``, as a ball between two walls (a triangle wave)."""
-    round_trip = np.mod(place, 2 * room)
-    return np.minimum(round_trip, 2 * room - round_trip)
+def fold(place: np.ndarray, span: np.ndarray) -> np.ndarray:
+    """Return places reflected at 0 and ``span``, as a ball between two walls (a triangle wave)."""
+    round_trip = np.mod(place, 2 * span)
+    return np.minimum(round_trip, 2 * span - round_trip)
 
 
-def heading(way: np.ndarray, first: np.ndarray) -> np.ndarray:
+def heading(place: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Return the unit vectors (U, 2) along which objects have come to their places; 0 where they stand still.
 
     A step that a wall reflects counts as what it is: from place to place. The first frame of a path, to which
     nothing has led, takes the direction of its first step.
 
     Args:
-        way: (U, 2), m, the places of all paths, one path after another.
+        place: (U, 2), m, the places of all paths, one path after another.
         first: (B,), ascending, where each path begins.
     """
-    steps = np.diff(way, axis=0, prepend=way[:1])
+    steps = np.diff(place, axis=0, prepend=place[:1])
     steps[first] = 0
-    more = first[np.diff(first, append=len(way)) > 1]
+    more = first[np.diff(first, append=len(place)) > 1]
     steps[more] = steps[more + 1]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     return np.divide(steps, length, out=np.zeros_like(steps), where=length > 0)

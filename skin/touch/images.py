@@ -16,7 +16,7 @@ from skin.paths import BUNDLED, candidates
 _FOLDER = BUNDLED / "data" / "shapes"
 
 
-def load(name: str) -> np.ndarray:
+def load_image(name: str) -> np.ndarray:
     """Return a shape's image (h, w), float64, 0 to 1.
 
     Args:
@@ -42,7 +42,7 @@ def load(name: str) -> np.ndarray:
             f"cannot read the shape {name} ({path}): {error}; touch.shapes takes grey-scale pictures, "
             "such as a PNG, white = full pressure"
         ) from error
-    return check(pixels, name)
+    return check_image(pixels, name)
 
 
 def _find(name: str) -> Path:
@@ -57,7 +57,7 @@ def _find(name: str) -> Path:
     )
 
 
-def check(pixels: np.ndarray, name: str) -> np.ndarray:
+def check_image(pixels: np.ndarray, name: str) -> np.ndarray:
     """Return pixels (h, w) scaled so that the brightest is 1.
 
     Raises:

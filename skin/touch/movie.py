@@ -26,7 +26,7 @@ class Movie:
             its last), x and y (m, that first place); area, travel, frames and pressure
             (``skin.labels.Measures``), which make the labels; and where pressure is solved for, unconverged
             (frames of all its draws that were not found).
-        drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
+        shear: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
             times the direction of motion, 0 where nothing slides; None: no friction.
     """
 
@@ -35,7 +35,7 @@ class Movie:
     scale: Tensor
     labels: Tensor
     parameters: dict[str, Tensor]
-    drag: Tensor | None = None
+    shear: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -51,7 +51,7 @@ class Movie:
             self.scale[rows],
             self.labels[rows],
             {name: values[rows] for name, values in self.parameters.items()},
-            None if self.drag is None else self.drag[shown],
+            None if self.shear is None else self.shear[shown],
         )
 
     @property
@@ -71,15 +71,15 @@ class Movie:
         return self.frames[self.index] * self.scale[..., None, None]
 
 
-def join(movies: Sequence[Movie]) -> Movie:
+def join_movies(movies: Sequence[Movie]) -> Movie:
     """Return one movie of all gestures of ``movies``, in order."""
     starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
-    drags = [movie.drag for movie in movies if movie.drag is not None]
+    shears = [movie.shear for movie in movies if movie.shear is not None]
     return Movie(
         torch.cat([movie.frames for movie in movies]),
         torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
         torch.cat([movie.scale for movie in movies]),
         torch.cat([movie.labels for movie in movies]),
         {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
-        torch.cat(drags) if drags else None,
+        torch.cat(shears) if shears else None,
     )

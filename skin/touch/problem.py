@@ -80,7 +80,7 @@ class ContactResult(NamedTuple):
     unconverged: np.ndarray | None = None
 
 
-class Contact(Protocol):
+class ContactModel(Protocol):
     """What the sampler asks of a contact: see :class:`skin.contact.base.AbstractContact`."""
 
     @property

@@ -13,10 +13,10 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.labels import TOUCH, measure
 from skin.touch._bodies import Fit
-from skin.touch._strokes import course
+from skin.touch._paths import sample_paths
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
-from skin.touch.movie import Movie, join
-from skin.touch.problem import Contact, ContactProblem, ContactResult
+from skin.touch.movie import Movie, join_movies
+from skin.touch.problem import ContactModel, ContactProblem, ContactResult
 from skin.touch.shapes import Shapes
 
 _ATTEMPTS = 50
@@ -86,7 +86,7 @@ class TouchSampler:
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: Contact,
+        contact: ContactModel,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
     ) -> None:
@@ -148,7 +148,7 @@ class TouchSampler:
                 pending = pending[~chosen & ~given_up]
             pending = np.concatenate([pending, *hopeless])
         tally.warn()
-        return join(movies)[torch.from_numpy(np.concatenate(found).argsort())]
+        return join_movies(movies)[torch.from_numpy(np.concatenate(found).argsort())]
 
     def _round(
         self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: _Tally
@@ -179,26 +179,26 @@ class TouchSampler:
     def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
         """Return the movie of gestures (B,), with the labels that it gives."""
         settings = self.settings
-        taken = course(gestures, wanted, settings, self.contact.proportional)
+        paths = sample_paths(gestures, wanted, settings, self.contact.proportional)
         pressed = self.contact.press(
-            taken.trajectories, ContactProblem(self.shapes, self.footprints, settings)
+            paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
-        shown, shares = taken.trajectories.index, taken.trajectories.profile
+        shown, shares = paths.trajectories.index, paths.trajectories.profile
         measures = measure(
             pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
         if not self.contact.proportional:
             # More of an object comes down as force grows, which moves the centre of pressure though it rests.
-            measures = measures._replace(travel=torch.from_numpy(taken.travel))
-        begin = taken.trajectories.place[taken.first]
-        values = pressed.peak, pressed.force, gestures["draws"], *taken.net.T, *begin.T
+            measures = measures._replace(travel=torch.from_numpy(paths.travel))
+        begin = paths.trajectories.place[paths.first]
+        values = pressed.peak, pressed.force, gestures["draws"], *paths.net.T, *begin.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
         known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
         known |= {name: value.float() for name, value in measures._asdict().items()}
-        pull = settings.shear * heading(taken.way, taken.first) if settings.shear else None
-        drag = None if pull is None else torch.from_numpy(pull).float()
+        pull = settings.shear * heading(paths.place, paths.first) if settings.shear else None
+        shear = None if pull is None else torch.from_numpy(pull).float()
         labels = measures.labels(settings.thresholds)
-        return Movie(pressed.frames, shown, shares, labels, known, drag), pressed
+        return Movie(pressed.frames, shown, shares, labels, known, shear), pressed
 
     def _never(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))

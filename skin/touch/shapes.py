@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
-from skin.touch.images import hulls, load, pyramid
+from skin.touch.images import hulls, load_image, pyramid
 
 # Frames rendered at once: their sampling grid (32 KiB a frame on 32 x 32 cells) then stays in the cache.
 _CELLS_AT_ONCE = 128 * 1024
@@ -53,7 +53,7 @@ class Shapes:
         hulls: (N, K, 2), corners of each shape's convex outline (pixels above ``contact``), in scales.
 
     Raises:
-        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load`).
+        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load_image`).
     """
 
     def __init__(self, names: Sequence[str], body: AbstractBody, contact: float = 0.02) -> None:
@@ -63,7 +63,7 @@ class Shapes:
         # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
         finest = max(64, max(body.size) / self.spacing)
-        self.levels = pyramid([load(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
+        self.levels = pyramid([load_image(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
         self.hulls = hulls(self.levels[0][:, 0].numpy(), contact)
 
     def extent(

@@ -11,12 +11,13 @@ from torch import Tensor
 
 from skin.labels import TOUCH_OR_NOT
 from skin.recording import Recording
-from skin.touch.sampler import Movie, TouchSampler, join
+from skin.touch.movie import Movie, join_movies
+from skin.touch.sampler import TouchSampler
 
 _LEAST = 16
 
 
-class Look(NamedTuple):
+class WindowContent(NamedTuple):
     """What W windows show.
 
     Attributes:
@@ -76,7 +77,7 @@ class Timeline:
         result[frame[inside]] = values[gesture[inside], shown]
         return result
 
-    def look(self, starts: Tensor, window: int) -> Look:
+    def window_content(self, starts: Tensor, window: int) -> WindowContent:
         """Return what windows of ``window`` frames show that begin at ``starts`` (W,)."""
         nearest = torch.searchsorted(self.end, starts, right=True)
         last = torch.searchsorted(self.begin, starts + window)
@@ -88,7 +89,7 @@ class Timeline:
         gesture = candidates[torch.arange(len(starts)), best]
         touched = seen > 0
         labels = torch.cat([self.movie.labels[gesture], torch.ones(len(starts), 1)], dim=1)
-        return Look(
+        return WindowContent(
             starts[:, None] + torch.arange(window),
             gesture.where(touched, -1),
             seen / self.duration[gesture],
@@ -122,11 +123,11 @@ def draw_timeline(
     begin = torch.from_numpy(np.concatenate(begins))
     kept = begin < length
     kept[0] = True  # one at least, though a short stream may end before it
-    return Timeline(join(movies)[kept], begin[kept], length)
+    return Timeline(join_movies(movies)[kept], begin[kept], length)
 
 
 @dataclass(frozen=True)
-class Strip:
+class TouchStream:
     """A stream as a skin feels it.
 
     Attributes:
@@ -138,7 +139,7 @@ class Strip:
     whole: Recording
 
     @classmethod
-    def of(cls, timeline: Timeline, gestures: Recording) -> "Strip":
+    def of(cls, timeline: Timeline, gestures: Recording) -> "TouchStream":
         """Return the stream of gestures that were felt one by one.
 
         Args:
@@ -170,11 +171,11 @@ class Strip:
     def cut(self, starts: Tensor, window: int) -> Recording:
         """Return the windows (W, T, ...) of T = ``window`` frames that begin at ``starts`` (W,).
 
-        Labels and ``share`` are as :class:`Look` has them. The other parameters are those of the gesture
-        shown, its onset counted from the window's first frame, and 0 without touch; but ``clipped`` is of
-        the frames of the window.
+        Labels and ``share`` are those of :class:`WindowContent`. The other parameters are those of the
+        gesture in the window, with its onset counted from the window's first frame, and 0 without a touch;
+        ``clipped`` refers to the frames of the window.
         """
-        frames, gesture, share, labels = self.timeline.look(starts, window)
+        frames, gesture, share, labels = self.timeline.window_content(starts, window)
 
         def windows(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[0][frames]
@@ -202,7 +203,7 @@ class Strip:
         )
 
 
-def touched(recording: Recording) -> Recording:
+def only_touches(recording: Recording) -> Recording:
     """Return what shows a touch: all, unless the labels say otherwise."""
     labels, gate = recording.touches.labels, recording.task.gate
     if labels is None or gate is None:

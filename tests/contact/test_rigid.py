@@ -31,7 +31,7 @@ COMPLIANCE = torch.from_numpy(love(BODY.shape, BODY.cell, 10 * BODY.layers[0].ma
 class HalfSpace(AbstractSimulator):
     """A surface of known compliance, and nothing below it."""
 
-    def forward(self, pressure: torch.Tensor, drag: torch.Tensor | None = None) -> Response:
+    def forward(self, pressure: torch.Tensor, shear: torch.Tensor | None = None) -> Response:
         """Read nothing."""
         return Response(pressure.new_zeros(*pressure.shape[:-2], len(SENSORS)), None)
 

@@ -10,7 +10,7 @@ from skin.body.base import AbstractBody
 _CHESSBOARD = 0.34
 
 
-def with_grain(compliance: Tensor, body: AbstractBody) -> Tensor:
+def stabilise_checkerboard(compliance: Tensor, body: AbstractBody) -> Tensor:
     """Return a compliance (N, N), m/Pa, that answers a chessboard of pressure as the top layer would.
 
     Where the surface is interpolated between the corners of the very cells that are loaded, each cell's

@@ -1,8 +1,8 @@
 """How many pictures a second the live page draws, in a headless Chromium; and a picture of an alarm.
 
 skin live web=true                                          # in one terminal
-python experiments/benchmarks/page.py http://127.0.0.1:8765 30               # in another
-python experiments/benchmarks/page.py http://127.0.0.1:8765 60 --alarm live.png
+python experiments/benchmarks/live_page.py http://127.0.0.1:8765 30               # in another
+python experiments/benchmarks/live_page.py http://127.0.0.1:8765 60 --alarm live.png
 """
 
 import argparse
@@ -25,7 +25,7 @@ _ALARM = "return document.body.dataset.state === 'danger' ? Math.max(...latest.v
 _LINE = "return document.getElementById('line').textContent"
 
 
-def measure(address: str, seconds: float, alarm: Path | None = None) -> dict[str, float | str]:
+def measure_refresh(address: str, seconds: float, alarm: Path | None = None) -> dict[str, float | str]:
     """Return how often a page drew the skin, and the browser refreshed it, per second; and its last line.
 
     Args:
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("seconds", type=float)
     parser.add_argument("--alarm", type=Path, metavar="PNG", help="take a picture of the hardest alarm")
     given = parser.parse_args()
-    print(json.dumps(measure(given.address, given.seconds, given.alarm)))
+    print(json.dumps(measure_refresh(given.address, given.seconds, given.alarm)))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ _GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameSolution:
     """What scikit-fem answers to one frame.
 
     Attributes:
@@ -40,14 +40,14 @@ class Frame:
 
 
 def solve_frame(
-    mesh: Hexahedra, pressure: np.ndarray, drag: float, place: np.ndarray, extent: float
-) -> Frame:
+    mesh: Hexahedra, pressure: np.ndarray, shear: float, place: np.ndarray, extent: float
+) -> FrameSolution:
     """Solve a flat skin under one frame in the mixed form: the pressure inside is an unknown per element.
 
     Args:
         mesh: gives points, cells and materials.
         pressure: (H, W), Pa.
-        drag: traction along x over the pressure.
+        shear: traction along x over the pressure.
         place: (3,), m: a node, at an interface between rows of elements.
         extent: side of the sensor's footprint, m: whole cells about the node.
     """
@@ -69,7 +69,7 @@ def solve_frame(
 
     def traction(v, w):
         here = pressure[(w.x[1] // rows).astype(int), (w.x[0] // columns).astype(int)]
-        return here * (drag * v[0] - v[2])
+        return here * (shear * v[0] - v[2])
 
     load = np.concatenate([LinearForm(traction).assemble(top), np.zeros(inner.N)])
     table = basis.get_dofs(lambda x: np.abs(x[2] + mesh.lines[2][-1]) < 1e-12).all()
@@ -78,7 +78,9 @@ def solve_frame(
     below = np.array([place[0], place[1], -place[2]])
     above = np.array([place[0], place[1], 0.0])
     sensor, surface = (-_at(points, basis, moved, spot)[2] for spot in (below, above))
-    return Frame(_reading(points, basis, moved, squeeze, fields["mu"], mesh, place, extent), sensor, surface)
+    return FrameSolution(
+        _reading(points, basis, moved, squeeze, fields["mu"], mesh, place, extent), sensor, surface
+    )
 
 
 def locking(mesh: Hexahedra) -> sp.csc_matrix:

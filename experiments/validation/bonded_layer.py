@@ -5,14 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import scipy.sparse as sp
 
-from experiments.validation.basics import SLABS, stack
-from experiments.validation.blocks import WALLS, block, held, row_means, solve
-from experiments.validation.direct import locking
-from experiments.validation.finding import Curve, Finding, Outcome, Picture, compared
+from experiments.validation.blocks import WALLS, block, held, row_means, solve_block
+from experiments.validation.finding import CheckResult, Curve, Finding, Plot, relative_finding
 from experiments.validation.layered import Slab, bonded_layer, patch
+from experiments.validation.mixed_form import locking
+from experiments.validation.patch_and_equilibrium import SLABS, stack
 from skin.sensors import Sensors
 from skin.simulator._hexahedra import Hexahedra
-from skin.simulator.solid import readings
+from skin.simulator.solid import reading_rows
 
 _SIDE = 0.16
 _LOADED = (0.06, 0.10, 0.06, 0.10)
@@ -20,7 +20,7 @@ _PLACES = np.array([[0.08, 0.08], [0.105, 0.08], [0.12, 0.08]])
 _RATIOS = (0.45, 0.49, 0.499, 0.4999)
 
 
-def thin_layer(quick: bool) -> Outcome:
+def thin_layer(quick: bool) -> CheckResult:
     """A thin bonded layer moves under a wave of pressure as the closed form says."""
     slab = Slab(0.005, 170e3, 0.499)
     shares = np.array([2.0, 8.0]) if quick else np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
@@ -30,20 +30,20 @@ def thin_layer(quick: bool) -> Outcome:
         found.append(_wave(number, slab, 16, 8))
         exact.append(bonded_layer(number, slab))
     findings = [
-        compared(f"compliance, m/Pa, wave of {share:g} thicknesses", one, other, 0.02)
+        relative_finding(f"compliance, m/Pa, wave of {share:g} thicknesses", one, other, 0.02)
         for share, one, other in zip(shares, found, exact, strict=True)
     ]
     fine = np.geomspace(0.7, 40, 200)
     line = [bonded_layer(2 * np.pi / (share * slab.thickness), slab) for share in fine]
-    picture = Picture(
+    picture = Plot(
         "layer", "Bonded layer, nu = 0.499, under a wave of pressure", "wavelength / thickness",
         "surface motion per pressure, m/Pa",
         [Curve("closed form", fine, line), Curve("elements", shares, found, marks=True)], log=True,
     )  # fmt: skip
-    return Outcome(findings, (), (picture,))
+    return CheckResult(findings, (), (picture,))
 
 
-def no_locking(quick: bool) -> Outcome:
+def no_locking(quick: bool) -> CheckResult:
     """The error stays where it is while nu goes to one half."""
     findings, curves = [], []
     for rows in (4,) if quick else (4, 8):
@@ -52,7 +52,9 @@ def no_locking(quick: bool) -> Outcome:
             slab = Slab(0.01, 170e3, ratio)
             ours, exact = _wave(100.0, slab, 2 * rows, rows), bonded_layer(100.0, slab)
             errors.append(ours / exact - 1)
-            findings.append(compared(f"compliance, m/Pa, nu = {ratio}, {rows} rows", ours, exact, 0.01))
+            findings.append(
+                relative_finding(f"compliance, m/Pa, nu = {ratio}, {rows} rows", ours, exact, 0.01)
+            )
         change = abs(errors[-1] - errors[-2])
         case = f"change of the error from nu = {_RATIOS[-2]} to {_RATIOS[-1]}, {rows} rows"
         findings.append(Finding(case, errors[-1], errors[-2], change, 1e-3))
@@ -60,16 +62,16 @@ def no_locking(quick: bool) -> Outcome:
     slabs = [Slab(0.01, 170e3, ratio) for ratio in _RATIOS]
     plain = [abs(_wave(100.0, slab, 8, 4, locking) / bonded_layer(100.0, slab) - 1) for slab in slabs]
     curves.append(Curve("4 rows of plain elements, which lock", 0.5 - np.array(_RATIOS), plain, marks=True))
-    picture = Picture("locking", "No locking: a bonded layer under a wave", "0.5 - nu", "relative error",
+    picture = Plot("locking", "No locking: a bonded layer under a wave", "0.5 - nu", "relative error",
                       curves, log=True)  # fmt: skip
     remark = (
         f"plain, fully integrated elements, 4 rows of them, are {100 * plain[-1]:.0f} % off at "
         f"nu = {_RATIOS[-1]}"
     )
-    return Outcome(findings, (remark,), (picture,))
+    return CheckResult(findings, (remark,), (picture,))
 
 
-def convergence(quick: bool) -> Outcome:
+def convergence(quick: bool) -> CheckResult:
     """Halving the elements divides the error of motion by four."""
     counts = (4, 8, 16) if quick else (4, 8, 16, 32)
     findings, curves = [], []
@@ -81,14 +83,14 @@ def convergence(quick: bool) -> Outcome:
         findings.append(Finding(f"order, nu = {ratio}", order, 2, abs(order - 2), 0.2))
         curves.append(Curve(f"nu = {ratio}", counts, errors, marks=True))
     curves.append(Curve("second order", counts, [0.5 / count**2 for count in counts]))
-    picture = Picture(
+    picture = Plot(
         "convergence", "Motion under a wave of pressure", "elements per thickness", "relative error",
         curves, log=True,
     )  # fmt: skip
-    return Outcome(findings, (), (picture,))
+    return CheckResult(findings, (), (picture,))
 
 
-def default_mesh(quick: bool) -> Outcome:
+def default_mesh(quick: bool) -> CheckResult:
     """The default skin reads a pressed square as the exact layers do; its error falls with the mesh."""
     meshes = ((16, 3), (32, 2)) if quick else ((16, 3), (32, 1), (32, 3), (64, 3))
     exact = _exact(200 if quick else 320)
@@ -104,13 +106,13 @@ def default_mesh(quick: bool) -> Outcome:
     fine = (32, 2) if quick else (32, 3)
     ours = found[fine]
     findings = [
-        compared("reading under the middle / p A", ours[0, 0], exact[0, 0], 0.05),
+        relative_finding("reading under the middle / p A", ours[0, 0], exact[0, 0], 0.05),
         Finding("reading 5 mm beside / p A", ours[0, 1], exact[0, 1],
                 abs(ours[0, 1] - exact[0, 1]) / exact[0, 0], 0.05),
-        compared("D_s under the middle, m/Pa", ours[1, 0], exact[1, 0], 0.05),
-        compared("D_t under the middle, m/Pa", ours[2, 0], exact[2, 0], 0.05),
+        relative_finding("D_s under the middle, m/Pa", ours[1, 0], exact[1, 0], 0.05),
+        relative_finding("D_t under the middle, m/Pa", ours[2, 0], exact[2, 0], 0.05),
     ]  # fmt: skip
-    return Outcome(findings, remarks)
+    return CheckResult(findings, remarks)
 
 
 def _list(errors: np.ndarray) -> str:
@@ -129,7 +131,7 @@ def _wave(
     lines = (x, x[:2].copy(), np.linspace(0, slab.thickness, rows + 1))
     mesh = block(lines, slab.young, slab.poisson)
     pressure = np.diff(np.sin(number * x)) / (number * np.diff(x))  # a cell's mean
-    moved = solve(mesh, held(mesh, WALLS), (mesh.loads(2) @ pressure)[:, None], stiffness(mesh))[:, 0]
+    moved = solve_block(mesh, held(mesh, WALLS), (mesh.loads(2) @ pressure)[:, None], stiffness(mesh))[:, 0]
     top = -moved.reshape(rows + 1, 2, columns + 1, 3)[0, 0, :, 2]
     return float(2 * number / np.pi * np.trapezoid(top * np.cos(number * x), x))
 
@@ -146,11 +148,11 @@ def _pressed(cells: int, divisions: int) -> np.ndarray:
     middle = row_means(x)
     on = (middle > _LOADED[0]) & (middle < _LOADED[1])
     load = mesh.loads(2) @ np.outer(on, on).ravel().astype(float)
-    moved = solve(mesh, held(mesh, WALLS), load[:, None])[:, 0]
+    moved = solve_block(mesh, held(mesh, WALLS), load[:, None])[:, 0]
     deep = np.column_stack([_SIDE - _PLACES, np.full(len(_PLACES), SLABS[0].thickness)])
     # A footprint on the mirror is cut in half there: twice per mirror gives it back.
     cut = 2.0 ** (np.abs(deep[:, :2] - _SIDE / 2) < 1e-9).sum(axis=1)
-    felt = readings(mesh, Sensors(deep, (0.01, 0.01))) @ moved / 1e-4 * cut
+    felt = reading_rows(mesh, Sensors(deep, (0.01, 0.01))) @ moved / 1e-4 * cut
     down = np.tile([0.0, 0.0, 1.0], (len(deep), 1))
     sensor, surface = (mesh.motion(deep * [1, 1, share], down) @ moved for share in (1, 0))
     return np.stack([felt, sensor, surface])

@@ -9,7 +9,7 @@ from rich.table import Table
 from skin.evaluation.report import SHARES, Report
 
 
-def report(found: Report, title: str, console: Console | None = None) -> None:
+def print_report(found: Report, title: str, console: Console | None = None) -> None:
     """Print one line per label and one column per set of touches, accuracies in per cent, errors in degrees.
 
     Args:
@@ -18,7 +18,7 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
         console: where to print; None takes standard output.
     """
     console = console or Console()
-    console.print(table(found.metrics, title))
+    console.print(metrics_table(found.metrics, title))
     if found.point is not None and found.reached is not None:
         said = f"{found.point.sentence()}; {found.reached.sentence()}"
         console.print(said, markup=False, highlight=False, soft_wrap=True)
@@ -26,7 +26,7 @@ def report(found: Report, title: str, console: Console | None = None) -> None:
         console.print(f"{column}: {reason}", markup=False)
 
 
-def table(metrics: Mapping[str, float], title: str) -> Table:
+def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
     """Return the table of metrics such as ``same/overall/accuracy``; others are left out."""
     shown = [name for name in metrics if name.endswith((*SHARES, "/degrees"))]
     columns = list(dict.fromkeys(name.split("/")[0] for name in shown))
@@ -34,10 +34,10 @@ def table(metrics: Mapping[str, float], title: str) -> Table:
     for line in dict.fromkeys(name.split("/", 1)[1] for name in shown):
         values = (metrics.get(f"{column}/{line}") for column in columns)
         unit = 1 if line.endswith("/degrees") else 100
-        made.add_row(line, *(number(value, unit) for value in values))
+        made.add_row(line, *(format_number(value, unit) for value in values))
     return made
 
 
-def number(value: float | None, unit: float = 100) -> str:
+def format_number(value: float | None, unit: float = 100) -> str:
     """Return a figure with one digit; "-" where it is not defined, and nothing where there is none."""
     return "" if value is None else "-" if isnan(value) else f"{unit * value:.1f}"

@@ -12,10 +12,10 @@ from torchmetrics.functional.classification import binary_confusion_matrix
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.alarm import Alarms, count_alarms
-from skin.evaluation.course import Course
 from skin.evaluation.metrics import metrics
 from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.report import Answers
+from skin.evaluation.report import Predictor
+from skin.evaluation.stream_settings import StreamSettings
 from skin.labels import TOUCH_OR_NOT, Task
 from skin.signal.contact_threshold import Gate, Threshold, gates, rise
 
@@ -41,7 +41,7 @@ class Bin:
 
 
 @dataclass(frozen=True)
-class Sliding:
+class WindowReport:
     """What was found.
 
     Attributes:
@@ -84,19 +84,19 @@ class Sliding:
         return values
 
 
-def slide(
-    learner: Answers,
+def evaluate_windows(
+    learner: Predictor,
     device: AbstractDevice,
-    course: Course,
+    settings: StreamSettings,
     point: OperatingPoint,
     track: Callable[..., Any] = iter,
-) -> Sliding:
+) -> WindowReport:
     """Try a learner on windows of test streams, as its device would feel them.
 
     Args:
         learner: trained.
         device: that it was trained on.
-        course: what to try.
+        settings: the streams and windows to test.
         point: where the learner raises the alarm.
         track: wraps the chunks of the long stream, to show how far it is, as ``rich.progress.track``.
 
@@ -113,13 +113,13 @@ def slide(
     assert labels is not None
     chances = learner.probabilities(touches)
     said = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
-    return Sliding(
+    return WindowReport(
         bins(chances, labels, recording.parameters["share"], device.task),
         {name: binary_confusion_matrix(answer.long(), labels[:, -1].long()) for name, answer in said.items()},
         threshold.least,
-        _listen(learner, streamed, device.task, all_gates, course, point, track),
-        course.hours,
-        {window: _length(learner, device, window) for window in course.windows},
+        _listen(learner, streamed, device.task, all_gates, settings, point, track),
+        settings.hours,
+        {window: _length(learner, device, window) for window in settings.windows},
         device.stream,
         point,
     )
@@ -159,32 +159,32 @@ def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin
 
 
 def _listen(
-    learner: Answers,
+    learner: Predictor,
     device: AbstractSimulated,
     task: Task,
     all_gates: dict[str, Gate],
-    course: Course,
+    settings: StreamSettings,
     point: OperatingPoint,
     track: Callable[..., Any],
 ) -> dict[str, Alarms]:
     """Return the alarms of each gate while a window slides over a long stream."""
-    frames = max(round(course.hours * 3600 * device.rate), device.window)
-    strip = device.strip(frames, course.gap)
-    starts = torch.arange(0, frames - device.window + 1, course.stride)
+    frames = max(round(settings.hours * 3600 * device.rate), device.window)
+    stream = device.simulate_stream(frames, settings.gap)
+    starts = torch.arange(0, frames - device.window + 1, settings.stride)
     dangerous = task.names.index(LABEL)
     heard: dict[str, list[Tensor]] = {name: [] for name in all_gates}
     for part in track(starts.split(_CHUNK)):
-        touches = strip.cut(part, device.window).touches
+        touches = stream.cut(part, device.window).touches
         chances = learner.probabilities(touches)
         for name, gate in all_gates.items():
             heard[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
-    gesture = strip.timeline.look(starts, device.window).gesture
-    truth = strip.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
-    hours = course.stride / device.rate / 3600
+    gesture = stream.timeline.window_content(starts, device.window).gesture
+    truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
+    hours = settings.stride / device.rate / 3600
     return {name: count_alarms(torch.cat(said), gesture, truth, hours) for name, said in heard.items()}
 
 
-def _length(learner: Answers, device: AbstractSimulated, window: int) -> float | str:
+def _length(learner: Predictor, device: AbstractSimulated, window: int) -> float | str:
     """Return the overall accuracy on test touches in windows of another length, or why there is none.
 
     The touches are those of the other lengths, begun elsewhere; a window that the longest press does not fit

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.contact._grain import with_grain
+from skin.contact._checkerboard import stabilise_checkerboard
 
 from .halfspace import love
 
@@ -50,7 +50,7 @@ def test_the_dent_of_a_chessboard_is_that_of_a_half_space():
     waves = np.hypot(odd, odd[:, None]) / side
     means = np.sinc(odd / (2 * np.pi)) ** 2
     dent = (2 / (MODULUS * waves) * means * means[:, None]).sum()
-    added = with_grain(torch.zeros(120, 120, dtype=torch.float64), BODY).numpy()
+    added = stabilise_checkerboard(torch.zeros(120, 120, dtype=torch.float64), BODY).numpy()
     middle = 5 * 12 + 6
     assert (added @ BOARD)[middle] * BOARD[middle] == pytest.approx(dent, rel=0.005)
     # The same by brute force: the mean over a cell of 6 x 6 cells in closed form, still a little too deep.
@@ -60,7 +60,7 @@ def test_the_dent_of_a_chessboard_is_that_of_a_half_space():
 def test_what_the_mesh_hides_is_put_back():
     """A single cell is too stiff by half; so are short waves. Both come much nearer to the half-space."""
     exact, seen = half_space(4), seen_at_corners()
-    grained = with_grain(torch.from_numpy(seen), BODY).numpy()
+    grained = stabilise_checkerboard(torch.from_numpy(seen), BODY).numpy()
     assert BOARD @ seen @ BOARD < 0.05 * BOARD @ exact @ BOARD
     short = np.linalg.eigh(exact)[1][:, : len(exact) // 2]
     for left, right in (
@@ -74,9 +74,9 @@ def test_what_the_mesh_hides_is_put_back():
 
 def test_even_pressure_gets_nothing_added():
     seen = torch.from_numpy(seen_at_corners())
-    torch.testing.assert_close(with_grain(seen, BODY).sum(1), seen.sum(1), rtol=1e-10, atol=0)
+    torch.testing.assert_close(stabilise_checkerboard(seen, BODY).sum(1), seen.sum(1), rtol=1e-10, atol=0)
 
 
 def test_what_lacks_nothing_stays():
     exact = torch.from_numpy(1.1 * half_space(4))
-    assert torch.equal(with_grain(exact, BODY), exact)
+    assert torch.equal(stabilise_checkerboard(exact, BODY), exact)

@@ -13,9 +13,9 @@ import scipy.sparse as sp
 import torch
 from scipy.sparse.linalg import spsolve
 
-from experiments.validation.basics import skin
-from experiments.validation.direct import solve_frame
-from experiments.validation.finding import Finding, Outcome, compared
+from experiments.validation.finding import CheckResult, Finding, relative_finding
+from experiments.validation.mixed_form import solve_frame
+from experiments.validation.patch_and_equilibrium import skin
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.sensors import Sensors
@@ -25,38 +25,38 @@ from skin.simulator._elastic import Elastic
 from skin.simulator._relaxation import Relaxing
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
-from skin.simulator.solid import Solid, hexahedra, readings
+from skin.simulator.solid import Solid, hexahedra, reading_rows
 
 _DRAGON: Any = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
 _ECOFLEX: Any = {"material": "EcoFlex 00-30", "thickness": 0.005}
 _FOAM: Any = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thickness": 0.003}
 
 
-def single_frames(quick: bool) -> Outcome:
+def single_frames(quick: bool) -> CheckResult:
     """The operator gives for single frames what scikit-fem gives, solved for each of them."""
     body = skin(8 if quick else 12, 0.12)
     place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
     mesh, extent = hexahedra(body, 2, {}), 2 * body.cell[0]
     sensors = Sensors(place[None], (extent, extent))
     down, above = np.array([[0.0, 0, 1]]), place * [1, 1, 0]
-    rows = [readings(mesh, sensors), mesh.motion(place[None], down), mesh.motion(above[None], down)]
+    rows = [reading_rows(mesh, sensors), mesh.motion(place[None], down), mesh.motion(above[None], down)]
     along, _, inwards = Elastic(mesh).transfer(sp.vstack(rows).tocsr())
     findings = []
-    for seed, drag in ((0, 0.0), (1, 0.5)):
+    for seed, shear in ((0, 0.0), (1, 0.5)):
         pressure = 1e4 * np.random.default_rng(seed).random(body.shape)
-        ours = (inwards + drag * along) @ pressure.ravel()
-        theirs = solve_frame(mesh, pressure, drag, place, extent)
+        ours = (inwards + shear * along) @ pressure.ravel()
+        theirs = solve_frame(mesh, pressure, shear, place, extent)
         for name, one, other in zip(
             ("reading, N", "D_s, m", "D_t, m"),
             ours,
             (theirs.reading, theirs.sensor, theirs.surface),
             strict=True,
         ):
-            findings.append(compared(f"{name}, friction {drag:g}", one, other, 1e-8))
-    return Outcome(findings)
+            findings.append(relative_finding(f"{name}, friction {shear:g}", one, other, 1e-8))
+    return CheckResult(findings)
 
 
-def plates_and_beams(quick: bool) -> Outcome:
+def plates_and_beams(quick: bool) -> CheckResult:
     """simulator=fem moves every node as PyNite does."""
     bodies = {
         "4x3, two layers": Sheet((0.04, 0.04), (4, 3), (_DRAGON, _ECOFLEX)),
@@ -72,10 +72,10 @@ def plates_and_beams(quick: bool) -> Outcome:
             error = (np.abs(ours - expected).max((0, 1, 2)) / np.abs(expected).max((0, 1, 2))).max()
             case = f"all displacements, {name}, constraint={constraint}"
             findings.append(Finding(case, np.abs(ours).max(), np.abs(expected).max(), float(error), 1e-8))
-    return Outcome(findings)
+    return CheckResult(findings)
 
 
-def equation_ten(quick: bool) -> Outcome:
+def equation_ten(quick: bool) -> CheckResult:
     """Readings of simulator=fem are D_s / D_t times the force on the footprint, in proportion."""
     body = Sheet((0.04, 0.04), (4, 4), (_DRAGON, _ECOFLEX))
     pressure = np.random.default_rng(0).uniform(0, 1e5, body.shape)
@@ -85,16 +85,18 @@ def equation_ten(quick: bool) -> Outcome:
     # The footprint is a quarter of each of the four cells about the node.
     force = pressure[2:4, 1:3].mean() * np.prod(body.cell)
     reading = [float(fem(torch.from_numpy(factor * pressure)).readings[0]) for factor in (1, 7)]
-    return Outcome(
+    return CheckResult(
         [
             # The simulator keeps its operator in single precision.
-            compared("reading, N; D_s and D_t from PyNite", reading[0], moves[0] / moves[1] * force, 1e-6),
-            compared("reading under seven times the pressure, N", reading[1], 7 * reading[0], 1e-6),
+            relative_finding(
+                "reading, N; D_s and D_t from PyNite", reading[0], moves[0] / moves[1] * force, 1e-6
+            ),
+            relative_finding("reading under seven times the pressure, N", reading[1], 7 * reading[0], 1e-6),
         ]
     )
 
 
-def naive(quick: bool) -> Outcome:
+def naive(quick: bool) -> CheckResult:
     """simulator=naive reads the pressure of one cell times the footprint."""
     body = skin(16)
     place = np.random.default_rng(0).uniform(0.01, 0.15, (25, 2))
@@ -103,10 +105,10 @@ def naive(quick: bool) -> Outcome:
     felt = Naive(body, sensors)(torch.from_numpy(pressure)).readings.numpy()
     exact = np.array([pressure[int(y // body.cell[1]), int(x // body.cell[0])] for x, y in place]) * 1e-4
     error = np.abs(felt - exact).max() / exact.max()
-    return Outcome([Finding("25 readings, N", felt.max(), exact.max(), float(error), 1e-6)])
+    return CheckResult([Finding("25 readings, N", felt.max(), exact.max(), float(error), 1e-6)])
 
 
-def creep(quick: bool) -> Outcome:
+def creep(quick: bool) -> CheckResult:
     """Under a load that stays, a skin of one relaxing material sinks in as the standard linear solid does."""
     time, strength, rate, frames = 0.6, 0.8, 10.0, 30
     branch = {"time": time, "strength": strength}
@@ -130,10 +132,10 @@ def creep(quick: bool) -> Outcome:
             error = float(np.abs(ours - exact).max())
             case = f"D_t in the first frame / in the end, worst of {frames}, simulator={name}"
             findings.append(Finding(case, float(ours[0]), float(exact[0]), error, 1e-5))
-    return Outcome(findings)
+    return CheckResult(findings)
 
 
-def threads(quick: bool) -> Outcome:
+def threads(quick: bool) -> CheckResult:
     """Operators, readings and contact pressures are the same on one thread and on two."""
     cells = "8" if quick else "16"
     with tempfile.TemporaryDirectory() as folder:
@@ -141,7 +143,7 @@ def threads(quick: bool) -> Outcome:
         for count in ("1", "2"):
             path = Path(folder) / f"{count}.npz"
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-            command = [sys.executable, "-m", "experiments.validation.alone", count, cells, str(path)]
+            command = [sys.executable, "-m", "experiments.validation.fixed_threads", count, cells, str(path)]
             environment = os.environ | dict.fromkeys(names, count)
             subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[2])
             with np.load(path) as file:
@@ -151,7 +153,7 @@ def threads(quick: bool) -> Outcome:
         one, two = (of[name] for of in found)
         error = float(np.abs(one - two).max() / np.abs(one).max())
         findings.append(Finding(name, np.abs(two).max(), np.abs(one).max(), error, tolerance))
-    return Outcome(findings)
+    return CheckResult(findings)
 
 
 def _refereed(structure: Structure, pressure: np.ndarray) -> np.ndarray:

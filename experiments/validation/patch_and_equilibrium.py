@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.validation.blocks import WALLS, block, held, solve
-from experiments.validation.finding import Finding, Outcome, compared
+from experiments.validation.blocks import WALLS, block, held, solve_block
+from experiments.validation.finding import CheckResult, Finding, relative_finding
 from experiments.validation.layered import Slab
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody
@@ -14,7 +14,7 @@ from skin.body.sheet import Sheet
 from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator._hexahedra import Hexahedra
-from skin.simulator.solid import hexahedra, readings
+from skin.simulator.solid import hexahedra, reading_rows
 
 # The default skin, from the surface down.
 SLABS = (Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49))
@@ -43,7 +43,7 @@ def stack(divisions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.concatenate([*lines, tops[-1:]]), young, ratio
 
 
-def patch_test(quick: bool) -> Outcome:
+def patch_test(quick: bool) -> CheckResult:
     """A uniform strain on the surface of distorted elements is the uniform strain inside."""
     findings = []
     for ratio in (0.3, 0.499):
@@ -55,48 +55,51 @@ def patch_test(quick: bool) -> Outcome:
         faces = dict.fromkeys(("left", "right", "near", "far", "base", "top"), (0, 1, 2))
         fixed = held(mesh, faces)
         given = np.where(fixed, exact, 0)
-        moved = given + solve(mesh, fixed, -(mesh.stiffness() @ given)[:, None])[:, 0]
+        moved = given + solve_block(mesh, fixed, -(mesh.stiffness() @ given)[:, None])[:, 0]
         error = np.abs(moved - exact).max() / np.abs(exact).max()
         findings.append(Finding(f"motion inside, nu = {ratio}", error, 0, error, 1e-10))
         error = _stress_error(mesh, moved, strain)
         findings.append(Finding(f"stress, nu = {ratio}", error, 0, error, 1e-10))
-    return Outcome(findings)
+    return CheckResult(findings)
 
 
-def confined_compression(quick: bool) -> Outcome:
+def confined_compression(quick: bool) -> CheckResult:
     """Between smooth walls an even pressure p shortens every layer by p h / (lambda + 2 G)."""
     line = np.linspace(0, 0.02, 3 if quick else 5)
     depth, young, ratio = stack(2)
     mesh = block((line, line, depth), young, ratio)
     load = mesh.loads(2).sum(axis=1)
-    moved = solve(mesh, held(mesh, WALLS), np.asarray(load).reshape(-1, 1))[:, 0]
+    moved = solve_block(mesh, held(mesh, WALLS), np.asarray(load).reshape(-1, 1))[:, 0]
     top = -moved.reshape(-1, 3)[0, 2]
     exact = sum(slab.thickness / slab.confined for slab in SLABS)
     points = np.array([[0.011, 0.007, z] for z in (0.0, 0.002, 0.005, 0.012)])
     down = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     stress = mesh.stress(points, down) @ moved
     worst = stress[np.abs(stress + 1).argmax()]
-    return Outcome(
-        [compared("motion of the surface, m/Pa", top, exact, 1e-8), compared("sigma_zz / p", worst, -1, 1e-8)]
+    return CheckResult(
+        [
+            relative_finding("motion of the surface, m/Pa", top, exact, 1e-8),
+            relative_finding("sigma_zz / p", worst, -1, 1e-8),
+        ]
     )
 
 
-def even_pressure(quick: bool) -> Outcome:
+def even_pressure(quick: bool) -> CheckResult:
     """Far from free edges an even pressure p is sigma_zz = -p at every depth."""
     body = skin(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
     mesh = hexahedra(body, 2, {})
-    felt = Elastic(mesh).transfer(readings(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
-    return Outcome(
+    felt = Elastic(mesh).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
+    return CheckResult(
         [
-            compared(f"reading / p A, {1e3 * depth:g} mm deep", one, 1, 2e-3)
+            relative_finding(f"reading / p A, {1e3 * depth:g} mm deep", one, 1, 2e-3)
             for depth, one in zip(depths, felt, strict=True)
         ]
     )
 
 
-def balance(quick: bool) -> Outcome:
+def global_balance(quick: bool) -> CheckResult:
     """The table pushes back with the force and the turning moment that are applied."""
     findings = []
     for name, body in _bodies(quick):
@@ -110,10 +113,10 @@ def balance(quick: bool) -> Outcome:
             error = np.abs(applied + answered).max() / np.abs(applied).max()
             ours, reference = (float(np.linalg.norm(value)) for value in (answered, applied))
             findings.append(Finding(f"{kind}, {name}", ours, reference, float(error), 1e-8))
-    return Outcome(findings)
+    return CheckResult(findings)
 
 
-def reciprocity(quick: bool) -> Outcome:
+def reciprocity(quick: bool) -> CheckResult:
     """Maxwell and Betti: one load does the same work on another's motion as the other does on its."""
     findings = []
     for name, body in _bodies(quick):
@@ -122,11 +125,11 @@ def reciprocity(quick: bool) -> Outcome:
         loads = sum(mesh.loads(axis) @ random[axis].T for axis in range(3))
         moves = Elastic(mesh).solve(loads)
         there, back = loads[:, 0] @ moves[:, 1], loads[:, 1] @ moves[:, 0]
-        findings.append(compared(f"work, J, {name}", there, back, 1e-8))
-    return Outcome(findings)
+        findings.append(relative_finding(f"work, J, {name}", there, back, 1e-8))
+    return CheckResult(findings)
 
 
-def wide_arm(quick: bool) -> Outcome:
+def wide_arm(quick: bool) -> CheckResult:
     """A sleeve around an arm of large radius is a sheet, the more so the larger the radius."""
     sheet = skin(8 if quick else 16)
     place = np.array([[0.07, 0.09, 0.005], [0.03, 0.12, 0.003], [0.11, 0.05, 0.005]])
@@ -139,10 +142,10 @@ def wide_arm(quick: bool) -> Outcome:
         error = np.abs(rows - flat).max() / np.abs(flat).max()
         case = f"readings of every cell and direction, radius {radius:g} m"
         findings.append(Finding(case, np.abs(rows).max(), np.abs(flat).max(), error, tolerance))
-    return Outcome(findings)
+    return CheckResult(findings)
 
 
-def sleeve(quick: bool) -> Outcome:
+def sleeve(quick: bool) -> CheckResult:
     """A sleeve on a rigid core under an even pressure is Lame's tube (plane strain, u = A r + B / r)."""
     core, middle, outer = 0.035, 0.045, 0.05
     soft, hard = SLABS
@@ -161,15 +164,20 @@ def sleeve(quick: bool) -> Outcome:
     # Half a tube ends in mirrors: it moves neither up nor down there, nor along the arm anywhere.
     walls = {"left": (2,), "right": (2,), "near": (1,), "far": (1,), "base": (0, 1, 2)}
     load = np.asarray(mesh.loads(2).sum(axis=1)).reshape(-1, 1)
-    moved = solve(mesh, held(mesh, walls), load)[:, 0]
+    moved = solve_block(mesh, held(mesh, walls), load)[:, 0]
     top = np.array([[body.size[0] / 2, 0.005, 0.0]])
     down = np.array([[0.0, 0.0, 1.0]])
     sensor = Sensors(top + np.array([0, 0, 0.005]), (0.01, 0.01))
-    return Outcome(
+    return CheckResult(
         [
-            compared("motion of the surface, m/Pa", (mesh.motion(top, down) @ moved)[0], -surface, 0.02),
-            compared(
-                "reading at the interface / p A", (readings(mesh, sensor) @ moved)[0] / 1e-4, -between, 0.01
+            relative_finding(
+                "motion of the surface, m/Pa", (mesh.motion(top, down) @ moved)[0], -surface, 0.02
+            ),
+            relative_finding(
+                "reading at the interface / p A",
+                (reading_rows(mesh, sensor) @ moved)[0] / 1e-4,
+                -between,
+                0.01,
             ),
         ]
     )
@@ -188,7 +196,7 @@ def _sleeve(radius: float, sheet: Sheet) -> Arm:
 
 def _rows(body: AbstractBody, sensors: Sensors) -> np.ndarray:
     mesh = hexahedra(body, 2, {})
-    return Elastic(mesh).transfer(readings(mesh, sensors))
+    return Elastic(mesh).transfer(reading_rows(mesh, sensors))
 
 
 def _bodies(quick: bool) -> list[tuple[str, AbstractBody]]:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from experiments.validation.blocks import ALL, block, graded, held, row_means, solve
-from experiments.validation.finding import Curve, Finding, Outcome, Picture, compared
+from experiments.validation.blocks import ALL, block, graded, held, row_means, solve_block
+from experiments.validation.finding import CheckResult, Curve, Finding, Plot, relative_finding
 from experiments.validation.halfspace import HalfSpace, Hertz, round_punch, square_punch
 from skin.body.sheet import Sheet
-from skin.contact._grain import with_grain
-from skin.contact._unilateral import solve as press
+from skin.contact._checkerboard import stabilise_checkerboard
+from skin.contact._unilateral import solve_contact as press
 from skin.simulator._hexahedra import Hexahedra
 
 _YOUNG, _RATIO, _HALF = 170e3, 0.45, 0.01
@@ -22,24 +22,24 @@ _MIRRORED = {"left": (0,), "near": (1,), "base": ALL}
 _OPPOSED = {"left": (1, 2), "near": (1,), "base": ALL}
 
 
-def boussinesq(quick: bool) -> Outcome:
+def boussinesq(quick: bool) -> CheckResult:
     """Pressure on a square of a thick block moves and stresses it as Boussinesq says."""
-    return _forces(quick, 2, "pressed", ("down", 2), _MIRRORED)
+    return _forces(quick, 2, "under_pressure", ("down", 2), _MIRRORED)
 
 
-def cerruti(quick: bool) -> Outcome:
+def cerruti(quick: bool) -> CheckResult:
     """Traction along x on a square of a thick block moves and stresses it as Cerruti says."""
-    return _forces(quick, 0, "dragged", ("along x", 0), _OPPOSED)
+    return _forces(quick, 0, "under_shear", ("along x", 0), _OPPOSED)
 
 
-def _forces(quick: bool, axis: int, kind: str, main: tuple[str, int], faces: dict) -> Outcome:
+def _forces(quick: bool, axis: int, kind: str, main: tuple[str, int], faces: dict) -> CheckResult:
     """Compare all motions, and the stresses on planes along the surface, below and beside the square."""
     count = 4 if quick else 6
     line = graded(_HALF / count, count + count // 2, 60 * _HALF, 1.6)
     mesh, middles = block((line, line, line), _YOUNG, _RATIO), row_means(line)
     on = middles < _HALF
     load = mesh.loads(axis) @ np.outer(on, on).ravel().astype(float)
-    moved = solve(mesh, held(mesh, faces), load[:, None])[:, 0]
+    moved = solve_block(mesh, held(mesh, faces), load[:, None])[:, 0]
     near = middles[middles < 1.6 * _HALF]
     deep = near[near > 0.4 * _HALF]
     places = np.stack(np.meshgrid(near, near, deep), axis=-1).reshape(-1, 3)
@@ -48,24 +48,26 @@ def _forces(quick: bool, axis: int, kind: str, main: tuple[str, int], faces: dic
     ours, tension = _motion(mesh, places, moved), _stress(mesh, places, moved)
     origin = _motion(mesh, np.zeros((1, 3)), moved)[0, main[1]]
     findings = [
-        compared(f"middle of the square moves {main[0]}, m/Pa", origin, space.middle()[main[1] == 0], 0.05),
+        relative_finding(
+            f"middle of the square moves {main[0]}, m/Pa", origin, space.middle()[main[1] == 0], 0.05
+        ),
         _worst(f"motion along x, y and down, {len(places)} places", ours, motion),
         _worst(f"sigma_zz, sigma_xz and sigma_yz, {len(places)} places", tension, stress),
     ]
-    return Outcome(findings, (), (_profile(mesh, moved, kind, middles, count),))
+    return CheckResult(findings, (), (_profile(mesh, moved, kind, middles, count),))
 
 
-def _profile(mesh: Hexahedra, moved: np.ndarray, kind: str, middles: np.ndarray, count: int) -> Picture:
+def _profile(mesh: Hexahedra, moved: np.ndarray, kind: str, middles: np.ndarray, count: int) -> Plot:
     """Draw a stress below the square's edge, along x."""
     depth = float(middles[count - 1])
     x = middles[middles < 4 * _HALF]
     fine = np.linspace(0, 4 * _HALF, 200)
-    part, name = (0, "sigma_zz") if kind == "pressed" else (1, "sigma_xz")
+    part, name = (0, "sigma_zz") if kind == "under_pressure" else (1, "sigma_xz")
     ours = _stress(mesh, np.column_stack([x, 0 * x + middles[0], 0 * x + depth]), moved)[:, part]
     space = HalfSpace(_YOUNG, _RATIO, _HALF)
     exact = getattr(space, kind)(np.column_stack([fine, 0 * fine + middles[0], 0 * fine + depth]))[1][:, part]
-    law = "Boussinesq" if kind == "pressed" else "Cerruti"
-    return Picture(
+    law = "Boussinesq" if kind == "under_pressure" else "Cerruti"
+    return Plot(
         law.lower(), f"{name} under a square of 20 mm, {1e3 * depth:.1f} mm deep", "x, mm",
         f"{name} per traction", [Curve(law, 1e3 * fine, exact), Curve("elements", 1e3 * x, ours, marks=True)],
     )  # fmt: skip
@@ -89,7 +91,7 @@ def _worst(case: str, ours: np.ndarray, exact: np.ndarray) -> Finding:
     return Finding(f"{case}, of the largest", float(ours[where]), float(exact[where]), float(error), 0.05)
 
 
-def hertz(quick: bool) -> Outcome:
+def hertz(quick: bool) -> CheckResult:
     """A rigid sphere finds the radius, the peak and the force of Hertz, the better the finer the mesh."""
     sphere = Hertz(0.05, _STAR)
     force = 4 / 3 * _STAR * _HALF**3 / 0.05  # for which Hertz' contact has the radius of _HALF
@@ -101,9 +103,9 @@ def hertz(quick: bool) -> Outcome:
         pressure, approach = ground.press(square / (2 * sphere.radius), force / 4)
         radius = float(np.sqrt(2.5 * (pressure @ square) / pressure.sum()))  # Hertz: <r^2> = 2 a^2 / 5
         findings = [
-            compared(f"contact radius, m, {count} cells long", radius, sphere.contact(force), 0.05),
-            compared("pressure in the middle, Pa", pressure[0], sphere.peak(force), 0.05),
-            compared("force at its approach, N", force, sphere.force(approach), 0.05),
+            relative_finding(f"contact radius, m, {count} cells long", radius, sphere.contact(force), 0.05),
+            relative_finding("pressure in the middle, Pa", pressure[0], sphere.peak(force), 0.05),
+            relative_finding("force at its approach, N", force, sphere.force(approach), 0.05),
         ]
         remarks.append(_refined(count, findings))
         near = square < (1.4 * _HALF) ** 2
@@ -113,10 +115,10 @@ def hertz(quick: bool) -> Outcome:
     exact = sphere.peak(force) * np.sqrt(np.clip(1 - r**2, 0, None))
     curves.append(Curve("Hertz", 1e3 * _HALF * r, exact / 1e3))
     title, x, y = "A rigid sphere on a thick block", "distance from the middle, mm", "pressure, kPa"
-    return Outcome(findings, remarks, (Picture("hertz", title, x, y, curves),))
+    return CheckResult(findings, remarks, (Plot("hertz", title, x, y, curves),))
 
 
-def flat_punch(quick: bool) -> Outcome:
+def flat_punch(quick: bool) -> CheckResult:
     """Flat rigid punches, round and square, carry the force that their approach asks for."""
     findings: list[Finding] = []
     remarks = []
@@ -128,12 +130,12 @@ def flat_punch(quick: bool) -> Outcome:
         radius = float(np.sqrt(4 * circle.sum() / np.pi)) * cell  # of the circle as large as its cells
         flat, round_ = (ground.press(np.where(under, 0.0, np.inf), 0.25)[1] for under in (square, circle))
         findings = [
-            compared(f"force at its approach, N, square, {2 * count} cells a side", 1,
+            relative_finding(f"force at its approach, N, square, {2 * count} cells a side", 1,
                      square_punch(_STAR, 2 * _HALF, flat), 0.05),
-            compared("force at its approach, N, round", 1, round_punch(_STAR, radius, round_), 0.05),
+            relative_finding("force at its approach, N, round", 1, round_punch(_STAR, radius, round_), 0.05),
         ]  # fmt: skip
         remarks.append(_refined(count, findings))
-    return Outcome(findings, remarks)
+    return CheckResult(findings, remarks)
 
 
 def _refined(count: int, findings: list[Finding]) -> str:
@@ -165,14 +167,14 @@ class _Ground:
         mesh = block((line, line, graded(fine, 2, 60 * _HALF, 1.4)), _YOUNG, _RATIO)
         inner = (np.arange(len(line) - 1)[:, None] * (len(line) - 1) + np.arange(cells))[:cells].ravel()
         loads = mesh.loads(2)[:, inner]
-        moved = solve(mesh, held(mesh, _MIRRORED), loads.toarray())
+        moved = solve_block(mesh, held(mesh, _MIRRORED), loads.toarray())
         surface = torch.from_numpy(loads.T @ moved / fine**2)
         layer: Any = {
             "material": {"name": "block", "young": _YOUNG, "poisson": _RATIO},
             "thickness": 60 * _HALF,
         }
         body = Sheet((cells * fine, cells * fine), (cells, cells), (layer,))
-        return with_grain((surface + surface.T) / 2, body)
+        return stabilise_checkerboard((surface + surface.T) / 2, body)
 
     def press(self, gap: np.ndarray, force: float) -> tuple[np.ndarray, float]:
         """Return the pressure (cells,), Pa, of an object on the quarter, and its approach, m."""

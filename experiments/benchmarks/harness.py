@@ -18,13 +18,13 @@ from skin.config import checked
 from skin.paths import CONF
 
 
-def configuration(*overrides: str) -> DictConfig:
+def training_config(*overrides: str) -> DictConfig:
     """Return the configuration of a training with overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return checked(compose("train", list(overrides)))
 
 
-def seconds(task: Callable[[], object], repeats: int) -> float:
+def median_seconds(task: Callable[[], object], repeats: int) -> float:
     """Return the median duration of a task, s, after one call that is not counted."""
     task()
     taken = []

@@ -7,12 +7,12 @@ import torch
 
 from skin.build import build_device
 from skin.errors import InputError
-from skin.evaluation.course import Course
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.sliding import bins, slide
+from skin.evaluation.sliding_windows import bins, evaluate_windows
+from skin.evaluation.stream_settings import StreamSettings
 from skin.labels import TOUCH, TOUCH_OR_NOT
 
-COURSE = Course(hours=0.05, gap=[20, 100], stride=3, windows=(20, 60))
+COURSE = StreamSettings(hours=0.05, gap=[20, 100], stride=3, windows=(20, 60))
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
 ONLY_ALARMS = replace(COURSE, windows=())
 
@@ -50,14 +50,14 @@ def streamed(device):
 @pytest.fixture(scope="module")
 def knew(streamed):
     """What is found of a learner of windows that knows the labels."""
-    return slide(Knows(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
+    return evaluate_windows(Knows(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
 
 
 @pytest.fixture(scope="module")
 def whole(device):
     """A learner of whole touches that knows the labels but takes no 60 frames, and what is found of it."""
     learner = Knows(TOUCH, refuses=60)
-    return learner, slide(learner, device, COURSE, POINT)
+    return learner, evaluate_windows(learner, device, COURSE, POINT)
 
 
 def test_who_knows_the_labels_is_right_about_everything(knew):
@@ -86,7 +86,7 @@ def test_every_test_window_with_touch_is_in_one_bin(streamed, knew):
 
 
 def test_gates_keep_false_alarms_from_one_who_always_cries(streamed):
-    found = slide(AlwaysDangerous(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
+    found = evaluate_windows(AlwaysDangerous(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
     none, threshold = found.alarms["none"], found.alarms["threshold"]
     assert none.false > 10
     assert threshold.false < none.false / 5
@@ -134,10 +134,10 @@ def test_bins_by_hand():
 
 def test_devices_without_streams_are_refused(made_up_device):
     with pytest.raises(InputError, match="device=simulated"):
-        slide(Knows(TOUCH), made_up_device, COURSE, POINT)
+        evaluate_windows(Knows(TOUCH), made_up_device, COURSE, POINT)
 
 
 @pytest.mark.parametrize("wrong", [{"hours": 0}, {"stride": 0}, {"gap": [5, 2]}, {"gap": [0, 2]}])
 def test_courses_that_lead_nowhere(wrong):
     with pytest.raises(InputError, match=r"measure\."):
-        Course(**wrong)
+        StreamSettings(**wrong)

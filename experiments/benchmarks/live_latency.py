@@ -1,7 +1,7 @@
 """Frame to verdict on one core; run in a process of its own.
 
-python experiments/benchmarks/live.py 1000               # the best row, untrained
-python experiments/benchmarks/live.py 1000 --run latest  # what a run has learnt
+python experiments/benchmarks/live_latency.py 1000               # the best row, untrained
+python experiments/benchmarks/live_latency.py 1000 --run latest  # what a run has learnt
 """
 
 import argparse
@@ -11,7 +11,7 @@ import time
 import numpy as np
 import torch
 
-from experiments.benchmarks.setting import configuration
+from experiments.benchmarks.harness import training_config
 from skin.build import build_data, build_device, build_learner
 from skin.device.base import AbstractSimulated
 from skin.hardware.live.engine import Detection, Engine
@@ -25,7 +25,7 @@ _WARM = 50  # verdicts that are not counted
 _TOUCH = 0.3  # N
 
 
-def measure(
+def measure_latency(
     frames: int = 1000, row: str = ROW, run: str | None = None, uri: str | None = None
 ) -> dict[str, float]:
     """Return the time from a frame at 100 Hz to the verdict on it, ms: median and the 99th percentile.
@@ -52,7 +52,7 @@ def measure(
 
 
 def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
-    config = configuration("simulator=naive", f"experiment={row}", "data.gestures=10")
+    config = training_config("simulator=naive", f"experiment={row}", "data.gestures=10")
     device, learner = build_device(config).simulated("the stream is simulated"), build_learner(config)
     assert isinstance(learner, Network)
     data = build_data(config, device)
@@ -69,7 +69,7 @@ def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
     from skin.tracking import Store
     from skin.trained import trained
 
-    config = configuration(*([f"tracking.uri={uri}"] if uri else []))
+    config = training_config(*([f"tracking.uri={uri}"] if uri else []))
     store = Store.open(config.tracking)
     found = find(store, run)
     known = stored(store, found)
@@ -81,7 +81,7 @@ def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame
     """Return frames at 100 Hz after those that fill the window, which the engine has then seen."""
     held = round(RATE / device.rate)
     ahead = held * device.window
-    whole = device.strip((ahead + count) // held + 1).whole.touches
+    whole = device.simulate_stream((ahead + count) // held + 1).whole.touches
     values = np.repeat(whole.readings[0].double().numpy(), held, axis=0)[: ahead + count]
     valid = np.ones(values.shape[1], dtype=bool)
     frames = [Frame(n, n / RATE, n / RATE, row, valid) for n, row in enumerate(values)]
@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--run", help="the beginning of the id of a finished run, or latest")
     parser.add_argument("--uri", help="of the store that holds it, as in sqlite:///mlflow.db")
     given = parser.parse_args()
-    print(json.dumps(measure(given.frames, run=given.run, uri=given.uri)))
+    print(json.dumps(measure_latency(given.frames, run=given.run, uri=given.uri)))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import fingerprint, plain
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation.operating_point import choose, gestures
+from skin.evaluation.operating_point import choose_operating_point, threshold_gestures
 from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
 from skin.recording import Touches, digest
@@ -125,7 +125,7 @@ def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: Abstra
     """Bring every member back and ask it about every column, of which it takes all sets or none."""
     settings = members[0][0].evaluation
     sets = {column: _drawn(drawn) for column, drawn in columns(device, settings).items()}
-    sets["alarm"] = [gestures(device, settings)]
+    sets["alarm"] = [threshold_gestures(device, settings)]
     answers: dict[str, list[Tensor]] = {}
     left_out: dict[str, str] = {}
     for config, run in members:
@@ -158,7 +158,7 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
         groups = ("representation", "model", "fusion", "learner", "optimizer", "trainer", "epochs")
         kept = {key: value for key, value in plain(config).items() if key not in groups}
         describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))
-        point = choose(known, device, config.evaluation)
+        point = choose_operating_point(known, device, config.evaluation)
         report = evaluate(known, device, config.evaluation, point)
         chances = asked.chances[digest(next(columns(device, config.evaluation)["same"]))]
         differ = disagreement(chances, device.task)

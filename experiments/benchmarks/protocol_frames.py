@@ -4,14 +4,14 @@ import struct
 from random import Random
 from typing import Literal
 
-Spoken = Literal["crc16", "xor", "none", "binary"]
-FORMATS: tuple[Spoken, ...] = ("crc16", "xor", "none", "binary")
+WireFormat = Literal["crc16", "xor", "none", "binary"]
+FORMATS: tuple[WireFormat, ...] = ("crc16", "xor", "none", "binary")
 """The checksum of lines, or binary frames."""
 
 _INSERTED = (b"\n", b"\0", b"\r\n", b"*", b"#", b",")
 
 
-def line(fields: list[bytes], separator: bytes, check: Spoken) -> bytes:
+def text_line(fields: list[bytes], separator: bytes, check: WireFormat) -> bytes:
     """Return a line without its end."""
     body = separator.join(fields)
     if check == "crc16":
@@ -24,12 +24,12 @@ def line(fields: list[bytes], separator: bytes, check: Spoken) -> bytes:
     return body + b"*%02X" % combined
 
 
-def binary(number: int, clock: int, values: list[float], kind: int) -> bytes:
+def binary_frame(number: int, clock: int, values: list[float], kind: int) -> bytes:
     """Return a binary frame of kind 1 (u16), 2 (i16) or 3 (f32), stuffed, with its delimiter."""
     return _stuffed(_sealed(_body(number, clock, values, kind)))
 
 
-def senseless(number: int, clock: int, values: list[float], kind: int, rng: Random) -> bytes:
+def invalid_frame(number: int, clock: int, values: list[float], kind: int, rng: Random) -> bytes:
     """Return a frame with a right CRC that is none: of no known kind, of another length, or with NaN."""
     body, trouble = bytearray(_body(number, clock, values, kind)), rng.randrange(5)
     if trouble == 0:
@@ -45,7 +45,7 @@ def senseless(number: int, clock: int, values: list[float], kind: int, rng: Rand
     return _stuffed(_sealed(bytes(body)))
 
 
-def damaged(piece: bytes, rng: Random) -> bytes:
+def damage(piece: bytes, rng: Random) -> bytes:
     """Return a piece that had up to five accidents of up to eight bytes."""
     data = bytearray(piece)
     for _ in range(rng.choice((1, 1, 2, 5))):

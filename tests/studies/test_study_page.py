@@ -8,9 +8,9 @@ from PIL import Image
 from rich.console import Console
 
 from experiments.studies.comparison import Paired
-from experiments.studies.outcomes import Outcome
-from experiments.studies.page import measured, publish, table
+from experiments.studies.outcomes import StatementResult
 from experiments.studies.study import Statement, Study, Variant
+from experiments.studies.study_page import comparison_text, publish_study, variants_table
 from experiments.studies.trials import Trial
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
@@ -49,7 +49,7 @@ STUDY = Study("edges", "edges", [0, 1], metrics=METRICS, statements=[SAID])
 
 
 def test_a_line_per_variant_with_mean_and_deviation():
-    head, first, second, third = table(FOUND, METRICS)
+    head, first, second, third = variants_table(FOUND, METRICS)
     # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt 2
     assert dict(zip(head, first, strict=True)) | {"big": "", "dynamic": "", "press": "", "dangerous": ""} == {
         "variant": "weight=exp",
@@ -74,7 +74,10 @@ def test_conditions_are_columns_of_the_first_metric():
         for name in ("none", "5 dead")
         for n in (0, 1)
     ]
-    assert table(found, METRICS) == [["variant", "none", "5 dead"], ["a", "85.0 ± 7.1", "85.0 ± 7.1"]]
+    assert variants_table(found, METRICS) == [
+        ["variant", "none", "5 dead"],
+        ["a", "85.0 ± 7.1", "85.0 ± 7.1"],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -94,12 +97,12 @@ def test_conditions_are_columns_of_the_first_metric():
 )
 def test_what_was_measured_has_its_unit(fields, compared, text):
     said = Statement(**vars(SAID) | fields)
-    assert measured(Outcome(said, compared, "undecided")) == text
+    assert comparison_text(StatementResult(said, compared, "undecided")) == text
 
 
 def test_files_and_terminal_say_the_same(tmp_path):
     console = Console(width=40, file=io.StringIO())
-    publish(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges", console)
+    publish_study(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges", console)
     page = (tmp_path / "study_edges.md").read_text()
     assert page.splitlines()[0] == "# edges, little [data]"
     assert "| 3.2.2 | one [sic] beats the other | +20.0 points | undecided |" in page

@@ -6,13 +6,15 @@ import re
 
 import pytest
 
-from experiments.validation.finding import Curve, Finding, Law, Outcome, Picture, compared
-from experiments.validation.index import LAWS, chosen
-from experiments.validation.page import as_json, page, publish
+from experiments.validation.finding import CheckResult, Curve, Finding, Law, Plot, relative_finding
+from experiments.validation.laws import LAWS, select_laws
+from experiments.validation.physics_page import as_json, page, publish_physics
 from skin.errors import InputError
 from skin.paths import ROOT
 
-MISS = Outcome([compared("this", 1.2, 1.0, 0.1), compared("that", 1.0, 1.0, 0.1)], ["a remark"])
+MISS = CheckResult(
+    [relative_finding("this", 1.2, 1.0, 0.1), relative_finding("that", 1.0, 1.0, 0.1)], ["a remark"]
+)
 LAW = Law("gravity", "Things fall.", "an apple", lambda quick: MISS)
 
 
@@ -24,15 +26,15 @@ def test_an_error_passes_up_to_its_tolerance(error, ok):
 
 
 def test_errors_are_relative():
-    assert compared("case", 2.2, 2.0, 1).error == pytest.approx(0.1)
-    assert compared("case", -2.2, -2.0, 1).error == pytest.approx(0.1)
-    assert compared("case", 0.3, 0.0, 1).error == pytest.approx(0.3)
+    assert relative_finding("case", 2.2, 2.0, 1).error == pytest.approx(0.1)
+    assert relative_finding("case", -2.2, -2.0, 1).error == pytest.approx(0.1)
+    assert relative_finding("case", 0.3, 0.0, 1).error == pytest.approx(0.3)
 
 
 def test_a_miss_is_written_as_one(tmp_path):
-    picture = Picture("apple", "An apple", "time, s", "height, m", [Curve("ours", [1, 2], [4, 1])])
-    outcome = Outcome(MISS.findings, MISS.remarks, [picture])
-    publish(tmp_path, tmp_path / "physics.json", [(LAW, outcome)])
+    picture = Plot("apple", "An apple", "time, s", "height, m", [Curve("ours", [1, 2], [4, 1])])
+    outcome = CheckResult(MISS.findings, MISS.remarks, [picture])
+    publish_physics(tmp_path, tmp_path / "physics.json", [(LAW, outcome)])
     text = (tmp_path / "physics.md").read_text()
     assert "| [gravity](#gravity) | an apple | 2 | 0.2 | 1e-01 | **fails** |" in text
     assert "| this | 1.2 | 1 | 0.2 | 1e-01 | **missed** |" in text
@@ -45,19 +47,19 @@ def test_a_miss_is_written_as_one(tmp_path):
         "law": "gravity", "case": "this", "ours": 1.2, "reference": 1.0,
         "error": pytest.approx(0.2), "tolerance": 0.1, "ok": False,
     }  # fmt: skip
-    assert "nan" in page([(LAW, Outcome([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
-    assert "NaN" not in as_json([(LAW, Outcome([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
+    assert "nan" in page([(LAW, CheckResult([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
+    assert "NaN" not in as_json([(LAW, CheckResult([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
 
 
 def test_the_page_is_the_same_where_rounding_differs():
     """Noise of double and of single precision, of either sign, and other laws worst by it."""
 
     def written(noise: float) -> str:
-        exact = compared("exact", 2.23588314 * (1 + 1e-13 * noise), 2.23588314, 1e-8)
-        single = compared("single", 66867.31 * (1 + 1e-7 * noise), 66867.31, 1e-6)
-        nothing = compared("nothing", 1e-14 * noise, 0.0, 1e-10)
-        real = compared("real", 0.98361523 * (1 + 1e-9 * noise), 0.98768812, 0.05)
-        return page([(LAW, Outcome(found)) for found in ([exact, nothing], [exact, single], [real])])
+        exact = relative_finding("exact", 2.23588314 * (1 + 1e-13 * noise), 2.23588314, 1e-8)
+        single = relative_finding("single", 66867.31 * (1 + 1e-7 * noise), 66867.31, 1e-6)
+        nothing = relative_finding("nothing", 1e-14 * noise, 0.0, 1e-10)
+        real = relative_finding("real", 0.98361523 * (1 + 1e-9 * noise), 0.98768812, 0.05)
+        return page([(LAW, CheckResult(found)) for found in ([exact, nothing], [exact, single], [real])])
 
     text = written(0.0)
     assert all(written(noise) == text for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))
@@ -67,12 +69,12 @@ def test_the_page_is_the_same_where_rounding_differs():
 
 
 def test_laws_are_chosen_by_name():
-    assert chosen("all") == list(LAWS)
-    assert [law.name for law in chosen(["punch", "hertz"])] == ["punch", "hertz"]
+    assert select_laws("all") == list(LAWS)
+    assert [law.name for law in select_laws(["punch", "hertz"])] == ["punch", "hertz"]
     assert len({law.name for law in LAWS}) == len(LAWS)
     for wrong in (["gravity"], []):
         with pytest.raises(InputError, match="hertz"):
-            chosen(wrong)
+            select_laws(wrong)
 
 
 def test_the_page_in_the_docs_knows_every_law_and_its_pictures():

@@ -11,7 +11,7 @@ from skin.settings import RISING, checked
 
 @checked("measure")
 @dataclass(frozen=True)
-class Course:
+class StreamSettings:
     """The stream on which alarms are counted, and what else is tried.
 
     Attributes:

@@ -6,14 +6,14 @@ import pytest
 import torch
 from PIL import Image
 
-from experiments.studies.sliding import line, page
-from experiments.studies.tables import publish
+from experiments.studies.streams_page import build_streams_page, streams_summary
+from experiments.studies.tables import publish_page
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.sliding import Bin, Sliding
+from skin.evaluation.sliding_windows import Bin, WindowReport
 
 NAMES = ("big", "dynamic", "press", "dangerous")
-FOUND = Sliding(
+FOUND = WindowReport(
     bins=[
         Bin("0-0.2", 40, dict.fromkeys(NAMES, 0.5), dict.fromkeys(NAMES, 0.625)),
         Bin("whole", 160, dict.fromkeys(NAMES, 0.9), dict.fromkeys(NAMES, 0.5)),
@@ -29,7 +29,7 @@ FOUND = Sliding(
 
 
 def test_the_line_says_what_matters():
-    assert line(FOUND) == (
+    assert streams_summary(FOUND) == (
         "accuracy 50.0 % at share 0-0.2, 90.0 % whole; touch by threshold 90.0 %; false alarms per hour "
         "6.0 (none), 0.0 (threshold) in 0.50 h without touch; window 20: 81.2, 60: cannot (made for 30)"
     )
@@ -37,8 +37,10 @@ def test_the_line_says_what_matters():
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    return publish(
-        page(FOUND, "rules fem 0"), "rules fem 0", tmp_path_factory.mktemp("results") / "stream_rules"
+    return publish_page(
+        build_streams_page(FOUND, "rules fem 0"),
+        "rules fem 0",
+        tmp_path_factory.mktemp("results") / "stream_rules",
     )
 
 

@@ -8,7 +8,7 @@ from annotated_types import Ge, MinLen
 
 
 @dataclass(frozen=True)
-class Probing:
+class ProbeSettings:
     """What is probed; ``conf/study/embeddings.yaml`` explains the fields."""
 
     attributes: Annotated[Sequence[Literal["degree", "reading"]], MinLen(1)] = ("degree", "reading")

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from experiments.studies import tables
-from experiments.studies.runs import finished
+from experiments.studies.runs import newest_finished
 from experiments.studies.tables import percent
 from skin.tracking import Store
 
@@ -67,7 +67,7 @@ def collect(store: Store, jobs: Iterable[tuple[str, str, DictConfig]]) -> list[C
     """Return the cells of jobs (row, simulator, configuration), by the fingerprint of each."""
     groups: dict[tuple[str, str], list[Run | None]] = {}
     for row, simulator, config in jobs:
-        groups.setdefault((row, simulator), []).append(finished(store, config))
+        groups.setdefault((row, simulator), []).append(newest_finished(store, config))
     return [
         Cell(*key, tuple(run for run in runs if run is not None), runs.count(None))
         for key, runs in groups.items()
@@ -83,7 +83,7 @@ def report_values(path: Path) -> dict[tuple[str, str, str], float]:
         }
 
 
-def rows(
+def result_rows(
     cells: Sequence[Cell], report: dict[tuple[str, str, str], float], budget: str = "full"
 ) -> list[dict[str, str]]:
     """Return one line per row, simulator and label, with the columns of ``COLUMNS``.
@@ -112,7 +112,7 @@ def rows(
     return lines
 
 
-def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
+def display_rows(lines: Sequence[dict[str, str]]) -> list[list[str]]:
     """Return the table for a person, its head first: one line per row and simulator, accuracies in per cent.
 
     Where the report has a number, it stands behind ours.
@@ -134,9 +134,9 @@ def grid(lines: Sequence[dict[str, str]]) -> list[list[str]]:
     return table
 
 
-def as_csv(lines: Sequence[dict[str, str]]) -> str:
+def results_csv(lines: Sequence[dict[str, str]]) -> str:
     """Return the lines as CSV with a header."""
-    return tables.as_csv([COLUMNS, *([line[name] for name in COLUMNS] for line in lines)])
+    return tables.csv_text([COLUMNS, *([line[name] for name in COLUMNS] for line in lines)])
 
 
 def _metric(column: str, label: str) -> str:
@@ -157,11 +157,11 @@ def beside(line: dict[str, str]) -> str:
     return (percent(line["ours"], line["ours_sd"]) or "-") + (f" ({reported})" if reported else "")
 
 
-def show(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:
+def print_results(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:
     """Print the results table, narrow enough for 80 columns with one seed; the report's overall in brackets.
 
     Args:
-        lines: as :func:`rows` gives them.
+        lines: as :func:`result_rows` gives them.
         title: of the table.
         console: where to print; None takes standard output.
     """
@@ -175,4 +175,4 @@ def show(lines: Sequence[dict[str, str]], title: str, console: Console | None = 
             + [percent(group[label]["ours"]) for label in LABELS[1:]]
             + [percent(whole["device_shift"]), percent(whole["unseen_layout"])]
         )
-    tables.show(table, title, console)
+    tables.print_table(table, title, console)

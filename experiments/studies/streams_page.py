@@ -7,18 +7,18 @@ from torch import Tensor
 
 from experiments.studies.tables import Page
 from skin.evaluation.alarm import Alarms
-from skin.evaluation.sliding import Sliding
+from skin.evaluation.sliding_windows import WindowReport
 from skin.plot.figures import COLOURS
 
 
-def page(found: Sliding, title: str) -> Page:
+def build_streams_page(found: WindowReport, title: str) -> Page:
     """Return the tables, the CSV and the figure, under a title."""
     learnt = "windows of streams" if found.streamed else "whole touches"
     about = f"Trained on {learnt}, tried on windows of streams; {found.point.sentence()}."
-    return Page(f"{line(found)}\n\n{about}", _tables(found), _csv(found), _figure(found, title))
+    return Page(f"{streams_summary(found)}\n\n{about}", _tables(found), _csv(found), _figure(found, title))
 
 
-def line(found: Sliding) -> str:
+def streams_summary(found: WindowReport) -> str:
     """Return what matters most, in one line."""
     parts = []
     if found.bins:
@@ -33,7 +33,7 @@ def line(found: Sliding) -> str:
     return "; ".join([*parts, "window " + ", ".join(windows)])
 
 
-def _tables(found: Sliding) -> dict[str, list[list[str]]]:
+def _tables(found: WindowReport) -> dict[str, list[list[str]]]:
     """Return heading -> table, its head first."""
     names = list(found.bins[0].accuracy) if found.bins else []
     shares = [
@@ -73,7 +73,7 @@ def _tables(found: Sliding) -> dict[str, list[list[str]]]:
     }
 
 
-def _csv(found: Sliding) -> list[Sequence[object]]:
+def _csv(found: WindowReport) -> list[Sequence[object]]:
     """Return every figure as ``measure,name,at,value``."""
     table: list[Sequence[object]] = [["measure", "name", "at", "value"]]
     for one in found.bins:
@@ -91,7 +91,7 @@ def _csv(found: Sliding) -> list[Sequence[object]]:
     return table
 
 
-def _figure(found: Sliding, title: str) -> Figure:
+def _figure(found: WindowReport, title: str) -> Figure:
     """Draw accuracy against the share that is seen, and alarms by gate."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))

@@ -7,7 +7,16 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from experiments.studies.table import COLUMNS, LABELS, Cell, as_csv, grid, report_values, rows, show
+from experiments.studies.results_table import (
+    COLUMNS,
+    LABELS,
+    Cell,
+    display_rows,
+    print_results,
+    report_values,
+    result_rows,
+    results_csv,
+)
 from experiments.studies.tables import markdown
 from skin.files import write
 from skin.paths import CONF, ROOT
@@ -36,7 +45,7 @@ def lines():
         Cell("temporal_graph", "fem", (run(0.8, 0.7), run(0.9, 0.5)), 0),
         Cell("linked_graph", "naive", (), 2),
     ]
-    return {(line["row"], line["label"]): line for line in rows(cells, REPORT)}
+    return {(line["row"], line["label"]): line for line in result_rows(cells, REPORT)}
 
 
 def test_ours_is_mean_and_deviation_over_seeds(lines):
@@ -46,7 +55,7 @@ def test_ours_is_mean_and_deviation_over_seeds(lines):
 
 
 def test_one_seed_has_no_deviation():
-    (line, *_) = rows([Cell("rules", "fem", (run(0.8),), 0)], {})
+    (line, *_) = result_rows([Cell("rules", "fem", (run(0.8),), 0)], {})
     assert (line["ours"], line["ours_sd"], line["report"]) == ("0.8000", "", "")
 
 
@@ -57,26 +66,26 @@ def test_the_reports_number_stands_where_it_has_one(lines):
 
 def test_a_row_without_a_finished_run_shows_as_failed(lines):
     assert {lines["linked_graph", label]["ours"] for label in LABELS} == {"failed"}
-    assert "failed" in markdown(grid(list(lines.values())), "x").splitlines()[-1]
+    assert "failed" in markdown(display_rows(list(lines.values())), "x").splitlines()[-1]
 
 
 def test_a_row_that_misses_a_seed_says_so():
-    lines = rows([Cell("rules", "fem", (run(0.8), run(0.9)), 1)], {})
+    lines = result_rows([Cell("rules", "fem", (run(0.8), run(0.9)), 1)], {})
     assert {line["failed"] for line in lines} == {"1"}
-    assert grid(lines)[1][0] == "rules (1 failed)"
+    assert display_rows(lines)[1][0] == "rules (1 failed)"
 
 
 def test_a_row_that_takes_no_other_layout_says_so():
     fixed = run(0.8, 0.7)
     fixed.data.tags["cannot_unseen_layout"] = "readings are of 25 sensors in this order"
-    (line, *_) = rows([Cell("mlp", "fem", (fixed,), 0)], {})
+    (line, *_) = result_rows([Cell("mlp", "fem", (fixed,), 0)], {})
     assert (line["device_shift"], line["unseen_layout"]) == ("0.7000", "cannot")
 
 
 def test_the_alarm_has_its_recall_and_its_false_alarms_side_by_side(lines):
     assert lines["temporal_graph", "dangerous_recall"]["ours"] == "0.5000"
     assert lines["temporal_graph", "false_alarms"]["ours"] == "0.0210"
-    head, first, _ = grid(list(lines.values()))
+    head, first, _ = display_rows(list(lines.values()))
     place = head.index("recall")
     assert head[place + 1] == "false alarms"
     assert first[place : place + 2] == ["50.0 ± 0.0", "2.1 ± 0.0"]
@@ -88,7 +97,7 @@ def test_other_devices_have_their_own_recall_and_false_alarms():
         "device_shift/dangerous/alarm_recall": 0.4,
         "device_shift/dangerous/false_alarm_rate": 0.048,
     }
-    head, first = grid(rows([Cell("features", "fem", (one,), 0)], {}))
+    head, first = display_rows(result_rows([Cell("features", "fem", (one,), 0)], {}))
     place = head.index("device shift")
     assert head[place : place + 3] == ["device shift", "its recall", "its false alarms"]
     assert first[place : place + 3] == ["70.0", "40.0", "4.8"]
@@ -98,19 +107,19 @@ def test_what_is_undefined_is_no_number():
     """A run without dangerous test gestures has no recall; it did not fail either."""
     one = run(0.8)
     del one.data.metrics["same/dangerous/alarm_recall"]
-    lines = rows([Cell("features", "fem", (one,), 0)], {})
+    lines = result_rows([Cell("features", "fem", (one,), 0)], {})
     assert next(line["ours"] for line in lines if line["label"] == "dangerous_recall") == ""
-    head, first = grid(lines)
+    head, first = display_rows(lines)
     assert first[head.index("recall")] == "-"
 
 
 def test_a_person_reads_ours_with_the_reports_in_brackets(lines):
-    head, first, _ = grid(list(lines.values()))
+    head, first, _ = display_rows(list(lines.values()))
     assert dict(zip(head, first, strict=True))["overall"] == "85.0 ± 7.1 (73.2)"
 
 
 def test_csv_has_the_columns_and_reads_back(lines):
-    read = list(csv.DictReader(io.StringIO(as_csv(list(lines.values())))))
+    read = list(csv.DictReader(io.StringIO(results_csv(list(lines.values())))))
     assert tuple(read[0]) == COLUMNS
     assert read == list(lines.values())
 
@@ -138,14 +147,14 @@ def test_the_reports_overall_is_the_mean_of_its_labels(row):
 
 def test_a_table_tells_its_budget():
     cell = Cell("rules", "fem", (run(0.8),), 0)
-    assert {line["budget"] for line in rows([cell], {}, "smoke")} == {"smoke"}
+    assert {line["budget"] for line in result_rows([cell], {}, "smoke")} == {"smoke"}
 
 
 def test_no_number_is_cut_on_a_narrow_terminal():
     line = dict.fromkeys(COLUMNS, "0.1234") | {"row": "temporal_graph", "simulator": "naive", "failed": "0"}
     lines = [line | {"label": label, "ours_sd": "0.0123", "report": "0.85"} for label in LABELS]
     seen = io.StringIO()
-    show(lines, "title", Console(file=seen, width=40))
+    print_results(lines, "title", Console(file=seen, width=40))
     text = seen.getvalue()
     assert "…" not in text
     assert "12.3 ± 1.2 (85.0)" in text
@@ -153,5 +162,5 @@ def test_no_number_is_cut_on_a_narrow_terminal():
     # A temporal_graph of one seed, with the report's number, fits 80 columns.
     line |= {"ours_sd": ""}
     seen = io.StringIO()
-    show([line | {"label": label} for label in LABELS], "title", Console(file=seen, width=40))
+    print_results([line | {"label": label} for label in LABELS], "title", Console(file=seen, width=40))
     assert max(map(len, seen.getvalue().splitlines())) <= 80

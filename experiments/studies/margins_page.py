@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.studies.tables import Page
-from skin.evaluation.margins import ALARM, Faint, Margins, Span
+from skin.evaluation.margins import ALARM, Faint, MarginReport, Span
 from skin.labels import OPPOSITE, TOUCH
 from skin.plot.figures import COLOURS
 
@@ -22,12 +22,12 @@ _NEAR = (0.9, 1.1)  # times its threshold
 _FAINT = 1.0  # N
 
 
-def page(found: Margins, title: str) -> Page:
+def build_margins_page(found: MarginReport, title: str) -> Page:
     """Return the tables, the CSV and the figure, under a title."""
-    return Page(line(found), _tables(found), _csv(found), _figure(found, title))
+    return Page(margins_summary(found), _tables(found), _csv(found), _figure(found, title))
 
 
-def line(found: Margins) -> str:
+def margins_summary(found: MarginReport) -> str:
     """Return what matters most, in one line: how many errors are near a threshold or of faint touches."""
     wrong = {name: sum(one.wrong for one in found.spans[name]) for name in TOUCH.names}
     near = {
@@ -45,7 +45,7 @@ def line(found: Margins) -> str:
     )
 
 
-def _tables(found: Margins) -> dict[str, list[list[str]]]:
+def _tables(found: MarginReport) -> dict[str, list[list[str]]]:
     """Return heading -> table, its head first."""
     tables = {
         _heading(name, found): [
@@ -64,7 +64,7 @@ def _tables(found: Margins) -> dict[str, list[list[str]]]:
     return tables
 
 
-def _heading(name: str, found: Margins) -> str:
+def _heading(name: str, found: MarginReport) -> str:
     if name == ALARM:
         return f"Alarm above {found.point.threshold:.4f}"
     return f"{name.capitalize()} or {OPPOSITE[name]}"
@@ -84,7 +84,7 @@ def _span(one: Span | Faint) -> str:
     return f"above {one.low:g}" if math.isinf(one.high) else f"{one.low:g} to {one.high:g}"
 
 
-def _csv(found: Margins) -> list[Sequence[object]]:
+def _csv(found: MarginReport) -> list[Sequence[object]]:
     """Return every figure as ``label,by,low,high,touches,said,wrong``."""
     head: list[object] = ["label", "by", "low", "high", "touches", "said", "wrong"]
     spans = [
@@ -100,7 +100,7 @@ def _csv(found: Margins) -> list[Sequence[object]]:
     return [head, *spans, *faint]
 
 
-def _figure(found: Margins, title: str) -> Figure:
+def _figure(found: MarginReport, title: str) -> Figure:
     """Draw what is said against measure over threshold, and errors against the highest reading."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))

@@ -9,25 +9,27 @@ from skin.touch.gesture import Draws, GestureSettings, fold
 from skin.touch.problem import Trajectories
 
 
-class Course(NamedTuple):
-    """Trajectories and the way that they take.
+class SampledPaths(NamedTuple):
+    """Trajectories and the place that they take.
 
     Attributes:
         trajectories: the frames (U,) of gestures (B,).
-        way: (U, 2), where each frame is within its room, m.
+        place: (U, 2), where each frame is within its room, m.
         first: (B,), the first frame of each gesture.
         net: (B, 2), from its first place to its last, m.
         travel: (B,), how far it gets from its first place, m.
     """
 
     trajectories: Trajectories
-    way: np.ndarray
+    place: np.ndarray
     first: np.ndarray
     net: np.ndarray
     travel: np.ndarray
 
 
-def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, proportional: bool) -> Course:
+def sample_paths(
+    gestures: Draws, wanted: np.ndarray, settings: GestureSettings, proportional: bool
+) -> SampledPaths:
     """Return the distinct frames of gestures.
 
     A sliding touch has one per step. One that stands still has a single one, or, where pressure is not
@@ -45,15 +47,15 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
     level = np.clip(np.minimum(time + 1, duration[:, None] - time), 0, rise)
     scale = level / rise
 
-    highest = level.max(axis=1)
-    counts = np.where(sliding, duration, 1 if proportional else highest)
+    peak_level = level.max(axis=1)
+    counts = np.where(sliding, duration, 1 if proportional else peak_level)
     first = np.cumsum(counts) - counts
     shown = np.where(sliding[:, None], time, level - 1)
     index = first[:, None] + np.clip(shown, 0, counts[:, None] - 1)
     owner = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(owner)) - first[owner]
     velocity = gestures["speed"] * np.stack([np.cos(gestures["direction"]), np.sin(gestures["direction"])])
-    way = fold(gestures["start"][owner] + step[:, None] * velocity.T[owner], gestures["room"][owner])
+    place = fold(gestures["start"][owner] + step[:, None] * velocity.T[owner], gestures["span"][owner])
 
     share = np.zeros(len(owner))
     np.maximum.at(share, index, scale)
@@ -62,7 +64,7 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
         gestures["shape"][owner],
         gestures["angle"][owner],
         gestures["scale"][owner],
-        way - gestures["low"][owner],
+        place - gestures["low"][owner],
         share,
         torch.from_numpy(index),
         torch.from_numpy(scale).float(),
@@ -70,7 +72,7 @@ def course(gestures: Draws, wanted: np.ndarray, settings: GestureSettings, propo
         wanted,
         gestures["stretch"][owner],
     )
-    from_first = way - way[first[owner]]
+    from_first = place - place[first[owner]]
     travel = np.zeros(len(first))
     np.maximum.at(travel, owner, np.hypot(*from_first.T))
-    return Course(trajectories, way, first, from_first[first + counts - 1], travel)
+    return SampledPaths(trajectories, place, first, from_first[first + counts - 1], travel)

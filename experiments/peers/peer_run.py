@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.peers.exchange import ABOUT, Foreign, export
+from experiments.peers.exchange import ABOUT, PeerPredictions, export_touches
 from skin.balance import announce
 from skin.build import build_device
 from skin.config import fingerprint, plain
-from skin.evaluation.operating_point import choose
+from skin.evaluation.operating_point import choose_operating_point
 from skin.evaluation.report import evaluate
 from skin.run import conclude, describe, tags
 from skin.tracking import Store
@@ -44,13 +44,13 @@ def learn(
             store, run.info.run_id, OmegaConf.create({"row": config.row, **source}), device.touches("train")
         )
         say("writing touches")
-        export(device, config.evaluation, where)
+        export_touches(device, config.evaluation, where)
         if not (config.tracking.resume and (where / config.row / ABOUT).is_file()):
             jobs = ["--seed", str(config.seed), "--jobs", str(torch.get_num_threads())]
             _follow([*command, config.row, str(where), *jobs], say)
         say("evaluating")
-        peer = Foreign(where, config.row, device.task)
-        point = choose(peer, device, config.evaluation)
+        peer = PeerPredictions(where, config.row, device.task)
+        point = choose_operating_point(peer, device, config.evaluation)
         report = evaluate(peer, device, config.evaluation, point)
         values = {"seconds_per_epoch": peer.about["seconds"], "parameters": peer.about["parameters"]}
         conclude(store, run, report, device.task, values)

@@ -5,9 +5,9 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from experiments.studies import ensemble
-from experiments.studies.ensemble import average, combine, disagreement, vote
-from experiments.studies.runs import finished
+from experiments.studies import row_ensembles
+from experiments.studies.row_ensembles import average, combine, disagreement, vote
+from experiments.studies.runs import newest_finished
 from skin.config import checked, fingerprint
 from skin.console import quiet
 from skin.errors import InputError
@@ -67,13 +67,13 @@ def trained(configured, tmp_path_factory):
     for config in members:
         train(config)
     store = Store.open(members[0].tracking)
-    return compose, store, {config.row: (config, finished(store, config)) for config in members}
+    return compose, store, {config.row: (config, newest_finished(store, config)) for config in members}
 
 
 @pytest.fixture(scope="module")
 def combined(trained):
     compose, store, members = trained
-    ways = {way: compose(f"row={way}") for way in ensemble.WAYS}
+    ways = {way: compose(f"row={way}") for way in row_ensembles.WAYS}
     return ways, combine(store, members, ways), store.find("FINISHED")
 
 
@@ -123,7 +123,7 @@ def test_every_column_is_tried_and_nothing_twice(trained, combined):
 @pytest.mark.slow
 def test_who_takes_no_other_layout_is_left_out_of_that_column_only(trained, monkeypatch):
     compose, store, members = trained
-    build = ensemble.build_learner
+    build = row_ensembles.build_learner
 
     def homebound(config):
         """Refuse other layouts, which no learner of today does."""
@@ -140,7 +140,7 @@ def test_who_takes_no_other_layout_is_left_out_of_that_column_only(trained, monk
             learner.probabilities = probabilities
         return learner
 
-    monkeypatch.setattr(ensemble, "build_learner", homebound)
+    monkeypatch.setattr(row_ensembles, "build_learner", homebound)
     ways = {"ensemble_average": compose("row=homebound")}
     run = combine(store, members, ways)["ensemble_average"]
     assert run.data.tags["left_out_unseen_layout"] == "rules: only the layout it was trained on"

@@ -9,10 +9,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from experiments.validation.finding import Finding, Law, Outcome, Picture
+from experiments.validation.finding import CheckResult, Finding, Law, Plot
 from skin.files import whole, write
 
-Results = Sequence[tuple[Law, Outcome]]
+Results = Sequence[tuple[Law, CheckResult]]
 
 _HEAD = """# Physics, proved
 
@@ -48,7 +48,7 @@ _LIMITS = """
 """
 
 
-def publish(folder: Path, json_path: Path, results: Results) -> None:
+def publish_physics(folder: Path, json_path: Path, results: Results) -> None:
     """Write physics.md and its pictures into a folder, and the findings as JSON, each whole."""
     write(as_json(results), json_path)
     for _, outcome in results:
@@ -83,7 +83,7 @@ def page(results: Results) -> str:
     return _HEAD + "".join(map(_line, results)) + "".join(map(_section, results)) + _LIMITS
 
 
-def _line(result: tuple[Law, Outcome]) -> str:
+def _line(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
     worst = max(
         outcome.findings,
@@ -96,7 +96,7 @@ def _line(result: tuple[Law, Outcome]) -> str:
     )
 
 
-def _section(result: tuple[Law, Outcome]) -> str:
+def _section(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
     lines = [f"\n## {law.name}\n\n{law.statement}\n\n"]
     lines.append("| | ours | reference | error | tolerance | |\n|---|---|---|---|---|---|\n")
@@ -120,7 +120,7 @@ def _error(finding: Finding) -> str:
     return f"< {bound:.0e}" if finding.error < bound else f"{finding.error:.2g}"
 
 
-def draw(picture: Picture, path: Path) -> None:
+def draw(picture: Plot, path: Path) -> None:
     """Write a picture as a PNG."""
     figure = Figure(figsize=(5.6, 3.4), layout="constrained")
     axes = figure.add_subplot()

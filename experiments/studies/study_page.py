@@ -9,10 +9,18 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.studies.comparison import Paired
-from experiments.studies.outcomes import UNITS, Difference, Outcome, conclusions, differences, lines, values
+from experiments.studies.outcomes import (
+    UNITS,
+    Difference,
+    StatementResult,
+    conclusions,
+    differences,
+    group_trials,
+    values,
+)
 from experiments.studies.study import Study
-from experiments.studies.tables import Page, show
-from experiments.studies.tables import publish as write_page
+from experiments.studies.tables import Page, print_table
+from experiments.studies.tables import publish_page as write_page
 from experiments.studies.trials import Trial
 from skin.plot.figures import COLOURS
 
@@ -27,12 +35,12 @@ _HEADINGS = {
 }
 
 
-def table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
+def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
     """Return a line per variant: mean and deviation over its runs; shares in per cent.
 
     Where there are conditions, each is a column of the first metric.
     """
-    found = lines(trials)
+    found = group_trials(trials)
     variants = list(dict.fromkeys(variant for variant, _ in found))
     conditions = list(dict.fromkeys(condition for _, condition in found if condition))
     if conditions:
@@ -48,7 +56,7 @@ def table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
     return [head, *([*line, *[""] * (len(head) - len(line))] for line in body)]
 
 
-def compared(found: Sequence[Difference], metric: str) -> list[list[str]]:
+def differences_table(found: Sequence[Difference], metric: str) -> list[list[str]]:
     """Return a line per difference; none without."""
     head = ["variant", "condition", "difference", "n", "verdict"]
     unit = UNITS.get(metric, "points")
@@ -67,13 +75,15 @@ def compared(found: Sequence[Difference], metric: str) -> list[list[str]]:
     ]
 
 
-def statements(outcomes: Sequence[Outcome]) -> list[list[str]]:
+def statements_table(outcomes: Sequence[StatementResult]) -> list[list[str]]:
     """Return a line per statement."""
-    body = [[one.statement.section, one.statement.says, measured(one), one.verdict] for one in outcomes]
+    body = [
+        [one.statement.section, one.statement.says, comparison_text(one), one.verdict] for one in outcomes
+    ]
     return [["section", "statement", "measured", "verdict"], *body]
 
 
-def measured(outcome: Outcome) -> str:
+def comparison_text(outcome: StatementResult) -> str:
     """Return every comparison of a statement: the mean over paired seeds ± its standard error."""
     said, several = outcome.statement, len(outcome.compared) > 1
     unit = "times" if said.claim == "ratio" else UNITS.get(said.metric, "points")
@@ -81,7 +91,7 @@ def measured(outcome: Outcome) -> str:
     return "; ".join(text + f" ({name})" if several else text for name, text in figures.items())
 
 
-def publish(
+def publish_study(
     study: Study, title: str, trials: Sequence[Trial], path: Path, console: Console | None = None
 ) -> None:
     """Write ``path`` with the endings .md, .csv and .png, each whole, and print the tables.
@@ -96,21 +106,21 @@ def publish(
     console = console or Console()
     changed = differences(study, trials)
     tables = {
-        "Variants": table(trials, study.metrics),
-        f"Differences in {_heading(study.metrics[0])}": compared(changed, study.metrics[0]),
-        "Statements": statements(conclusions(study.statements, trials)),
+        "Variants": variants_table(trials, study.metrics),
+        f"Differences in {_heading(study.metrics[0])}": differences_table(changed, study.metrics[0]),
+        "Statements": statements_table(conclusions(study.statements, trials)),
     }
     told = {name: each for name, each in tables.items() if len(each) > 1}
-    drawn = figure(trials, study.metrics[0], study.about) if any(one.run for one in trials) else None
+    drawn = study_figure(trials, study.metrics[0], study.about) if any(one.run for one in trials) else None
     print(title)
     for name, each in told.items():
-        show(each, name, console, wrapped=("statement", "measured"))
+        print_table(each, name, console, wrapped=("statement", "measured"))
     print(*write_page(Page("", told, _csv(study, trials), drawn), title, path), sep="\n")
 
 
-def figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
+def study_figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
     """Draw a metric of each variant and condition: every trial, the mean, and two standard errors."""
-    found = {key: list(each) for key, each in lines(trials).items()}
+    found = {key: list(each) for key, each in group_trials(trials).items()}
     drawn = Figure(figsize=(7, 1.2 + 0.3 * len(found)), layout="constrained")
     axis = drawn.subplots()
     unit = UNITS.get(metric, "%")

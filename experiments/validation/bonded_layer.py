@@ -1,4 +1,4 @@
-"""Laws of layers bonded to a rigid base, against exact sums of waves."""
+"""Checks of layers bonded to a rigid base against exact Fourier sums."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ _RATIOS = (0.45, 0.49, 0.499, 0.4999)
 
 
 def thin_layer(quick: bool) -> CheckResult:
-    """A thin bonded layer moves under a wave of pressure as the closed form says."""
+    """Compare the compliance of a thin bonded layer under a pressure wave with the closed form."""
     slab = Slab(0.005, 170e3, 0.499)
     shares = np.array([2.0, 8.0]) if quick else np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
     found, exact = [], []
@@ -44,7 +44,7 @@ def thin_layer(quick: bool) -> CheckResult:
 
 
 def no_locking(quick: bool) -> CheckResult:
-    """The error stays where it is while nu goes to one half."""
+    """Check that the error does not grow when nu approaches one half."""
     findings, curves = [], []
     for rows in (4,) if quick else (4, 8):
         errors = []
@@ -65,14 +65,14 @@ def no_locking(quick: bool) -> CheckResult:
     picture = Plot("locking", "No locking: a bonded layer under a wave", "0.5 - nu", "relative error",
                       curves, log=True)  # fmt: skip
     remark = (
-        f"plain, fully integrated elements, 4 rows of them, are {100 * plain[-1]:.0f} % off at "
+        f"plain, fully integrated elements, 4 rows of them, have an error of {100 * plain[-1]:.0f} % at "
         f"nu = {_RATIOS[-1]}"
     )
     return CheckResult(findings, (remark,), (picture,))
 
 
 def convergence(quick: bool) -> CheckResult:
-    """Halving the elements divides the error of motion by four."""
+    """Check that halving the element size divides the displacement error by four."""
     counts = (4, 8, 16) if quick else (4, 8, 16, 32)
     findings, curves = [], []
     for ratio in (0.3, 0.499):
@@ -91,7 +91,7 @@ def convergence(quick: bool) -> CheckResult:
 
 
 def default_mesh(quick: bool) -> CheckResult:
-    """The default skin reads a pressed square as the exact layers do; its error falls with the mesh."""
+    """Compare readings of the default skin under a square load with the exact layers, on several meshes."""
     meshes = ((16, 3), (32, 2)) if quick else ((16, 3), (32, 1), (32, 3), (64, 3))
     exact = _exact(200 if quick else 320)
     remarks, found = [], {}

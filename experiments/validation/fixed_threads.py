@@ -1,4 +1,4 @@
-"""Compute with a given number of threads in one process: python -m validation.alone 2 16 out.npz"""
+"""Compute with a given number of threads: python -m experiments.validation.fixed_threads 2 16 out.npz."""
 
 import sys
 import tempfile
@@ -15,7 +15,7 @@ from skin.simulator.solid import Solid, hexahedra, reading_rows
 
 
 def main(threads: int, cells: int, path: str) -> None:
-    """Write an operator, readings of random frames and the pressure under a ball to x.npz."""
+    """Write an operator, readings of random frames and the pressure under a sphere to an .npz file."""
     torch.set_num_threads(threads)
     body = skin(cells)
     places = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))

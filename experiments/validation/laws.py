@@ -5,44 +5,49 @@ from experiments.validation.finding import Law
 from skin.errors import InputError
 
 LAWS = (
-    Law("patch", "A uniform strain on the surface of distorted elements is the same strain inside.",
+    Law("patch",
+        "A uniform strain prescribed on the surface of distorted elements gives the same strain inside.",
         "linear algebra", patch_and_equilibrium.patch_test),
-    Law("confined", "Between smooth walls an even pressure p shortens each layer by p h / (lambda + 2 G).",
+    Law("confined",
+        "Between smooth walls a uniform pressure p compresses each layer by p h / (lambda + 2 G).",
         "closed form", patch_and_equilibrium.confined_compression),
-    Law("even", "In the middle of a wide sheet an even pressure p is sigma_zz = -p at every depth.",
+    Law("even", "In the middle of a wide sheet a uniform pressure p gives sigma_zz = -p at every depth.",
         "equilibrium", patch_and_equilibrium.even_pressure),
-    Law("balance", "The table answers with the force and the moment applied, flat or on an arm.",
+    Law("balance",
+        "The reactions of the support balance the applied force and moment, on a sheet and on an arm.",
         "equilibrium", patch_and_equilibrium.global_balance),
-    Law("reciprocity", "Loads do the same work on each other's motion (Maxwell and Betti).",
+    Law("reciprocity", "Two loads do the same work on each other's displacements (Maxwell and Betti).",
         "symmetry", patch_and_equilibrium.reciprocity),
-    Law("convergence", "Halving the elements divides the error of motion by four.",
+    Law("convergence", "Halving the element size divides the displacement error by four.",
         "closed form of the bonded layer", bonded_layer.convergence),
-    Law("layer", "A thin, nearly incompressible bonded layer moves under waves of pressure, long or short.",
+    Law("layer",
+        "The compliance of a thin, nearly incompressible bonded layer is right at long and short wavelengths.",
         "closed form (Aleksandrov and Vorovich)", bonded_layer.thin_layer),
-    Law("locking", "The error stays the same while nu goes from 0.45 to 0.4999.",
+    Law("locking", "The error does not grow when nu rises from 0.45 to 0.4999.",
         "the same closed form", bonded_layer.no_locking),
-    Law("mesh", "The two layers of the default skin, pressed by a square, are felt on its default mesh.",
+    Law("mesh", "The default mesh gives the readings of the default skin under a square load.",
         "sums of exact waves of both layers", bonded_layer.default_mesh),
-    Law("boussinesq", "Pressure on a thick soft block: motion and stress below and beside it.",
+    Law("boussinesq", "Pressure on a thick soft block: displacement and stress below and beside the load.",
         "Boussinesq, integrated over the square", thick_block.boussinesq),
-    Law("cerruti", "Traction along the surface of a thick soft block: motion and stress.",
+    Law("cerruti", "Tangential traction on a thick soft block: displacement and stress.",
         "Cerruti, integrated over the square", thick_block.cerruti),
-    Law("hertz", "A rigid sphere on a thick block: radius, peak pressure and force.",
+    Law("hertz", "A rigid sphere on a thick block: contact radius, peak pressure and force.",
         "Hertz", thick_block.hertz),
-    Law("punch", "Flat rigid punches, square and round: the force at an approach.",
+    Law("punch", "Flat rigid punches, square and round: force for a given approach.",
         "capacitance of a square plate (Read, 1997); Johnson, section 3.4", thick_block.flat_punch),
-    Law("direct", "The operator answers single frames as a solve of each does.",
+    Law("direct", "The precomputed operator gives the same result as solving each frame.",
         "scikit-fem alone, in the mixed form", reference_programs.single_frames),
-    Law("arm", "A sleeve of large radius is a sheet.", "the sheet", patch_and_equilibrium.wide_arm),
-    Law("tube", "A sleeve on a rigid core under an even pressure is a bonded tube of two layers.",
+    Law("arm", "A sleeve of large radius behaves like a sheet.", "the sheet", patch_and_equilibrium.wide_arm),
+    Law("tube", "A sleeve on a rigid core under uniform pressure behaves like a bonded tube of two layers.",
         "Lame's equations", patch_and_equilibrium.sleeve),
-    Law("pynite", "simulator=fem moves every node as PyNite does.",
+    Law("pynite", "simulator=fem gives the same nodal displacements as PyNite.",
         "PyNite", reference_programs.plates_and_beams),
-    Law("equation10", "simulator=fem reads D_s / D_t times the force on the footprint, in proportion to it.",
+    Law("equation10",
+        "The reading of simulator=fem is D_s / D_t times the force on the footprint, and proportional to it.",
         "PyNite and the report's equation 10", reference_programs.equation_ten),
-    Law("naive", "simulator=naive reads one cell's pressure times the footprint.",
+    Law("naive", "The reading of simulator=naive is the pressure of one cell times the footprint area.",
         "the report", reference_programs.naive),
-    Law("creep", "A skin that relaxes sinks in under a load that stays.",
+    Law("creep", "A viscoelastic skin creeps under a constant load.",
         "creep of the standard linear solid", reference_programs.creep),
     Law("threads", "Results are the same on one thread and on two.",
         "another process", reference_programs.threads),
@@ -50,10 +55,10 @@ LAWS = (
 
 
 def select_laws(names: str | list[str]) -> list[Law]:
-    """Return the laws of these names; ``all``: all.
+    """Return the laws with the given names, or every law for ``all``.
 
     Raises:
-        InputError: a name that no law has.
+        InputError: an unknown name.
     """
     wanted = [names] if isinstance(names, str) else list(names)
     known = {law.name: law for law in LAWS}

@@ -1,4 +1,4 @@
-"""scikit-fem alone: its forms, boundaries and condensation; only the mesh is ours."""
+"""A solution by scikit-fem in the mixed form; only the mesh comes from this package."""
 
 from dataclasses import dataclass
 
@@ -26,12 +26,12 @@ _GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
 
 @dataclass(frozen=True)
 class FrameSolution:
-    """What scikit-fem answers to one frame.
+    """The solution of one frame.
 
     Attributes:
-        reading: force that pushes on a rectangle of whole cells, N.
-        sensor: motion into the skin of the node in its middle, m.
-        surface: of the node above that, m.
+        reading: normal force on a rectangle of whole cells, N.
+        sensor: displacement into the skin of the node in its middle, m.
+        surface: the same of the node above, m.
     """
 
     reading: float
@@ -42,13 +42,13 @@ class FrameSolution:
 def solve_frame(
     mesh: Hexahedra, pressure: np.ndarray, shear: float, place: np.ndarray, extent: float
 ) -> FrameSolution:
-    """Solve a flat skin under one frame in the mixed form: the pressure inside is an unknown per element.
+    """Solve a flat skin under one frame in the mixed form, with one pressure unknown per element.
 
     Args:
         mesh: gives points, cells and materials.
         pressure: (H, W), Pa.
-        shear: traction along x over the pressure.
-        place: (3,), m: a node, at an interface between rows of elements.
+        shear: tangential traction along x divided by the pressure.
+        place: (3,), m: a node between two rows of elements.
         extent: side of the sensor's footprint, m: whole cells about the node.
     """
     points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
@@ -84,7 +84,7 @@ def solve_frame(
 
 
 def locking(mesh: Hexahedra) -> sp.csc_matrix:
-    """Return the stiffness of plain trilinear elements, fully integrated: what locks when nu nears 1/2."""
+    """Return the stiffness of fully integrated trilinear elements, which lock when nu approaches 1/2."""
     points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
     basis = CellBasis(points, ElementVector(ElementHex1()), intorder=2)
     lam, mu = (np.broadcast_to(value[:, None], basis.dx.shape) for value in mesh.lame)
@@ -97,7 +97,7 @@ def locking(mesh: Hexahedra) -> sp.csc_matrix:
 
 
 def _solve(matrix, right, whole, free) -> np.ndarray:
-    """Solve, and mend once what rounding left: the mixed form is badly scaled."""
+    """Solve with one step of iterative refinement, because the mixed form is ill-conditioned."""
     factors = splu(matrix.tocsc())
     found = factors.solve(right)
     answer = whole.copy()
@@ -106,13 +106,13 @@ def _solve(matrix, right, whole, free) -> np.ndarray:
 
 
 def _at(points: MeshHex, basis: CellBasis, moved: np.ndarray, spot: np.ndarray) -> np.ndarray:
-    """Return the motion (3,) of the node at a place."""
+    """Return the displacement (3,) of the node at a place."""
     node = np.linalg.norm(points.p - spot[:, None], axis=0).argmin()
     return moved[basis.nodal_dofs[:, node]]
 
 
 def _reading(points, basis, moved, squeeze, mu, mesh: Hexahedra, place, extent: float) -> float:
-    """Integrate -sigma_zz over the footprint, half-way down the rows above and below, and take the line."""
+    """Integrate -sigma_zz over the footprint in the rows above and below, and interpolate linearly."""
     x, y, z = points.p[:, points.t].mean(axis=1)
     within = (np.abs(x - place[0]) < extent / 2) & (np.abs(y - place[1]) < extent / 2)
     lines = mesh.lines[2]

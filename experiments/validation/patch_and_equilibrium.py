@@ -1,4 +1,4 @@
-"""Laws of any elastic body: patch test, confined compression, balance, reciprocity."""
+"""Checks of any elastic body: patch test, confined compression, equilibrium, reciprocity."""
 
 from collections.abc import Callable
 from typing import Any
@@ -44,7 +44,7 @@ def stack(divisions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def patch_test(quick: bool) -> CheckResult:
-    """A uniform strain on the surface of distorted elements is the uniform strain inside."""
+    """Check that a uniform strain on the surface of distorted elements gives the same strain inside."""
     findings = []
     for ratio in (0.3, 0.499):
         x, y, z = (np.sort(np.random.default_rng(seed).random(4 if quick else 6)) for seed in range(3))
@@ -64,7 +64,7 @@ def patch_test(quick: bool) -> CheckResult:
 
 
 def confined_compression(quick: bool) -> CheckResult:
-    """Between smooth walls an even pressure p shortens every layer by p h / (lambda + 2 G)."""
+    """Check that between smooth walls a uniform pressure p compresses each layer by p h / (lambda + 2 G)."""
     line = np.linspace(0, 0.02, 3 if quick else 5)
     depth, young, ratio = stack(2)
     mesh = block((line, line, depth), young, ratio)
@@ -85,7 +85,7 @@ def confined_compression(quick: bool) -> CheckResult:
 
 
 def even_pressure(quick: bool) -> CheckResult:
-    """Far from free edges an even pressure p is sigma_zz = -p at every depth."""
+    """Check that far from free edges a uniform pressure p gives sigma_zz = -p at every depth."""
     body = skin(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
@@ -100,7 +100,7 @@ def even_pressure(quick: bool) -> CheckResult:
 
 
 def global_balance(quick: bool) -> CheckResult:
-    """The table pushes back with the force and the turning moment that are applied."""
+    """Check that the reactions of the support balance the applied force and moment."""
     findings = []
     for name, body in _bodies(quick):
         mesh = hexahedra(body, 2, {})
@@ -117,7 +117,7 @@ def global_balance(quick: bool) -> CheckResult:
 
 
 def reciprocity(quick: bool) -> CheckResult:
-    """Maxwell and Betti: one load does the same work on another's motion as the other does on its."""
+    """Check reciprocity (Maxwell and Betti): two loads do the same work on each other's displacements."""
     findings = []
     for name, body in _bodies(quick):
         mesh = hexahedra(body, 2, {})
@@ -130,7 +130,7 @@ def reciprocity(quick: bool) -> CheckResult:
 
 
 def wide_arm(quick: bool) -> CheckResult:
-    """A sleeve around an arm of large radius is a sheet, the more so the larger the radius."""
+    """Check that a sleeve approaches a sheet as its radius grows."""
     sheet = skin(8 if quick else 16)
     place = np.array([[0.07, 0.09, 0.005], [0.03, 0.12, 0.003], [0.11, 0.05, 0.005]])
     lean = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
@@ -146,7 +146,7 @@ def wide_arm(quick: bool) -> CheckResult:
 
 
 def sleeve(quick: bool) -> CheckResult:
-    """A sleeve on a rigid core under an even pressure is Lame's tube (plane strain, u = A r + B / r)."""
+    """Compare a sleeve on a rigid core under uniform pressure with Lame's tube (u = A r + B / r)."""
     core, middle, outer = 0.035, 0.045, 0.05
     soft, hard = SLABS
     inner, upper = (_tube(slab) for slab in (hard, soft))
@@ -161,7 +161,7 @@ def sleeve(quick: bool) -> CheckResult:
     around = 32 if quick else 96
     body = Arm(cells=(around, 2), layers=_LAYERS, radius=outer, length=0.01, angle=np.pi)
     mesh = hexahedra(body, 2 if quick else 4, {})
-    # Half a tube ends in mirrors: it moves neither up nor down there, nor along the arm anywhere.
+    # Symmetry planes close the half tube: no vertical motion there, and no motion along the arm anywhere.
     walls = {"left": (2,), "right": (2,), "near": (1,), "far": (1,), "base": (0, 1, 2)}
     load = np.asarray(mesh.loads(2).sum(axis=1)).reshape(-1, 1)
     moved = solve_block(mesh, held(mesh, walls), load)[:, 0]
@@ -184,7 +184,7 @@ def sleeve(quick: bool) -> CheckResult:
 
 
 def _tube(slab: Slab) -> Callable[[float], np.ndarray]:
-    """Return what A and B of u = A r + B / r give at a radius: motion outwards and radial stress, (2, 2)."""
+    """Return a map from a radius to radial displacement and stress per A and B of u = A r + B / r, (2, 2)."""
     lam = slab.confined - 2 * slab.shear
     return lambda r: np.array([[r, 1 / r], [2 * (lam + slab.shear), -2 * slab.shear / r**2]])
 
@@ -213,7 +213,7 @@ def _moment(mesh: Hexahedra, load: np.ndarray) -> np.ndarray:
 
 
 def _bent(points: np.ndarray) -> np.ndarray:
-    """Move a chart's points smoothly and unevenly: no element stays a box."""
+    """Map points by a smooth, non-linear function, so that no element stays a box."""
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([x + 0.2 * y * x, y + 0.1 * x * x - 0.1 * z, -z + 0.3 * x * z], axis=-1)
 
@@ -223,7 +223,7 @@ def _axes(points: np.ndarray) -> np.ndarray:
 
 
 def _stress_error(mesh: Hexahedra, moved: np.ndarray, strain: np.ndarray) -> float:
-    """Return how far stress at random places is from the uniform one, over its largest part."""
+    """Return the largest error of the stress at random places, relative to the largest component."""
     lam, mu = mesh.lame[0][0], mesh.lame[1][0]
     exact = lam * np.trace(strain) * np.eye(3) + 2 * mu * strain
     rng = np.random.default_rng(3)

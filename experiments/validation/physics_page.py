@@ -1,4 +1,4 @@
-"""The results of the laws as a page, pictures and JSON."""
+"""The results of the laws as a page, plots and JSON."""
 
 import json
 import math
@@ -14,46 +14,45 @@ from skin.files import whole, write
 
 Results = Sequence[tuple[Law, CheckResult]]
 
-_HEAD = """# Physics, proved
+_HEAD = """# Physics, verified
 
-Written by `make physics` (`skin validate`). Every law is checked against an answer
-that is not the simulator's own; one that does not hold ends the command with exit code 1. Only digits that
-are the same on every processor are printed; errors of rounding stand as an upper bound. All digits of this
-machine, for programs: `results/physics.json`.
+Written by `make physics` (`skin validate`). Each law is checked against an independent solution. The
+command exits with code 1 if a law does not hold. The page shows only digits that are the same on every
+processor; rounding errors are shown as an upper bound. `results/physics.json` holds all digits of one machine.
 
-| law | against | numbers | worst error | tolerance | |
+| law | reference | numbers | worst error | tolerance | |
 |---|---|---|---|---|---|
 """
 
-# Errors below this are rounding, in double and in single precision; the tolerance tells which of them it is.
+# Rounding errors in double and in single precision; the tolerance of a finding tells which applies.
 _DOUBLE, _SINGLE = 1e-10, 1e-6
 
 _LIMITS = """
-## What this does not prove
+## Limits
 
-- **It is the linear theory that is proved.** Most default gestures strain the skin beyond it; see
+- **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
   [results](results.md#what-the-numbers-are-worth).
-- **Motion of the surface converges slowly where the skin is thin and nearly incompressible.** What goes down
-  under a wide object has to flow out sideways, and elements as long as the skin is thick hinder it,
-  above all beside its edge: see `mesh` for the default mesh, a finer one and coarser ones. Readings suffer
-  less, because what is pressed on has to come out below.
-  Beside an edge, though, an error of 1 % of the reading under the object can be much of a small reading.
-- **The thick block ends** at 60 half sides, so that its surface moves about 2 % less than a half-space does.
-  No refinement mends that.
-- **A sensor just at the joint of two layers** takes a line between the stresses above and below. What a
-  tilted one feels of the stress along the layers jumps there; it reads a mean.
-- **A footprint is cut out of the chart.** Deep in an arm it covers a shorter arc than the sensor does (10 %
-  less for the default sleeve); the reading is the mean stress there times the sensor's full area.
-- **Objects find their pressure without friction;** the drag of a sliding touch is added afterwards.
+- **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Material under a
+  wide object must move sideways. Elements that are as long as the skin is thick restrict this motion, most
+  of all beside the edge of the object: see `mesh` for the default mesh, a finer one and coarser ones.
+  Readings are more accurate, because the layers transmit the applied force. Beside an edge, however, an
+  error of 1 % of the reading under the object can be a large part of a small reading.
+- **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of a
+  half-space. Refining the mesh does not reduce this error.
+- **A sensor at the interface of two layers** interpolates linearly between the stresses above and below. The
+  stress along the layers is discontinuous there; a tilted sensor reads a mean of both sides.
+- **A footprint is defined on the unrolled surface.** Deep in an arm it covers a shorter arc than the sensor
+  (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full area.
+- **Contact is solved without friction.** The tangential traction of a sliding touch is added afterwards.
 """
 
 
 def publish_physics(folder: Path, json_path: Path, results: Results) -> None:
-    """Write physics.md and its pictures into a folder, and the findings as JSON, each whole."""
+    """Write physics.md and its plots into a folder, and the findings as JSON, each file atomically."""
     write(as_json(results), json_path)
     for _, outcome in results:
-        for picture in outcome.pictures:
-            draw(picture, folder / "results" / "physics" / f"{picture.name}.png")
+        for plot in outcome.plots:
+            draw(plot, folder / "results" / "physics" / f"{plot.name}.png")
     write(page(results), folder / "physics.md")
 
 
@@ -68,7 +67,7 @@ def as_json(results: Results) -> str:
 
 
 def _finite(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return lines with null for what is no number: JSON knows none."""
+    """Return lines with null instead of values that are not finite, which JSON does not have."""
     return [
         {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -79,7 +78,7 @@ def _finite(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def page(results: Results) -> str:
-    """Return the page: one line per law, then its figures."""
+    """Return the page: a table with one line per law, then one section per law."""
     return _HEAD + "".join(map(_line, results)) + "".join(map(_section, results)) + _LIMITS
 
 
@@ -107,7 +106,7 @@ def _section(result: tuple[Law, CheckResult]) -> str:
             f"{'ok' if one.ok else '**missed**'} |\n"
         )
     lines += [f"\n- {remark}" for remark in outcome.remarks]
-    lines += [f"\n\n![{picture.title}](results/physics/{picture.name}.png)" for picture in outcome.pictures]
+    lines += [f"\n\n![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
     return "".join(lines).rstrip("\n") + "\n"
 
 
@@ -120,16 +119,16 @@ def _error(finding: Finding) -> str:
     return f"< {bound:.0e}" if finding.error < bound else f"{finding.error:.2g}"
 
 
-def draw(picture: Plot, path: Path) -> None:
-    """Write a picture as a PNG."""
+def draw(plot: Plot, path: Path) -> None:
+    """Write a plot as PNG."""
     figure = Figure(figsize=(5.6, 3.4), layout="constrained")
     axes = figure.add_subplot()
-    for curve in picture.curves:
+    for curve in plot.curves:
         style = {"marker": "o", "markersize": 3.5, "linestyle": "none"} if curve.marks else {"linewidth": 1.2}
         axes.plot(curve.x, curve.y, label=curve.label, **style)
-    if picture.log:
+    if plot.log:
         axes.set(xscale="log", yscale="log")
-    axes.set(xlabel=picture.x, ylabel=picture.y, title=picture.title)
+    axes.set(xlabel=plot.x, ylabel=plot.y, title=plot.title)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     with whole(path) as partial:

@@ -1,4 +1,4 @@
-"""Laws checked against another program, another number of threads, or the report."""
+"""Checks against another program, another number of threads, or the report."""
 
 import os
 import subprocess
@@ -33,7 +33,7 @@ _FOAM: Any = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thic
 
 
 def single_frames(quick: bool) -> CheckResult:
-    """The operator gives for single frames what scikit-fem gives, solved for each of them."""
+    """Compare the precomputed operator with a scikit-fem solution of single frames."""
     body = skin(8 if quick else 12, 0.12)
     place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
     mesh, extent = hexahedra(body, 2, {}), 2 * body.cell[0]
@@ -57,7 +57,7 @@ def single_frames(quick: bool) -> CheckResult:
 
 
 def plates_and_beams(quick: bool) -> CheckResult:
-    """simulator=fem moves every node as PyNite does."""
+    """Compare the nodal displacements of simulator=fem with those of PyNite."""
     bodies = {
         "4x3, two layers": Sheet((0.04, 0.04), (4, 3), (_DRAGON, _ECOFLEX)),
         "5x4, three layers that vary": Sheet((0.06, 0.05), (5, 4), (_DRAGON, _ECOFLEX, _FOAM), 0.2, 3),
@@ -67,7 +67,7 @@ def plates_and_beams(quick: bool) -> CheckResult:
         for constraint in ("vertical", "free"):
             structure = Structure(body, constraint)
             pressure = np.random.default_rng(0).uniform(0, 1e5, body.shape)
-            expected = _refereed(structure, pressure)[..., list(structure.free)]
+            expected = _pynite_displacements(structure, pressure)[..., list(structure.free)]
             ours = spsolve(structure.stiffness(), structure.load() @ pressure.ravel()).reshape(expected.shape)
             error = (np.abs(ours - expected).max((0, 1, 2)) / np.abs(expected).max((0, 1, 2))).max()
             case = f"all displacements, {name}, constraint={constraint}"
@@ -76,12 +76,12 @@ def plates_and_beams(quick: bool) -> CheckResult:
 
 
 def equation_ten(quick: bool) -> CheckResult:
-    """Readings of simulator=fem are D_s / D_t times the force on the footprint, in proportion."""
+    """Check that readings of simulator=fem are D_s / D_t times the force on the footprint."""
     body = Sheet((0.04, 0.04), (4, 4), (_DRAGON, _ECOFLEX))
     pressure = np.random.default_rng(0).uniform(0, 1e5, body.shape)
     with tempfile.TemporaryDirectory() as cache:
         fem = PlatesAndBeams(body, Sensors(np.array([[0.02, 0.03, 0.005]]), body.cell), cache=cache).double()
-    moves = _refereed(Structure(body), pressure)[:, 3, 2, 2]
+    moves = _pynite_displacements(Structure(body), pressure)[:, 3, 2, 2]
     # The footprint is a quarter of each of the four cells about the node.
     force = pressure[2:4, 1:3].mean() * np.prod(body.cell)
     reading = [float(fem(torch.from_numpy(factor * pressure)).readings[0]) for factor in (1, 7)]
@@ -97,7 +97,7 @@ def equation_ten(quick: bool) -> CheckResult:
 
 
 def naive(quick: bool) -> CheckResult:
-    """simulator=naive reads the pressure of one cell times the footprint."""
+    """Check that readings of simulator=naive are the pressure of one cell times the footprint area."""
     body = skin(16)
     place = np.random.default_rng(0).uniform(0.01, 0.15, (25, 2))
     sensors = Sensors(np.column_stack([place, np.full(25, 0.005)]), (0.01, 0.01))
@@ -109,7 +109,7 @@ def naive(quick: bool) -> CheckResult:
 
 
 def creep(quick: bool) -> CheckResult:
-    """Under a load that stays, a skin of one relaxing material sinks in as the standard linear solid does."""
+    """Compare the creep of a skin of one material under a constant load with the standard linear solid."""
     time, strength, rate, frames = 0.6, 0.8, 10.0, 30
     branch = {"time": time, "strength": strength}
     rubber = {"name": "rubber", "young": 170e3, "poisson": 0.45, "relaxation": branch}
@@ -118,7 +118,7 @@ def creep(quick: bool) -> CheckResult:
     sensors = Sensors(np.array([[0.03, 0.05, 0.0]]), (0.02, 0.02))
     index, scale = torch.zeros(1, frames, dtype=torch.long), torch.ones(1, frames)
     pressure = torch.rand(1, *body.shape, generator=torch.Generator().manual_seed(0))
-    after = np.arange(1, frames + 1) / rate  # a load is taken to have come with the frame before
+    after = np.arange(1, frames + 1) / rate  # a load counts from the frame before
     exact = 1 - strength / (1 + strength) * np.exp(-after / (time * (1 + strength)))
     findings = []
     with tempfile.TemporaryDirectory() as cache:
@@ -136,7 +136,7 @@ def creep(quick: bool) -> CheckResult:
 
 
 def threads(quick: bool) -> CheckResult:
-    """Operators, readings and contact pressures are the same on one thread and on two."""
+    """Check that operators, readings and contact pressures are the same on one thread and on two."""
     cells = "8" if quick else "16"
     with tempfile.TemporaryDirectory() as folder:
         found = []
@@ -156,13 +156,13 @@ def threads(quick: bool) -> CheckResult:
     return CheckResult(findings)
 
 
-def _refereed(structure: Structure, pressure: np.ndarray) -> np.ndarray:
+def _pynite_displacements(structure: Structure, pressure: np.ndarray) -> np.ndarray:
     """Return PyNite's displacements, (layers, ny + 1, nx + 1, 6), with w positive upwards."""
     try:
         model = _pynite.model(structure, pressure)
     except ModuleNotFoundError as missing:
         raise InputError(
-            "PyNite is the referee of simulator=fem, and is not installed: pip install PyNiteFEA"
+            "checking simulator=fem needs PyNite, which is not installed: pip install PyNiteFEA"
         ) from missing
     _pynite.solve(model)
     return _pynite.displacements(model, structure)

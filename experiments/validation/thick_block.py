@@ -1,4 +1,4 @@
-"""Laws of a thick soft block: forces and rigid objects far from its ends."""
+"""Checks of a thick soft block: tractions and rigid objects far from its ends."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -17,23 +17,23 @@ from skin.simulator._hexahedra import Hexahedra
 
 _YOUNG, _RATIO, _HALF = 170e3, 0.45, 0.01
 _STAR = _YOUNG / (1 - _RATIO**2)
-# A quarter of the block is solved: two faces are mirrors, or the opposite of mirrors under forces along x.
+# A quarter of the block is solved: two faces are symmetry planes, or antisymmetric under forces along x.
 _MIRRORED = {"left": (0,), "near": (1,), "base": ALL}
 _OPPOSED = {"left": (1, 2), "near": (1,), "base": ALL}
 
 
 def boussinesq(quick: bool) -> CheckResult:
-    """Pressure on a square of a thick block moves and stresses it as Boussinesq says."""
+    """Compare displacement and stress under a square of pressure with Boussinesq's solution."""
     return _forces(quick, 2, "under_pressure", ("down", 2), _MIRRORED)
 
 
 def cerruti(quick: bool) -> CheckResult:
-    """Traction along x on a square of a thick block moves and stresses it as Cerruti says."""
+    """Compare displacement and stress under a square of traction along x with Cerruti's solution."""
     return _forces(quick, 0, "under_shear", ("along x", 0), _OPPOSED)
 
 
 def _forces(quick: bool, axis: int, kind: str, main: tuple[str, int], faces: dict) -> CheckResult:
-    """Compare all motions, and the stresses on planes along the surface, below and beside the square."""
+    """Compare displacements, and stresses on planes parallel to the surface, below and beside the square."""
     count = 4 if quick else 6
     line = graded(_HALF / count, count + count // 2, 60 * _HALF, 1.6)
     mesh, middles = block((line, line, line), _YOUNG, _RATIO), row_means(line)
@@ -85,14 +85,14 @@ def _stress(mesh: Hexahedra, places: np.ndarray, moved: np.ndarray) -> np.ndarra
 
 
 def _worst(case: str, ours: np.ndarray, exact: np.ndarray) -> Finding:
-    """Compare the place that is furthest off, as a share of the largest value."""
+    """Return the largest error over all places, relative to the largest value."""
     where = np.unravel_index(np.abs(ours - exact).argmax(), ours.shape)
     error = abs(ours[where] - exact[where]) / np.abs(exact).max()
     return Finding(f"{case}, of the largest", float(ours[where]), float(exact[where]), float(error), 0.05)
 
 
 def hertz(quick: bool) -> CheckResult:
-    """A rigid sphere finds the radius, the peak and the force of Hertz, the better the finer the mesh."""
+    """Compare contact radius, peak pressure and force of a rigid sphere with Hertz, on several meshes."""
     sphere = Hertz(0.05, _STAR)
     force = 4 / 3 * _STAR * _HALF**3 / 0.05  # for which Hertz' contact has the radius of _HALF
     findings: list[Finding] = []
@@ -119,7 +119,7 @@ def hertz(quick: bool) -> CheckResult:
 
 
 def flat_punch(quick: bool) -> CheckResult:
-    """Flat rigid punches, round and square, carry the force that their approach asks for."""
+    """Compare the force on flat rigid punches, round and square, with the solution for their approach."""
     findings: list[Finding] = []
     remarks = []
     for count in (4,) if quick else (4, 6, 8):
@@ -139,7 +139,7 @@ def flat_punch(quick: bool) -> CheckResult:
 
 
 def _refined(count: int, findings: list[Finding]) -> str:
-    """Say how far a mesh is off."""
+    """Return a remark with the errors on one mesh."""
     errors = (f"{100 * (one.ours / one.reference - 1):+.1f} %" for one in findings)
     return f"with {count} cells over 10 mm: {', '.join(errors)}"
 

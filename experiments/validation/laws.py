@@ -21,7 +21,7 @@ LAWS = (
     Law("convergence", "Halving the element size divides the displacement error by four.",
         "closed form of the bonded layer", bonded_layer.convergence),
     Law("layer",
-        "The compliance of a thin, nearly incompressible bonded layer is right at long and short wavelengths.",
+        "The compliance of a thin, nearly incompressible bonded layer is correct for all wavelengths.",
         "closed form (Aleksandrov and Vorovich)", bonded_layer.thin_layer),
     Law("locking", "The error does not grow when nu rises from 0.45 to 0.4999.",
         "the same closed form", bonded_layer.no_locking),

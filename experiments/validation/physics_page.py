@@ -18,7 +18,8 @@ _HEAD = """# Physics, verified
 
 Written by `make physics` (`skin validate`). Each law is checked against an independent solution. The
 command exits with code 1 if a law does not hold. The page shows only digits that are the same on every
-processor; rounding errors are shown as an upper bound. `results/physics.json` holds all digits of one machine.
+processor; rounding errors are shown as an upper bound. `results/physics.json` holds all digits of one
+machine.
 
 | law | reference | numbers | worst error | tolerance | |
 |---|---|---|---|---|---|

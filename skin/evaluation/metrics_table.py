@@ -13,9 +13,9 @@ def print_report(found: Report, title: str, console: Console | None = None) -> N
     """Print one line per label and one column per set of touches, accuracies in per cent, errors in degrees.
 
     Args:
-        found: what an evaluation found.
+        found: result of the evaluation.
         title: of the table.
-        console: where to print; None takes standard output.
+        console: where to print; None: standard output.
     """
     console = console or Console()
     console.print(metrics_table(found.metrics, title))
@@ -27,7 +27,7 @@ def print_report(found: Report, title: str, console: Console | None = None) -> N
 
 
 def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
-    """Return the table of metrics such as ``same/overall/accuracy``; others are left out."""
+    """Return a table of the metrics with a suffix such as ``/accuracy``; others are omitted."""
     shown = [name for name in metrics if name.endswith((*SHARES, "/degrees"))]
     columns = list(dict.fromkeys(name.split("/")[0] for name in shown))
     made = Table("", *columns, title=title)
@@ -39,5 +39,5 @@ def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
 
 
 def format_number(value: float | None, unit: float = 100) -> str:
-    """Return a figure with one digit; "-" where it is not defined, and nothing where there is none."""
+    """Return a value with one decimal; "-" for NaN, and an empty string for None."""
     return "" if value is None else "-" if isnan(value) else f"{unit * value:.1f}"

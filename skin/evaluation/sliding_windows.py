@@ -1,4 +1,4 @@
-"""Evaluation on windows that slide over a stream: part of a touch, a whole one, or none."""
+"""Evaluation on sliding windows over a stream, which show a part of a touch, a whole touch, or none."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,13 +25,13 @@ _EDGES = (0.2, 0.4, 0.6, 0.8)
 
 @dataclass(frozen=True)
 class Bin:
-    """Windows that show about the same share of a touch.
+    """Windows that show a similar share of a touch.
 
     Attributes:
-        name: as ``0.2-0.4``, the upper end included; ``whole`` for those that show all of it.
-        count: of windows.
+        name: such as ``0.2-0.4``, upper end included; ``whole`` for windows with a whole touch.
+        count: number of windows.
         accuracy: of each label.
-        majority: what always giving the commoner answer would reach, of each label.
+        majority: accuracy of always predicting the majority class, of each label.
     """
 
     name: str
@@ -42,17 +42,17 @@ class Bin:
 
 @dataclass(frozen=True)
 class WindowReport:
-    """What was found.
+    """Result of an evaluation on sliding windows.
 
     Attributes:
-        bins: accuracy against the share of the touch that a window shows.
-        gates: gate -> (2, 2) counts of windows: idle and touched down, said to be idle and touched across.
+        bins: accuracy by the share of the touch in the window.
+        gates: gate -> (2, 2) counts of windows: truth idle and touched down, predicted across.
         threshold: of the gate by threshold, N.
         alarms: gate -> alarms on the long stream.
-        hours: its length.
-        lengths: frames of a window -> overall accuracy, or why the learner takes no such window.
+        hours: length of that stream.
+        lengths: frames of a window -> overall accuracy, or why the learner does not accept such windows.
         streamed: whether the learner was trained on windows of streams.
-        point: where the alarm is raised.
+        point: operating point of the alarm.
     """
 
     bins: list[Bin]
@@ -65,7 +65,7 @@ class WindowReport:
     point: OperatingPoint
 
     def metrics(self) -> dict[str, float]:
-        """Return every figure by a name that MLflow takes."""
+        """Return all values under names that MLflow accepts."""
         values: dict[str, float] = {
             "stream/hours": self.hours,
             "gate/threshold/least": self.threshold,
@@ -91,20 +91,20 @@ def evaluate_windows(
     point: OperatingPoint,
     track: Callable[..., Any] = iter,
 ) -> WindowReport:
-    """Try a learner on windows of test streams, as its device would feel them.
+    """Evaluate a learner on windows of test streams of its device.
 
     Args:
-        learner: trained.
-        device: that it was trained on.
+        learner: trained learner.
+        device: its device.
         settings: the streams and windows to test.
-        point: where the learner raises the alarm.
-        track: wraps the chunks of the long stream, to show how far it is, as ``rich.progress.track``.
+        point: operating point of the alarm.
+        track: wraps the chunks of the long stream to show progress, such as ``rich.progress.track``.
 
     Raises:
-        InputError: a device that has no streams.
+        InputError: the device has no streams.
     """
     device = device.simulated(f"streams are simulated, {type(device).__name__} has none")
-    # One device feels the whole stream, and its baseline is known as after a tare.
+    # One device records the whole stream, and its baseline is known as after a tare.
     streamed = device.replace(stream=True, randomise=False)
     threshold = _tuned(streamed)
     all_gates = gates(threshold, device.task)
@@ -126,20 +126,20 @@ def evaluate_windows(
 
 
 def _tuned(device: AbstractSimulated) -> Threshold:
-    """Return the threshold that tells touched windows from idle ones, tuned on the validation split."""
+    """Return the threshold that separates touched from idle windows, tuned on the validation split."""
     known, idle = device.touches("validation"), device.idle
     assert known.labels is not None
     return Threshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
 
 
 def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:
-    """Return accuracies by the share that is seen, of the windows that show a touch.
+    """Return accuracies by the share of the touch in the window, for windows that show a touch.
 
     Args:
         chances: (W, L), probabilities of the labels of ``task``.
         labels: (W, 5), of ``TOUCH_OR_NOT``.
-        share: (W,), part of the touch that is seen; 0 without touch.
-        task: what the learner says.
+        share: (W,), fraction of the touch in the window; 0 without touch.
+        task: task of the learner.
     """
     names = TOUCH_OR_NOT.gated
     truth = labels[:, : len(names)] > 0.5
@@ -167,7 +167,7 @@ def _listen(
     point: OperatingPoint,
     track: Callable[..., Any],
 ) -> dict[str, Alarms]:
-    """Return the alarms of each gate while a window slides over a long stream."""
+    """Return the alarms of each gate on sliding windows over a long stream."""
     frames = max(round(settings.hours * 3600 * device.rate), device.window)
     stream = device.simulate_stream(frames, settings.gap)
     starts = torch.arange(0, frames - device.window + 1, settings.stride)
@@ -187,8 +187,8 @@ def _listen(
 def _length(learner: Predictor, device: AbstractSimulated, window: int) -> float | str:
     """Return the overall accuracy on test touches in windows of another length, or why there is none.
 
-    The touches are those of the other lengths, begun elsewhere; a window that the longest press does not fit
-    in has shorter presses.
+    All lengths have the same touches with other onsets; windows that are shorter than the longest press have
+    shorter presses.
     """
     settings = device.sampler.settings
     try:

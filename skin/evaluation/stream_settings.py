@@ -1,4 +1,4 @@
-"""Settings of an evaluation on streams; free of heavy imports, so that a mistake is reported at once."""
+"""Settings of an evaluation on streams, without heavy imports, so that errors are reported early."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from skin.settings import RISING, checked
 @checked("measure")
 @dataclass(frozen=True)
 class StreamSettings:
-    """The stream on which alarms are counted, and what else is tried.
+    """Settings of an evaluation on streams.
 
     Attributes:
-        hours: length of the stream.
-        gap: [least, most] idle frames between two of its touches.
-        stride: frames from one verdict to the next.
-        windows: lengths of window on which the learner is tried, frames.
+        hours: length of the stream on which alarms are counted.
+        gap: [least, most] idle frames between two touches.
+        stride: frames between two predictions.
+        windows: window lengths to test the learner on, frames.
 
     Raises:
         InputError: a value that cannot be used.

@@ -1,4 +1,4 @@
-"""From drawn gestures to the frames they show: where, and at what share of full force."""
+"""Sample the paths of drawn gestures: the place and the share of full force in each frame."""
 
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ from skin.touch.problem import Trajectories
 
 
 class SampledPaths(NamedTuple):
-    """Trajectories and the place that they take.
+    """Sampled trajectories of gestures.
 
     Attributes:
         trajectories: the frames (U,) of gestures (B,).
-        place: (U, 2), where each frame is within its room, m.
+        place: (U, 2), place of each frame within the gesture's span, m.
         first: (B,), the first frame of each gesture.
         net: (B, 2), from its first place to its last, m.
-        travel: (B,), how far it gets from its first place, m.
+        travel: (B,), largest distance from its first place, m.
     """
 
     trajectories: Trajectories
@@ -32,14 +32,14 @@ def sample_paths(
 ) -> SampledPaths:
     """Return the distinct frames of gestures.
 
-    A sliding touch has one per step. One that stands still has a single one, or, where pressure is not
-    proportional to force, one per level of its force.
+    A sliding touch has one per step. A static touch has one, or one per force level where pressure is not
+    proportional to force.
 
     Args:
-        gestures: what ``draw_gestures`` and ``draw_paths`` gave, (B, ...).
+        gestures: the draws of ``draw_gestures`` and ``draw_paths``, (B, ...).
         wanted: (B, 4), bool, the wanted labels.
-        settings: the difficulty.
-        proportional: twice the force is twice the pressure.
+        settings: ranges of the gestures.
+        proportional: whether pressure is proportional to force.
     """
     duration, onset, sliding = gestures["duration"], gestures["onset"], gestures["speed"] > 0
     time = np.arange(settings.window) - onset[:, None]

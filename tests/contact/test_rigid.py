@@ -234,7 +234,7 @@ def test_draws_that_fail_are_counted():
 
 def test_what_is_not_found_is_told_and_never_used():
     hasty = sampler(rigid(iterations=5))
-    with pytest.warns(RuntimeWarning, match=r"\d+ frames were not found to contact.tolerance"):
+    with pytest.warns(RuntimeWarning, match=r"\d+ frames did not converge to contact.tolerance"):
         movie = hasty.sample(32, np.random.default_rng(5))
     assert movie.parameters["unconverged"].sum() > 0
 

@@ -1,4 +1,4 @@
-"""The independent answers are right themselves: against other formulas, and against numerical integration."""
+"""The reference solutions are checked against other formulas and numerical integration."""
 
 import numpy as np
 import pytest

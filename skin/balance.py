@@ -12,7 +12,7 @@ from skin.errors import InputError
 from skin.labels import OPPOSITE
 from skin.recording import Recording
 from skin.touch.gesture import GestureSettings
-from skin.touch.stream import touched
+from skin.touch.stream import only_touches
 
 
 def announce(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
@@ -48,7 +48,7 @@ def balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, Any]:
         each), area, force (N), x and y (m; mean and standard deviation of where touches begin), rejected
         (share of drawn paths with other labels) and misfits (share of drawn bodies without room).
     """
-    recording = touched(recording)
+    recording = only_touches(recording)
     known = {name: values.double().numpy() for name, values in recording.parameters.items()}
     labels = recording.touches.labels
     assert labels is not None

@@ -9,8 +9,11 @@ from typing import Any
 from skin import __version__
 from skin.paths import candidates
 
-RENAMED: dict[str, str] = {}
-"""Class as older configurations name it -> its name now. Who moves a class of an option adds a line."""
+RENAMED: dict[str, str] = {
+    "skin.learner.features.Features": "skin.learner.boosted_trees.BoostedTrees",
+    "skin.representation.measured.Measured": "skin.representation.features.Features",
+}
+"""Former name of a class -> its name now. Add a line when you move or rename the class of an option."""
 
 # Group -> settings that were added later. With these values nothing changes, so older runs keep their hash.
 _LATER: dict[str, dict[str, Any]] = {

@@ -17,7 +17,7 @@ from skin.build import build_device
 from skin.config import Evaluation, checked
 from skin.datamodule import TouchData
 from skin.errors import InputError
-from skin.evaluation.operating_point import OperatingPoint, choose, read
+from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
 from skin.foreign import settings
 from skin.identity import renamed
 from skin.learner.base import AbstractLearner
@@ -166,12 +166,12 @@ def operating_point(
         InputError: the stored one cannot be read.
     """
     text, target = run.data.tags.get(TAG), settings.false_alarm_rate
-    known = None if text is None else read(text)
+    known = None if text is None else parse_operating_point(text)
     if text is not None and (known is None or known.target == target):
         return known
     lacks = f"run {run.info.run_id} stores no alarm threshold for {100 * target:g} % false alarms"
     if "simulator" in stored.device:
-        point = choose(learner, build_device(stored), settings)
+        point = choose_operating_point(learner, build_device(stored), settings)
         said = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
     else:
         point = known or OperatingPoint.default(target)

@@ -24,14 +24,14 @@ from skin.build import build_data, build_device, build_learner
 from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
 from skin.errors import InputError
-from skin.evaluation.operating_point import check, choose
+from skin.evaluation.metrics_table import metrics_table
+from skin.evaluation.metrics_table import print_report as show
+from skin.evaluation.operating_point import check_evaluation, choose_operating_point
 from skin.evaluation.report import Report, evaluate
-from skin.evaluation.show import report as show
-from skin.evaluation.show import table
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.option import option
-from skin.plot.figures import confusions, save
+from skin.plot.figures import confusions, save_figure
 from skin.recording import Touches, digest
 from skin.reload import TAG
 from skin.settings import imported
@@ -71,9 +71,9 @@ def train(config: DictConfig) -> bool:
     if finished:
         if PARENT not in os.environ:
             print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
-            Console().print(table(finished[0].data.metrics, finished[0].info.run_name))
+            Console().print(metrics_table(finished[0].data.metrics, finished[0].info.run_name))
         return False
-    check(config.evaluation)
+    check_evaluation(config.evaluation)
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
@@ -83,7 +83,7 @@ def train(config: DictConfig) -> bool:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         describe(store, run.info.run_id, config, data.touches("train"))
         learner.fit(data, logger)
-        point = choose(learner, device, config.evaluation)
+        point = choose_operating_point(learner, device, config.evaluation)
         report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
         _keep(store, run, learner)
@@ -223,4 +223,4 @@ def _write(report: Report, task: Task, folder: Path) -> None:
     pq.write_table(report.predictions, folder / "predictions.parquet")
     if report.confusion is not None:
         named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
-        save(confusions(named, ("no", "yes")), folder / "confusion.png")
+        save_figure(confusions(named, ("no", "yes")), folder / "confusion.png")

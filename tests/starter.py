@@ -28,9 +28,9 @@ WARM = (
     "mlflow.store.tracking.sqlalchemy_store",
     "pytorch_lightning.callbacks",
     "skfem",
-    "skin.learner.features",
+    "skin.learner.boosted_trees",
     "skin.learner.network",
-    "skin.evaluation.show",
+    "skin.evaluation.metrics_table",
     "skin.run",
 )
 

@@ -52,7 +52,9 @@ WRITERS = {
     "session.csv": sessions,
     "session.parquet": sessions,
     "page.md": lambda path, device: write(200 * "a", path),
-    "figure.png": lambda path, device: figures.save(figures.traces({"a": torch.ones(9, 3)}, 10.0), path),
+    "figure.png": lambda path, device: figures.save_figure(
+        figures.traces({"a": torch.ones(9, 3)}, 10.0), path
+    ),
     "gains.yaml": lambda path, device: calibration.write(calibration.Calibration({"gain": 99 * [1.0]}), path),
     "verdicts.csv": lambda path, device: evaluation_page.verdicts(torch.ones(9, 4), TOUCH, None, path),
 }
@@ -88,7 +90,7 @@ def test_an_animation_is_whole(tmp_path, configured):
     small = ["data.gestures=10", "simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
     scene = simulated(build_device(configured(*small)), [], None, 0, False)
     with full(500), pytest.raises(InputError, match=r"^cannot write .*x\.gif"):
-        animation.write(scene, "flat", tmp_path / "x.gif")
+        animation.write_animation(scene, "flat", tmp_path / "x.gif")
     assert not list(tmp_path.iterdir())
 
 

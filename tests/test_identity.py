@@ -90,3 +90,19 @@ def test_only_classes_that_moved_are_listed():
     for old, new in RENAMED.items():
         assert old != new
         assert new not in RENAMED, "the table leads to the last name at once"
+
+
+RENAMED_OPTIONS = {
+    "experiment=features": "skin.learner.features.Features",
+    "representation=features": "skin.representation.measured.Measured",
+}
+
+
+@pytest.mark.parametrize("override", RENAMED_OPTIONS)
+def test_a_renamed_option_keeps_its_fingerprint(configured, override):
+    now = plain(checked(configured(override, "model=mlp")))
+    group, old = RENAMED_OPTIONS[override].split(".")[1], deepcopy(now)
+    old[group]["_target_"] = RENAMED_OPTIONS[override]
+    assert old != now
+    assert renamed(old) == now
+    assert digest(old) == digest(now)

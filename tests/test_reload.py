@@ -155,7 +155,7 @@ def whole(tmp_path_factory):
     """What learners save: the name of the file -> its content."""
     found = {}
     for name, learner in (
-        ("features.npz", ["learner=features", "learner.rounds=2"]),
+        ("features.npz", ["learner=boosted_trees", "learner.rounds=2"]),
         ("rules.json", ["learner=rules"]),
     ):
         config = checked(composed(*SKIN, *learner))
@@ -186,7 +186,7 @@ def foreign(**arrays):
 
 
 def tables(rows, columns, labels):
-    """Return an .npz file as learner=features saves it, of random numbers."""
+    """Return an .npz file as learner=boosted_trees saves it, of random numbers."""
     random = np.random.default_rng(0)
     parts = {}
     for split in ("train", "validation"):
@@ -205,7 +205,7 @@ DAMAGED = {
     "other arrays": ("features.npz", lambda content: foreign(a=np.ones(3))),
     "texts": ("features.npz", lambda content: foreign(**dict.fromkeys(
         ("train", "train_labels", "validation", "validation_labels"), np.array([["x"] * 4] * 9)))),
-    "other measurements": ("features.npz", lambda content: tables(20, 5, 4)),
+    "other features": ("features.npz", lambda content: tables(20, 5, 4)),
     "other labels": ("features.npz", lambda content: tables(20, 5, 2)),
     "a list": ("rules.json", lambda content: b"[]"),
     "other rules": ("rules.json", lambda content: b"{}"),
@@ -222,7 +222,7 @@ DAMAGED = {
 @pytest.mark.parametrize("case", DAMAGED)
 def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store, whole, tmp_path):
     name, damage = DAMAGED[case]
-    kind = {"features.npz": "features", "rules.json": "rules", "weights.pt": "network"}[name]
+    kind = {"features.npz": "boosted_trees", "rules.json": "rules", "weights.pt": "network"}[name]
     config = checked(composed(*SKIN, f"learner={kind}"))
     path = tmp_path / name
     path.write_bytes(damage(whole[name]))

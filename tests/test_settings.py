@@ -132,7 +132,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["trainer.max_epochs=0.5"], "trainer.max_epochs=0.5 must be a whole number from 1 up"),
         (["trainer.accelerator=gpus"], "Trainer refuses trainer: .*gpus"),
         (["+trainer.typo=1"], "Trainer refuses trainer: .*typo"),
-        (["learner=features", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal to 1"),
+        (["learner=boosted_trees", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal"),
         (
             ["representation=interp", "representation.pixels=x"],
             "representation.pixels=x must be a valid integer",

@@ -10,12 +10,12 @@ import tempfile
 
 from hydra.utils import instantiate
 
-from experiments.benchmarks.setting import configuration, peak_memory, seconds
+from experiments.benchmarks.harness import median_seconds, peak_memory, training_config
 
 
-def measure(simulator: str, repeats: int) -> dict[str, float]:
+def measure_building(simulator: str, repeats: int) -> dict[str, float]:
     """Return the seconds to build the default skin's operator (median) and the peak memory, bytes."""
-    config = configuration(f"simulator={simulator}")
+    config = training_config(f"simulator={simulator}")
     body, make = instantiate(config.body), instantiate(config.simulator)
     sensors = instantiate(config.layout).sensors(body)
 
@@ -24,8 +24,8 @@ def measure(simulator: str, repeats: int) -> dict[str, float]:
             os.environ["SKIN_CACHE"] = empty
             make(body, sensors)
 
-    return {"build_seconds": seconds(build, repeats), "peak_memory_bytes": peak_memory()}
+    return {"build_seconds": median_seconds(build, repeats), "peak_memory_bytes": peak_memory()}
 
 
 if __name__ == "__main__":
-    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]))))
+    print(json.dumps(measure_building(sys.argv[1], int(sys.argv[2]))))

@@ -17,7 +17,14 @@ from random import Random
 from rich.console import Console
 from rich.progress import Progress
 
-from experiments.benchmarks.pieces import FORMATS, Spoken, binary, damaged, line, senseless
+from experiments.benchmarks.protocol_frames import (
+    FORMATS,
+    WireFormat,
+    binary_frame,
+    damage,
+    invalid_frame,
+    text_line,
+)
 from skin.signal.frame import Frame
 from skin.wire.decoder import Decoder
 
@@ -31,7 +38,7 @@ _LONG = 70_000  # bytes: longer than any line may be
 
 
 def fuzz(
-    count: int, spoken: Spoken, sensors: int, seed: int, told: Callable[[int], object] = id
+    count: int, spoken: WireFormat, sensors: int, seed: int, told: Callable[[int], object] = id
 ) -> dict[str, int]:
     """Feed a decoder with ``count`` chunks of a stream of good, damaged and senseless frames, and noise.
 
@@ -83,7 +90,7 @@ class _Stream:
         pieces, sent: frames and fragments, and bytes, that were made so far.
     """
 
-    def __init__(self, rng: Random, spoken: Spoken, sensors: int) -> None:
+    def __init__(self, rng: Random, spoken: WireFormat, sensors: int) -> None:
         self._rng, self._spoken, self._sensors = rng, spoken, sensors
         self._end = b"\0" if spoken == "binary" else b"\n"
         self.expected: deque[int] = deque()
@@ -136,25 +143,25 @@ class _Stream:
         self._put(self._frame(max(0, self._count - self._rng.randint(0, 3)) % 2**16))
 
     def _damaged(self) -> None:
-        self._put(damaged(self._frame(self._next()), self._rng))
+        self._put(damage(self._frame(self._next()), self._rng))
 
     def _frame(self, number: int) -> bytes:
         clock, values = self._count * _PERIOD % 2**32, self.values(number)
         if self._spoken == "binary":
-            return binary(number, clock, values, number % 3 + 1)
+            return binary_frame(number, clock, values, number % 3 + 1)
         separator, end = self._rng.choice((b",", b";", b"\t", b" ")), self._rng.choice((b"\n", b"\r\n"))
-        return line(_fields(number, clock, values), separator, self._spoken) + end
+        return text_line(_fields(number, clock, values), separator, self._spoken) + end
 
     def _senseless(self) -> None:
         """A frame whose checksum is right and whose content is not: it may not be taken."""
         number, rng = self._next(), self._rng
         clock, values = self._count * _PERIOD % 2**32, self.values(number)
         if self._spoken == "binary":
-            self._put(senseless(number, clock, values, number % 3 + 1, rng))
+            self._put(invalid_frame(number, clock, values, number % 3 + 1, rng))
             return
         fields, trouble = _fields(number, clock, values), rng.randrange(5)
-        check: Spoken = self._spoken
-        others: list[Spoken] = [other for other in FORMATS if other not in (check, "binary")]
+        check: WireFormat = self._spoken
+        others: list[WireFormat] = [other for other in FORMATS if other not in (check, "binary")]
         if trouble == 0:
             fields[rng.randrange(len(fields) - 1)] = rng.choice(_NO_NUMBERS)
         elif trouble == 1:
@@ -165,7 +172,7 @@ class _Stream:
             fields[0] = rng.choice((b"-1", b"0.5"))
         else:
             check = rng.choice(others)
-        self._put(line(fields, b",", check) + b"\n")
+        self._put(text_line(fields, b",", check) + b"\n")
 
     def _noise(self) -> None:
         rng = self._rng

@@ -10,19 +10,19 @@ from statistics import median
 
 import numpy as np
 
-from experiments.benchmarks.setting import configuration, peak_memory
+from experiments.benchmarks.harness import peak_memory, training_config
 from skin.build import build_device
 
 GESTURES = 4038
 
 
-def measure(simulator: str, repeats: int) -> dict[str, float]:
+def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
     """Return gestures per second (median), distinct frames per second and peak memory, bytes.
 
     The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
     readings, imperfections.
     """
-    config = configuration(f"simulator={simulator}", f"data.gestures={GESTURES}")
+    config = training_config(f"simulator={simulator}", f"data.gestures={GESTURES}")
     device = build_device(config).simulated("gestures are generated")
     taken = []
     for seed in range(repeats + 1):
@@ -39,4 +39,4 @@ def measure(simulator: str, repeats: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]))))
+    print(json.dumps(measure_generation(sys.argv[1], int(sys.argv[2]))))

@@ -81,7 +81,7 @@ def poolings(name: Pooling, width: int, graphs: int) -> tuple[Task, dict[str, Ta
     return ours, found
 
 
-def measure(repeats: int) -> dict[str, dict[str, float]]:
+def measure_layers(repeats: int) -> dict[str, dict[str, float]]:
     """Return for each row the time of PyTorch Geometric's layers over that of skin's."""
     found = {}
     for row, (graphs, sizes) in ROWS.items():
@@ -116,4 +116,4 @@ def _alternating(tasks: list[Task], x: Tensor, repeats: int) -> list[float]:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    print(json.dumps(measure(int(sys.argv[1])), indent=2))
+    print(json.dumps(measure_layers(int(sys.argv[1])), indent=2))

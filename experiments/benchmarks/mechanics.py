@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 
-from experiments.benchmarks.setting import configuration, seconds
+from experiments.benchmarks.harness import median_seconds, training_config
 from skin.build import build_device
 from skin.device.base import AbstractSimulated
 from skin.simulator import _pynite
@@ -33,8 +33,10 @@ def direct_seconds_per_frame(simulator: str, gestures_frames: int, repeats: int)
         return factorised(stiffness())
 
     factors = factorise()
-    solving = seconds(lambda: [factors.solve(load @ frame) for frame in pressures], repeats) / len(pressures)
-    return solving + seconds(factorise, repeats) / gestures_frames
+    solving = median_seconds(lambda: [factors.solve(load @ frame) for frame in pressures], repeats) / len(
+        pressures
+    )
+    return solving + median_seconds(factorise, repeats) / gestures_frames
 
 
 def _system(simulator: str) -> tuple[Callable[[], csc_matrix], csc_matrix]:
@@ -42,7 +44,7 @@ def _system(simulator: str) -> tuple[Callable[[], csc_matrix], csc_matrix]:
     if simulator == "fem":
         structure = Structure(_device().body)
         return structure.stiffness, structure.load()
-    settings = configuration("simulator=solid").simulator
+    settings = training_config("simulator=solid").simulator
     mesh = hexahedra(_device().body, settings.divisions, settings.poisson)
     free = ~mesh.held
     return lambda: mesh.stiffness()[free][:, free].tocsc(), mesh.loads(2)[free]
@@ -58,11 +60,11 @@ def pynite_seconds_per_frame(repeats: int) -> float | None:
     structure = Structure(_device().body)
     frame = _pressures()[0].reshape(structure.body.shape)
     models = iter([_pynite.model(structure, frame) for _ in range(repeats + 1)])
-    return seconds(lambda: _pynite.solve(next(models)), repeats)
+    return median_seconds(lambda: _pynite.solve(next(models)), repeats)
 
 
 def _device() -> AbstractSimulated:
-    return build_device(configuration("simulator=fem")).simulated("mechanics are simulated")
+    return build_device(training_config("simulator=fem")).simulated("mechanics are simulated")
 
 
 def _pressures() -> np.ndarray:

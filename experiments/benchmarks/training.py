@@ -2,21 +2,21 @@
 
 import torch
 
+from experiments.benchmarks.harness import median_seconds, training_config
 from experiments.benchmarks.reference_models import PLAIN, train_epoch
-from experiments.benchmarks.setting import configuration, seconds
 from skin.build import build_data, build_device, build_learner
 from skin.console import quiet
 from skin.datamodule import TouchData
 from skin.learner.network import Network
 
 
-def measure(row: str, repeats: int) -> dict[str, float]:
+def measure_training(row: str, repeats: int) -> dict[str, float]:
     """Return the median seconds per epoch on 4038 finite-element gestures, and the plain twin's times that.
 
     Both train on the same touches with batches of 64; samples of the twin are made beforehand.
     """
     quiet()
-    config = configuration("simulator=fem", f"experiment={row}", f"trainer.max_epochs={repeats + 1}")
+    config = training_config("simulator=fem", f"experiment={row}", f"trainer.max_epochs={repeats + 1}")
     data, learner = build_data(config, build_device(config)), build_learner(config)
     assert isinstance(learner, Network)
     learner.fit(data)
@@ -32,5 +32,5 @@ def plain_seconds(row: str, data: TouchData, repeats: int) -> float:
     samples, labels = twin.samples(touches, data.device.size), touches.labels
     optimizer = torch.optim.Adam(twin.parameters(), 1e-3)
     some = 8 * data.batch_size
-    taken = seconds(lambda: train_epoch(twin, optimizer, samples, labels[:some]), repeats)
+    taken = median_seconds(lambda: train_epoch(twin, optimizer, samples, labels[:some]), repeats)
     return taken * len(labels) / some

@@ -51,7 +51,7 @@ def figures(
     from rich.console import Console
 
     from experiments.benchmarks import training
-    from experiments.benchmarks.setting import machine, seconds, versions
+    from experiments.benchmarks.harness import machine, median_seconds, versions
     from experiments.benchmarks.wire import decode_core_share
 
     say = Console(stderr=True).print
@@ -59,19 +59,19 @@ def figures(
     say("generation, device, live")
     found["generation"] = {name: _own("generation", name, str(repeats)) for name in SIMULATORS}
     found["device"] = {"decode_core_share": decode_core_share()}
-    found["live"] = _own("live", "1000")
+    found["live"] = _own("live_latency", "1000")
     say("operator")
     found["operator"] = {name: _own("building", name, str(repeats)) for name in SIMULATORS}
     say("peers of the finite-element skins: about two minutes")
     _compare(found["generation"], repeats, say)
     say("start")
     command = [sys.executable, "-m", "skin", "train", "--help"]
-    help_seconds = seconds(lambda: subprocess.run(command, capture_output=True, check=True), repeats)
+    help_seconds = median_seconds(lambda: subprocess.run(command, capture_output=True, check=True), repeats)
     found["startup"] = {"help_seconds": help_seconds}
     found["training"] = {}
     for row in rows:
         say(f"training of {row}")
-        found["training"][row] = training.measure(row, repeats)
+        found["training"][row] = training.measure_training(row, repeats)
     return found
 
 

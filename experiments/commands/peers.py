@@ -36,15 +36,15 @@ def main(config: DictConfig) -> bool:
 
     from rich.console import Console
 
-    from experiments.peers.runs import learn
-    from experiments.studies.runs import finished
+    from experiments.peers.peer_run import learn
+    from experiments.studies.runs import newest_finished
     from skin.console import quiet
     from skin.run import simulator
     from skin.tracking import Store
 
     quiet()
     store, name = Store.open(own.tracking), f"{own.row} {simulator(own)} seed {own.seed}"
-    before = finished(store, own) if own.tracking.resume else None
+    before = newest_finished(store, own) if own.tracking.resume else None
     if before is not None:
         print(f"run {before.info.run_id} did this before: tracking.resume=false repeats it")
         return False

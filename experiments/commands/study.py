@@ -14,7 +14,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from experiments.studies.study import SMOKE, Study, given, words
+from experiments.studies.study import SMOKE, Study, as_overrides, passed_overrides
 from skin.command import command
 from skin.config import checked
 from skin.errors import InputError
@@ -41,27 +41,27 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
     from rich.console import Console
     from rich.progress import track
 
-    from experiments.studies.page import publish
-    from experiments.studies.runs import known, trained
-    from experiments.studies.trials import trials
+    from experiments.studies.runs import find_runs, train_study
+    from experiments.studies.study_page import publish_study
+    from experiments.studies.trials import run_trials
     from skin.tracking import Store
 
     if study.trainings:
-        store, planned = trained(study, config.smoke)
+        store, planned = train_study(study, config.smoke)
     else:
         store = Store.open(config.tracking)
-        planned = known(study, config, store)
+        planned = find_runs(study, config, store)
     found, console = [], Console(stderr=True)
     shown = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
-    for trial in (trial for one in shown for trial in trials(store, one, study, config, folder)):
+    for trial in (trial for one in shown for trial in run_trials(store, one, study, config, folder)):
         found.append(trial)
         if trial.line:
             print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *trial.files, sep="\n", flush=True)
     if study.metrics:
         smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
-        settings = [word for word in given() if not word.startswith("tracking.")]
+        settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
         title = smoke + ", ".join([f"{study.name}: {study.about}", *(SMOKE if smoke else ()), *settings])
-        publish(study, title, found, folder / f"study_{study.name}")
+        publish_study(study, title, found, folder / f"study_{study.name}")
     if any(one.run is None for one in planned):
         sys.exit(1)
 
@@ -71,13 +71,15 @@ def _measure_skin(study: Study, folder: Path) -> None:
     from hydra import compose
 
     from experiments.studies.measures import Subject
-    from experiments.studies.tables import publish
+    from experiments.studies.tables import publish_page
     from skin.build import build_device
 
     if study.measure is None:
         raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
-    config = checked(compose("train", [*words(study.test), *given()]))
+    config = checked(compose("train", [*as_overrides(study.test), *passed_overrides()]))
     page = study.measure(Subject(config, build_device(config))).page
     print(
-        page.about, *publish(page, f"{study.name}: {study.about}", folder / f"study_{study.name}"), sep="\n"
+        page.about,
+        *publish_page(page, f"{study.name}: {study.about}", folder / f"study_{study.name}"),
+        sep="\n",
     )

@@ -40,7 +40,7 @@ def main(config: DictConfig) -> None:
     multirun(words)
     budget = settings["budget"]
     folder = results(config.out) / ("" if budget == "full" else budget)
-    sys.exit(1 if report(words, budget, folder) else 0)
+    sys.exit(1 if write_results(words, budget, folder) else 0)
 
 
 def sweep(
@@ -51,10 +51,17 @@ def sweep(
     return words + ([f"simulator={','.join(simulators)}"] if simulators else [])
 
 
-def report(words: Sequence[str], budget: str, folder: Path) -> int:
+def write_results(words: Sequence[str], budget: str, folder: Path) -> int:
     """Write and print what finished runs say, with their budget; return how many are missing."""
     from experiments.studies.report_figures import draw_runs, draw_skin
-    from experiments.studies.table import as_csv, collect, grid, report_values, rows, show
+    from experiments.studies.results_table import (
+        collect,
+        display_rows,
+        print_results,
+        report_values,
+        result_rows,
+        results_csv,
+    )
     from experiments.studies.table_rows import Entries
     from experiments.studies.tables import markdown
     from skin.build import build_device
@@ -70,15 +77,15 @@ def report(words: Sequence[str], budget: str, folder: Path) -> int:
     skins = {simulator(config): config for config in reversed(entries.rows)}
     simulators = list(reversed(skins))
     cells.sort(key=lambda cell: simulators.index(cell.simulator))
-    lines = rows(cells, report_values(ROOT / "data" / "report_table.csv"), budget)
+    lines = result_rows(cells, report_values(ROOT / "data" / "report_table.csv"), budget)
     title = _TITLE if budget == "full" else _SMOKE + _TITLE
     paths = [
-        write(markdown(grid(lines), title), folder / "table.md"),
-        write(as_csv(lines), folder / "table.csv"),
+        write(markdown(display_rows(lines), title), folder / "table.md"),
+        write(results_csv(lines), folder / "table.csv"),
     ]
     name = "fem" if "fem" in skins else simulators[-1]
     device = build_device(skins[name]).simulated("the figures of the report are of a simulated skin")
     pictures = [*draw_runs(cells, store, folder), *draw_skin(device, folder, name)]
-    show(lines, title)
+    print_results(lines, title)
     print(f"{', '.join(map(str, paths))} and {len(pictures)} figures beside them")
     return sum(cell.missing for cell in cells)

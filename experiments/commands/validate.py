@@ -23,11 +23,11 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
     from rich.progress import track
 
-    from experiments.validation.index import chosen
-    from experiments.validation.page import publish
+    from experiments.validation.laws import select_laws
+    from experiments.validation.physics_page import publish_physics
 
     settings = plain(config)["validate"]
-    laws = chosen(settings["laws"])
+    laws = select_laws(settings["laws"])
     outcomes = []
     shown = sys.stderr.isatty()
     for law in track(laws, "checking laws", console=Console(stderr=True), disable=not shown):
@@ -40,7 +40,7 @@ def main(config: DictConfig) -> None:
             print(f"  error {one.error:.2g}, tolerance {one.tolerance:g}", flush=True)
     if config.out is not None or settings["laws"] == "all":
         page, data = _places(config.out, settings["quick"])
-        publish(page, data, outcomes)
+        publish_physics(page, data, outcomes)
         print(f"{page / 'physics.md'}, {data}")
     if any(not finding.ok for _, outcome in outcomes for finding in outcome.findings):
         sys.exit(1)

@@ -13,24 +13,24 @@ from torch import Tensor
 from skin.config import Evaluation
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.evaluation.operating_point import gestures
+from skin.evaluation.operating_point import threshold_gestures
 from skin.evaluation.report import columns
 from skin.files import whole
 from skin.files import write as write_text
 from skin.labels import Task
 from skin.recording import Recording, Touches, digest
-from skin.signal.features import measurements
+from skin.signal.features import engineered_features
 from skin.storage import write
 
 SETS = "sets.json"
 ABOUT = "about.json"
 
 
-def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
+def export_touches(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
     """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
-    ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
-    engineered measurements, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
+    ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``features/<set>.parquet`` hold the
+    engineered features, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
     alarm's threshold is chosen), then ``<column>_<number>`` for the sets of
     :func:`skin.evaluation.report.columns`. ``sets.json``, written last, names the content of each set: set ->
     digest. A folder with other touches is emptied, answers and all.
@@ -42,11 +42,12 @@ def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> Non
     """
     if (folder / SETS).is_file():
         known = json.loads((folder / SETS).read_text())
-        if known["train"] == digest(device.touches("train")) and "alarm" in known:
+        complete = "alarm" in known and (folder / "features").is_dir()
+        if complete and known["train"] == digest(device.touches("train")):
             return
         shutil.rmtree(folder)
     learnt = {name: device.touches(name) for name in ("train", "validation")}
-    first = learnt | {"alarm": gestures(device, settings)}
+    first = learnt | {"alarm": threshold_gestures(device, settings)}
     known = {name: _export(touches, device, folder, name) for name, touches in first.items()}
     for column, sets in columns(device, settings).items():
         numbers = count()
@@ -59,13 +60,13 @@ def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> Non
     write_text(json.dumps(known, indent=1) + "\n", folder / SETS)
 
 
-class Foreign:
+class PeerPredictions:
     """Answers to touches with the probabilities that another environment wrote for them.
 
     It knows touches by their content alone, so an answer can never meet other touches than it was given for.
 
     Args:
-        folder: that :func:`export` filled.
+        folder: that :func:`export_touches` filled.
         peer: name of the folder in it with ``about.json`` (what the peer tells of itself) and, per set, a
             ``<set>.parquet`` with one column per label.
         task: what the labels mean.
@@ -99,8 +100,8 @@ def _export(touches: Touches, device: AbstractSimulated, folder: Path, name: str
     """Write one set and return its digest."""
     recording = Recording(touches, device.task, device.size, device.sensors.footprint)
     write(recording, folder / "touches" / f"{name}.parquet")
-    table = {key: values.to(torch.float32).numpy() for key, values in measurements(touches).items()}
-    path = folder / "measurements" / f"{name}.parquet"
+    table = {key: values.to(torch.float32).numpy() for key, values in engineered_features(touches).items()}
+    path = folder / "features" / f"{name}.parquet"
     with whole(path) as partial:
         pa.parquet.write_table(pa.table(table), partial, compression="zstd")
     return digest(touches)

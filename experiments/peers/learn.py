@@ -36,7 +36,7 @@ LIBRARIES = {
 Answer = Callable[[str], np.ndarray]  # of the name of a set
 
 
-def readings(folder: Path, name: str) -> np.ndarray:
+def load_readings(folder: Path, name: str) -> np.ndarray:
     """Return the readings of a set as aeon wants them, (B, S, T), float32, N; what is missing is 0."""
     table = pq.read_table(folder / "touches" / f"{name}.parquet")
     about = json.loads(table.schema.metadata[b"skin"])
@@ -45,13 +45,13 @@ def readings(folder: Path, name: str) -> np.ndarray:
     return np.stack([column.reshape(about["gestures"], about["frames"]) for column in columns], axis=1)
 
 
-def measurements(folder: Path, name: str) -> np.ndarray:
-    """Return the engineered measurements of a set, (B, D), float32."""
-    table = pq.read_table(folder / "measurements" / f"{name}.parquet")
+def load_features(folder: Path, name: str) -> np.ndarray:
+    """Return the engineered features of a set, (B, D), float32."""
+    table = pq.read_table(folder / "features" / f"{name}.parquet")
     return np.stack([column.to_numpy() for column in table.columns], axis=1)
 
 
-def labels(folder: Path, name: str) -> dict[str, np.ndarray]:
+def load_labels(folder: Path, name: str) -> dict[str, np.ndarray]:
     """Return label -> (B,), 0 or 1."""
     about = json.loads(pq.read_schema(folder / "touches" / f"{name}.parquet").metadata[b"skin"])
     table = pq.read_table(folder / "touches" / f"{name}.parquet", columns=about["task"]["names"])
@@ -59,11 +59,11 @@ def labels(folder: Path, name: str) -> dict[str, np.ndarray]:
 
 
 def lightgbm(folder: Path, seed: int, jobs: int) -> tuple[Answer, float, int]:
-    """Boost trees on the measurements, one ensemble per label; validation says when to stop."""
+    """Train gradient-boosted trees on the features, one ensemble per label, with early stopping."""
     from lightgbm import LGBMClassifier, early_stopping
 
-    x, v = (measurements(folder, name) for name in LEARNT)
-    truth, held = (labels(folder, name) for name in LEARNT)
+    x, v = (load_features(folder, name) for name in LEARNT)
+    truth, held = (load_labels(folder, name) for name in LEARNT)
     began, models = time.perf_counter(), []
     for label in truth:
         print(label, flush=True)
@@ -77,7 +77,7 @@ def lightgbm(folder: Path, seed: int, jobs: int) -> tuple[Answer, float, int]:
     trees = [tree for model in models for tree in model.booster_.dump_model()["tree_info"]]
 
     def answer(name: str) -> np.ndarray:
-        table = measurements(folder, name)
+        table = load_features(folder, name)
         return np.stack([model.predict_proba(table)[:, 1] for model in models], axis=1)
 
     return answer, seconds, sum(tree["num_leaves"] for tree in trees)
@@ -114,7 +114,7 @@ def ridge(
     What aeon's classifiers do (ridge on -1 and 1), but the kernels are computed once for all labels, and
     scores become probabilities by Platt's logistic curve through the validation split.
     """
-    x, truth = readings(folder, "train"), labels(folder, "train")
+    x, truth = load_readings(folder, "train"), load_labels(folder, "train")
     print("compiling", flush=True)
     make(jobs, seed).fit_transform(x[:32])
     print("learning", flush=True)
@@ -125,12 +125,12 @@ def ridge(
     del table
 
     def scores(name: str) -> np.ndarray:
-        parts = readings(folder, name)
+        parts = load_readings(folder, name)
         return np.concatenate(
             [model.predict(transform.transform(parts[i : i + CHUNK])) for i in range(0, len(parts), CHUNK)]
         )
 
-    held = labels(folder, "validation").values()
+    held = load_labels(folder, "validation").values()
     curves = [platt(*pair) for pair in zip(scores("validation").T, held, strict=True)]
     seconds = time.perf_counter() - began
 
@@ -170,7 +170,7 @@ def main() -> None:
     out.mkdir(exist_ok=True)
     answer, seconds, parameters = PEERS[arguments.peer](folder, arguments.seed, arguments.jobs)
     sets = [name for name in json.loads((folder / "sets.json").read_text()) if name not in LEARNT]
-    names = list(labels(folder, "train"))
+    names = list(load_labels(folder, "train"))
     for name in sets:
         print(f"answering {name}", flush=True)
         chances = answer(name)

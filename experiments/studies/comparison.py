@@ -72,7 +72,7 @@ def verdict(claim: str, found: Paired | None, by: float = 0.0) -> str:
     return "disagree" if high < least or low > most else "undecided"
 
 
-def conclude(verdicts: Sequence[str]) -> str:
+def combine_verdicts(verdicts: Sequence[str]) -> str:
     """Return the verdict of a statement about several others: it holds only if it holds against each."""
     if "disagree" in verdicts:
         return "disagree"

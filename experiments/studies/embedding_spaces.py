@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 
-from experiments.studies.comparison import conclude, paired, verdict
-from experiments.studies.embedding.probe import FRAME, Found
+from experiments.studies.comparison import combine_verdicts, paired, verdict
+from experiments.studies.embedding.probe import FRAME, ProbeResult
 from experiments.studies.tables import Page
 from skin.plot.figures import COLOURS
 
@@ -23,13 +23,13 @@ morphology; beside it the share of an embedding's variance there that the layout
 that the best label does. On one layout all graphs have one morphology: labelled by degree, as Graph2Vec
 usually is, they are all equal.
 """
-_Figure = Callable[[Found], float]
+_Figure = Callable[[ProbeResult], float]
 
 
-def page(found: Sequence[Found], names: Sequence[str]) -> Page:
+def build_embeddings_page(found: Sequence[ProbeResult], names: Sequence[str]) -> Page:
     """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
-    table = lines(found, names)
-    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in statements(found, names))
+    table = embeddings_table(found, names)
+    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(found, names))
     figure = spaces([one for one in found if one.seed == found[0].seed], names)
     return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
 
@@ -45,7 +45,7 @@ def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
     return TSNE(perplexity=near, init="pca", random_state=0).fit_transform(reduced)
 
 
-def spaces(found: Sequence[Found], names: Sequence[str], points: int = 400) -> Figure:
+def spaces(found: Sequence[ProbeResult], names: Sequence[str], points: int = 400) -> Figure:
     """Draw one row of planes per embedding, coloured by each label and by the layout (report, figure 5).
 
     Args:
@@ -70,7 +70,7 @@ def spaces(found: Sequence[Found], names: Sequence[str], points: int = 400) -> F
     return figure
 
 
-def lines(found: Sequence[Found], names: Sequence[str]) -> list[list[str]]:
+def embeddings_table(found: Sequence[ProbeResult], names: Sequence[str]) -> list[list[str]]:
     """Return the table, its head first: accuracies and shares of variance in per cent, means over seeds."""
     head = ["input", *names, "mean", "layout", "variance: layout", "variance: best label"]
     table = [head]
@@ -87,7 +87,7 @@ def lines(found: Sequence[Found], names: Sequence[str]) -> list[list[str]]:
     return table
 
 
-def statements(found: Sequence[Found], names: Sequence[str]) -> list[str]:
+def embedding_statements(found: Sequence[ProbeResult], names: Sequence[str]) -> list[str]:
     """Return what the touches say of the report's sentences on pretrained embeddings (3.2.4), one line each.
 
     A sentence holds if it does for every embedding; agree and disagree need two standard errors over at least
@@ -120,13 +120,15 @@ def statements(found: Sequence[Found], names: Sequence[str]) -> list[str]:
         mine = [group for key, group in groups.items() if key[0] == attribute]
         for says, claim, figure, reference in claims:
             each = [_compare(group, claim, figure, reference) for group in mine]
-            whole = conclude([word for word, _ in each])
+            whole = combine_verdicts([word for word, _ in each])
             details = "; ".join(detail for _, detail in each)
             said.append(f"Nodes labelled by {attribute}: the embeddings {says}: **{whole}**. {details}.")
     return said
 
 
-def _compare(group: Sequence[Found], claim: str, figure: _Figure, reference: _Figure) -> tuple[str, str]:
+def _compare(
+    group: Sequence[ProbeResult], claim: str, figure: _Figure, reference: _Figure
+) -> tuple[str, str]:
     """Return the verdict on a claim about one embedding, and its figures."""
     able = [one for one in group if one.explained or claim != "greater"]
     one, other = ({str(each.seed): of(each) for each in able} for of in (figure, reference))
@@ -138,26 +140,26 @@ def _compare(group: Sequence[Found], claim: str, figure: _Figure, reference: _Fi
     return word, f"{group[0].name} {100 * difference.mean:+.1f}{spread} points ({word})"
 
 
-def _groups(found: Iterable[Found]) -> dict[tuple[str, str], list[Found]]:
+def _groups(found: Iterable[ProbeResult]) -> dict[tuple[str, str], list[ProbeResult]]:
     """Return what each input told, seed by seed."""
-    groups: dict[tuple[str, str], list[Found]] = {}
+    groups: dict[tuple[str, str], list[ProbeResult]] = {}
     for one in found:
         groups.setdefault((one.attribute, one.name), []).append(one)
     return groups
 
 
-def _mean(one: Found, names: Sequence[str]) -> float:
+def _mean(one: ProbeResult, names: Sequence[str]) -> float:
     """Return the mean accuracy over the labels that could be learnt."""
     return float(np.nanmean([one.accuracy[name] for name in names]))
 
 
-def _chance(one: Found) -> float:
+def _chance(one: ProbeResult) -> float:
     """Return the mean share of the held-out touches that are of their label's commoner class."""
     share = one.space.labels[one.space.train :].mean(axis=0)
     return float(np.maximum(share, 1 - share).mean())
 
 
-def _title(one: Found) -> str:
+def _title(one: ProbeResult) -> str:
     return f"{one.name}, {one.attribute}" if one.attribute else one.name
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 
 from annotated_types import Ge, Gt
 
-from experiments.studies.embedding.settings import Probing
+from experiments.studies.embedding.probe_settings import ProbeSettings
 from skin.errors import InputError
-from skin.evaluation.course import Course
+from skin.evaluation.stream_settings import StreamSettings
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -85,8 +85,8 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What came out.
+class Measurement:
+    """The result of a measure.
 
     Attributes:
         metrics: name -> value; shares are of 1.
@@ -100,7 +100,7 @@ class Measured:
 class Measure(Protocol):
     """A frozen dataclass of settings that measures."""
 
-    def __call__(self, subject: Subject) -> Measured:
+    def __call__(self, subject: Subject) -> Measurement:
         """Measure; InputError where the device or the learner cannot be measured so."""
 
 
@@ -108,27 +108,27 @@ class Measure(Protocol):
 class Accuracy:
     """Accuracy and the like on the test touches."""
 
-    def __call__(self, subject: Subject) -> Measured:
+    def __call__(self, subject: Subject) -> Measurement:
         from skin.evaluation.metrics import metrics
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
         chances = subject.learner.probabilities(touches)
         found = metrics(chances, touches.labels, subject.device.task)
-        return Measured({f"same/{name}": value for name, value in found.items()})
+        return Measurement({f"same/{name}": value for name, value in found.items()})
 
 
 @dataclass(frozen=True)
 class SelfShare:
     """How much of its own row a node of the run's graph is (:func:`skin.representation.graph.self_share`)."""
 
-    def __call__(self, subject: Subject) -> Measured:
+    def __call__(self, subject: Subject) -> Measurement:
         from skin.build import build_data
         from skin.representation.graph import self_share
 
         data = build_data(subject.config, subject.device)
         graph = data.representation_for(data.touches("train").positions)
-        return Measured({"self_share": self_share(graph.adjacency)})  # type: ignore[arg-type]
+        return Measurement({"self_share": self_share(graph.adjacency)})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -143,28 +143,28 @@ class Margins:
 
     gestures: Annotated[int, Ge(1)] = 20000
 
-    def __call__(self, subject: Subject) -> Measured:
-        from experiments.studies.margins import page
+    def __call__(self, subject: Subject) -> Measurement:
+        from experiments.studies.margins_page import build_margins_page
         from skin.evaluation.margins import margins
 
         found = margins(subject.learner, subject.device, self.gestures, subject.point())
-        return Measured({}, page(found, subject.title))
+        return Measurement({}, build_margins_page(found, subject.title))
 
 
-class Streams(Course):
+class Streams(StreamSettings):
     """False alarms per hour of a stream, and accuracy by the share of a touch that a window shows."""
 
-    def __call__(self, subject: Subject) -> Measured:
+    def __call__(self, subject: Subject) -> Measurement:
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.sliding import page
-        from skin.evaluation.sliding import slide
+        from experiments.studies.streams_page import build_streams_page
+        from skin.evaluation.sliding_windows import evaluate_windows
 
         console = Console(stderr=True)
         shown = partial(track, description=subject.title, console=console, transient=True)
-        found = slide(subject.learner, subject.device, self, subject.point(), shown)
-        return Measured(found.metrics(), page(found, subject.title))
+        found = evaluate_windows(subject.learner, subject.device, self, subject.point(), shown)
+        return Measurement(found.metrics(), build_streams_page(found, subject.title))
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Holds:
     touch: Annotated[float, Gt(0)] | None = None
     drift: Annotated[float, Ge(0)] = 0.2
 
-    def __call__(self, subject: Subject) -> Measured:
+    def __call__(self, subject: Subject) -> Measurement:
         from rich.progress import track
 
         from experiments.studies.tables import Page
@@ -201,7 +201,7 @@ class Holds:
         table = [FIELDS, *courses(engine, device, self.gestures, self.rate, partial(track, transient=True))]
         told = (zip(FIELDS, values, strict=True) for values in table[1:])
         lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
-        return Measured({}, Page("\n".join(lines), {"Time to alarm": table}, table))
+        return Measurement({}, Page("\n".join(lines), {"Time to alarm": table}, table))
 
 
 @dataclass(frozen=True)
@@ -214,24 +214,24 @@ class Motion:
 
     gestures: Annotated[int, Ge(1)] = 1000
 
-    def __call__(self, subject: Subject) -> Measured:
-        from experiments.studies.motion import change
+    def __call__(self, subject: Subject) -> Measurement:
+        from experiments.studies.motion import motion_change
         from experiments.studies.tables import Page
 
         device = subject.device.simulated("how sensors move is known in simulation only")
-        found = change(device, self.gestures)
-        return Measured({}, Page(f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"))
+        found = motion_change(device, self.gestures)
+        return Measurement({}, Page(f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"))
 
 
-class Embeddings(Probing):
+class Embeddings(ProbeSettings):
     """What an SVM reads in graph embeddings, in readings, and in the encoder of a run, if one is given."""
 
-    def __call__(self, subject: Subject) -> Measured:
+    def __call__(self, subject: Subject) -> Measurement:
         from rich.console import Console
         from rich.progress import track
 
         from experiments.studies.embedding.probe import probe
-        from experiments.studies.embedding_spaces import page
+        from experiments.studies.embedding_spaces import build_embeddings_page
         from skin.balance import announce
 
         device, learner = subject.device, subject.learner if subject.finished else None
@@ -240,4 +240,4 @@ class Embeddings(Probing):
         steps = probe(device, self, learner)
         found = list(track(steps, "probing", count, console=Console(stderr=True)))
         names = device.task.names
-        return Measured({}, page(found, names))
+        return Measurement({}, build_embeddings_page(found, names))

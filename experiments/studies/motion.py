@@ -53,7 +53,7 @@ class Change:
         return f"{line}: " + ("below 1 %, no effect possible" if small else "an effect is possible")
 
 
-def change(device: AbstractSimulated, count: int, neighbourhood: int = 6) -> Change:
+def motion_change(device: AbstractSimulated, count: int, neighbourhood: int = 6) -> Change:
     """Measure how far ``count`` test gestures move the sensors of a skin in which they can.
 
     Args:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Literal
 
-from experiments.studies.comparison import Paired, conclude, paired, verdict
+from experiments.studies.comparison import Paired, combine_verdicts, paired, verdict
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
 
@@ -14,7 +14,7 @@ UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/dir
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StatementResult:
     """A statement beside what was measured.
 
     Attributes:
@@ -45,7 +45,7 @@ class Difference:
     verdict: str
 
 
-def lines(trials: Sequence[Trial]) -> dict[tuple[str, str], list[Trial]]:
+def group_trials(trials: Sequence[Trial]) -> dict[tuple[str, str], list[Trial]]:
     """Return the trials of each variant and condition, in their order."""
     found: dict[tuple[str, str], list[Trial]] = {}
     for one in trials:
@@ -71,7 +71,7 @@ def values(trials: Sequence[Trial], metric: str, by: Literal["seed", "device"] =
     return {key: fmean(each) for key, each in groups.items()}
 
 
-def conclusions(statements: Sequence[Statement], trials: Sequence[Trial]) -> list[Outcome]:
+def conclusions(statements: Sequence[Statement], trials: Sequence[Trial]) -> list[StatementResult]:
     """Return every statement with its comparisons and its verdict."""
     return [_outcome(statement, trials) for statement in statements]
 
@@ -86,7 +86,7 @@ def differences(study: Study, trials: Sequence[Trial]) -> list[Difference]:
     words = {"agree": "better", "disagree": "worse", "undecided": "undecided"}
     by: Literal["seed", "device"] = "device" if study.devices else "seed"
     found, first = [], dict[str, dict[str, float]]()
-    for (variant, condition), each in lines(trials).items():
+    for (variant, condition), each in group_trials(trials).items():
         figures = values(each, study.metrics[0], by)
         base = first.setdefault(variant if study.conditions else "", figures)
         if base is not figures:
@@ -96,7 +96,7 @@ def differences(study: Study, trials: Sequence[Trial]) -> list[Difference]:
     return found
 
 
-def _outcome(statement: Statement, trials: Sequence[Trial]) -> Outcome:
+def _outcome(statement: Statement, trials: Sequence[Trial]) -> StatementResult:
     _, one = _figures(statement.one, statement.metric, trials)
     others = dict(_figures(other, statement.metric, trials) for other in statement.others)
     if statement.level is not None:
@@ -104,12 +104,12 @@ def _outcome(statement: Statement, trials: Sequence[Trial]) -> Outcome:
         others[f"{statement.level:g}"] = dict.fromkeys(one, scale * statement.level)
     compared = {name: paired(one, other, statement.claim == "ratio") for name, other in others.items()}
     verdicts = [verdict(statement.claim, found, statement.by) for found in compared.values()]
-    return Outcome(statement, compared, conclude(verdicts))
+    return StatementResult(statement, compared, combine_verdicts(verdicts))
 
 
 def _figures(chosen: Mapping[str, str], metric: str, trials: Sequence[Trial]) -> tuple[str, dict[str, float]]:
     """Return the name and, by seed, the figures of the first line that was so chosen."""
-    for (variant, condition), each in lines(trials).items():
+    for (variant, condition), each in group_trials(trials).items():
         known = {**each[0].variant.chosen, "condition": condition}
         if chosen.items() <= known.items():
             name = f"{variant}, {condition}" if condition else variant

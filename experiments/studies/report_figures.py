@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from experiments.studies.table import Cell
+from experiments.studies.results_table import Cell
 from skin.device.base import AbstractSimulated
 from skin.evaluation.metrics import confusion
 from skin.plot import figures
@@ -40,9 +40,9 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
             wrong[row] = ((_column(table, "p_big") > 0.5) != (_column(table, "big") > 0.5))[:, 0].numpy()
         speeds = _column(next(iter(tables.values())), "speed")[:, 0].numpy()
         drawn = figures.confusions(matrices, ("safe", "dangerous"))
-        paths.append(figures.save(drawn, folder / f"figure08_confusion_{simulator}.png"))
+        paths.append(figures.save_figure(drawn, folder / f"figure08_confusion_{simulator}.png"))
         drawn = figures.misclassified(speeds, wrong, "big", _SPEEDS)
-        paths.append(figures.save(drawn, folder / f"figure07_speed_{simulator}.png"))
+        paths.append(figures.save_figure(drawn, folder / f"figure07_speed_{simulator}.png"))
     return paths
 
 
@@ -69,9 +69,9 @@ def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> lis
     return [
         _overview(device, folder),
         *_hand(device, folder),
-        figures.save(image, folder / "figure04_interpolations.png"),
-        figures.save(figures.traces(readings, device.rate), folder / f"figure10_naive_{name}.png"),
-        figures.save(
+        figures.save_figure(image, folder / "figure04_interpolations.png"),
+        figures.save_figure(figures.traces(readings, device.rate), folder / f"figure10_naive_{name}.png"),
+        figures.save_figure(
             figures.force_and_reading(recording.force[four], touches.readings[four], device.rate),
             folder / "figure11_force_reading.png",
         ),
@@ -90,7 +90,7 @@ def _hand(device: AbstractSimulated, folder: Path) -> list[Path]:
         depth = device.body.interfaces[level]
         where = f"{1e3 * depth:g} mm below the surface" if depth else "the surface"
         drawn = surface(moved[level], depth, size, f"finite elements, {name}: {where}")
-        paths.append(figures.save(drawn, folder / f"{file}.png"))
+        paths.append(figures.save_figure(drawn, folder / f"{file}.png"))
     return paths
 
 
@@ -117,7 +117,7 @@ def _overview(device: AbstractSimulated, folder: Path) -> Path:
         device.sensors.positions,
         (device.size, device.rate),
     )
-    return figures.save(drawn, folder / "overview.png")
+    return figures.save_figure(drawn, folder / "overview.png")
 
 
 def _pictures(readings: Tensor, positions: Tensor, size: tuple[float, float]) -> dict[str, Tensor]:

@@ -13,8 +13,8 @@ from hydra.core.singleton import Singleton
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
-from experiments.studies.ensemble import combine
-from experiments.studies.study import Study, Variant, given, sweeps, variants, words
+from experiments.studies.row_ensembles import combine
+from experiments.studies.study import Study, Variant, as_overrides, passed_overrides, sweeps, variants
 from skin.commands import train
 from skin.config import checked, fingerprint
 from skin.errors import InputError
@@ -38,7 +38,7 @@ class Planned:
     run: Run | None
 
 
-def trained(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]]:
+def train_study(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]]:
     """Train what a study lacks, and return where its runs are, and all of them."""
     every = variants(study, smoke)
     store = Store.open(next(iter(every[0].configs.values())).tracking)
@@ -49,7 +49,7 @@ def trained(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]]:
     return store, planned + _ensembles(study, store, planned)
 
 
-def known(study: Study, config: DictConfig, store: Store) -> list[Planned]:
+def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     """Return finished runs: the one that is named, or the newest ones of rows on the simulator of ``config``.
 
     Runs of a row whose names differ in more than the seed are different variants.
@@ -79,7 +79,7 @@ def known(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     return [found[key] for key in sorted(found)]
 
 
-def finished(store: Store, config: DictConfig, **further: str) -> Run | None:
+def newest_finished(store: Store, config: DictConfig, **further: str) -> Run | None:
     """Return the newest finished run of a configuration."""
     return next(iter(store.find("FINISHED", fingerprint=fingerprint(config), **further)), None)
 
@@ -111,7 +111,7 @@ def _another_command() -> Iterator[None]:
 
 def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
     return [
-        Planned(variant, seed, finished(store, config))
+        Planned(variant, seed, newest_finished(store, config))
         for variant in every
         for seed, config in variant.configs.items()
     ]
@@ -124,7 +124,7 @@ def _ensembles(study: Study, store: Store, members: Sequence[Planned]) -> list[P
     planned = []
     for seed in dict.fromkeys(one.seed for one in members) if ways else ():
         for way, variant in ways.items():
-            line = [*words(study.common), *given(), f"seed={seed}", f"row={way}{suffix}"]
+            line = [*as_overrides(study.common), *passed_overrides(), f"seed={seed}", f"row={way}{suffix}"]
             variant.configs[seed] = checked(compose("train", line))
         present = {
             one.variant.name: (one.variant.configs[seed], one.run)

@@ -107,7 +107,7 @@ class Study:
         return cls(**settings | {"statements": [Statement(**one) for one in settings["statements"]]})
 
 
-def given() -> list[str]:
+def passed_overrides() -> list[str]:
     """Return the overrides of the command line that are for trainings, or change finished runs' devices.
 
     What the default training does not have must be added (``+``), though a study's trainings may have it.
@@ -116,19 +116,24 @@ def given() -> list[str]:
     return [f"++{one.lstrip('+')}" if one.startswith("+") else one for one in found]
 
 
-def words(settings: Mapping[str, Any]) -> list[str]:
+def as_overrides(settings: Mapping[str, Any]) -> list[str]:
     """Return settings as overrides; a list is swept."""
     return [f"{key}={_text(value)}" for key, value in settings.items()]
 
 
 def sweeps(study: Study, smoke: bool = False) -> Iterator[tuple[Mapping[str, Any], list[str]]]:
     """Yield each sweep that trains a study's variants: its own settings, and all of its overrides."""
-    last = [*words(study.common), f"seed={_text(study.seeds)}", *(SMOKE if smoke else ()), *given()]
+    last = [
+        *as_overrides(study.common),
+        f"seed={_text(study.seeds)}",
+        *(SMOKE if smoke else ()),
+        *passed_overrides(),
+    ]
     rows = {} if study.rows is None else {"experiment": study.rows}
     fixed = {_key(one) for one in last}
     for block in study.trainings:
         own = {key: value for key, value in (block | rows).items() if key not in fixed}
-        yield own, [*words({key: value for key, value in own.items() if key != "name"}), *last]
+        yield own, [*as_overrides({key: value for key, value in own.items() if key != "name"}), *last]
 
 
 def variants(study: Study, smoke: bool = False) -> list[Variant]:

@@ -6,8 +6,8 @@ from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.peers import PEERS
-from experiments.studies.ensemble import WAYS, combine
-from experiments.studies.runs import finished
+from experiments.studies.row_ensembles import WAYS, combine
+from experiments.studies.runs import newest_finished
 from skin.config import checked
 from skin.paths import CONF
 from skin.run import simulator
@@ -43,7 +43,7 @@ class Entries:
         """Let the report's networks decide together, wherever two of them have finished."""
         for job in self._touches:
             configs = [_composed(*job, f"experiment={row}") for row in MEMBERS]
-            runs = {config.row: (config, finished(store, config)) for config in configs}
+            runs = {config.row: (config, newest_finished(store, config)) for config in configs}
             present = {row: (config, run) for row, (config, run) in runs.items() if run is not None}
             if len(present) > 1:
                 combine(store, present, {way: _composed(*job, f"row={way}") for way in WAYS})

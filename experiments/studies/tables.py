@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from skin.files import write
-from skin.plot.figures import save
+from skin.plot.figures import save_figure
 
 Table = Sequence[Sequence[str]]
 
@@ -36,16 +36,16 @@ class Page:
     figure: Figure | None = None
 
 
-def publish(page: Page, title: str, path: Path) -> list[Path]:
+def publish_page(page: Page, title: str, path: Path) -> list[Path]:
     """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
     sections = [f"#{markdown(table, heading)}" for heading, table in page.tables.items()]
     parts = [f"# {title}\n", *([f"{page.about}\n"] if page.about else []), *sections]
     paths = [write("\n".join(parts), path.with_name(f"{path.name}.md"))]
-    paths += [write(as_csv(page.data), path.with_name(f"{path.name}.csv"))] if page.data else []
-    return paths + ([save(page.figure, path.with_name(f"{path.name}.png"))] if page.figure else [])
+    paths += [write(csv_text(page.data), path.with_name(f"{path.name}.csv"))] if page.data else []
+    return paths + ([save_figure(page.figure, path.with_name(f"{path.name}.png"))] if page.figure else [])
 
 
-def as_csv(table: Iterable[Sequence[object]]) -> str:
+def csv_text(table: Iterable[Sequence[object]]) -> str:
     """Return a table as CSV."""
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(table)
@@ -66,7 +66,9 @@ def percent(value: str, deviation: str = "") -> str:
     return f"{100 * float(value):.1f}{spread}"
 
 
-def show(table: Table, title: str, console: Console | None = None, wrapped: Sequence[str] = ()) -> None:
+def print_table(
+    table: Table, title: str, console: Console | None = None, wrapped: Sequence[str] = ()
+) -> None:
     """Print a table, all numbers whole, however narrow the terminal is.
 
     Args:

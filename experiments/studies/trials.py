@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 
 from experiments.studies.measures import Accuracy, Finished, Measure, Subject
 from experiments.studies.runs import Planned
-from experiments.studies.study import Study, Variant, given, words
-from experiments.studies.tables import publish
+from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
+from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.config import checked, fingerprint
 from skin.reload import TAG, changed, configuration
@@ -49,7 +49,9 @@ class Trial:
     files: Sequence[Path] = ()
 
 
-def trials(store: Store, planned: Planned, study: Study, config: DictConfig, folder: Path) -> Iterator[Trial]:
+def run_trials(
+    store: Store, planned: Planned, study: Study, config: DictConfig, folder: Path
+) -> Iterator[Trial]:
     """Yield what a study measures of a run; what was measured before is read from MLflow.
 
     Args:
@@ -70,8 +72,10 @@ def trials(store: Store, planned: Planned, study: Study, config: DictConfig, fol
     for condition, settings in (study.conditions or {"": {}}).items():
         for number in range(1, study.devices + 1) or ("",):
             numbered = dict.fromkeys(study.numbered, number) if study.devices else {}
-            line = words({**study.test, **settings, **numbered})
-            base, line = (given(), line) if planned.variant.configs else ([], [*line, *given()])
+            line = as_overrides({**study.test, **settings, **numbered})
+            base, line = (
+                (passed_overrides(), line) if planned.variant.configs else ([], [*line, *passed_overrides()])
+            )
             found = subject.measured(study, base, line)
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
@@ -114,7 +118,7 @@ class _Run:
             self.store.client.set_tag(logged.info.run_id, "outcome", found.page.about if found.page else "")
             if found.page is not None:
                 stem = f"{type(what).__name__.lower()}_{own.row}_{logged.info.run_id[:8]}"
-                publish(found.page, subject.title, Path(made) / stem)
+                publish_page(found.page, subject.title, Path(made) / stem)
                 self.store.client.log_artifacts(logged.info.run_id, made)
         return self.store.client.get_run(logged.info.run_id)
 

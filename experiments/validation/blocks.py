@@ -1,4 +1,4 @@
-"""Blocks of the solid's elements with any faces held, solved without the simulator's own solver."""
+"""Blocks of the solid's elements with any faces fixed, solved without the simulator's own solver."""
 
 from collections.abc import Mapping
 
@@ -19,7 +19,7 @@ FACES: dict[str, tuple[int | slice, ...]] = {
     "base": (-1, slice(None), slice(None)),
 }
 ALL = (0, 1, 2)
-# Smooth walls all around: the block is then one part of an endless, mirrored layer.
+# Smooth walls on all sides: the block is then one period of an infinite layer.
 WALLS: dict[str, tuple[int, ...]] = {"left": (0,), "right": (0,), "near": (1,), "far": (1,), "base": ALL}
 
 _FLAT = Sheet([1.0, 1.0], [2, 2], [{"material": "EcoFlex 00-30", "thickness": 1.0}])  # type: ignore[arg-type]
@@ -43,7 +43,7 @@ def block(
 
 
 def graded(fine: float, count: int, far: float, growth: float) -> np.ndarray:
-    """Return lines from 0: ``count`` steps of length ``fine``, then steps that grow until beyond ``far``."""
+    """Return grid lines from 0: ``count`` steps of length ``fine``, then growing steps to beyond ``far``."""
     lines = list(fine * np.arange(count + 1))
     step = fine
     while lines[-1] < far:
@@ -53,7 +53,7 @@ def graded(fine: float, count: int, far: float, growth: float) -> np.ndarray:
 
 
 def held(mesh: Hexahedra, faces: Mapping[str, tuple[int, ...]]) -> np.ndarray:
-    """Return which unknowns are held, (3 N,), bool, from the axes of space held on each face."""
+    """Return which degrees of freedom are fixed, (3 N,), bool, from the fixed axes of each face."""
     columns, rows, deep = mesh.counts
     mask = np.zeros((deep + 1, rows + 1, columns + 1, 3), dtype=bool)
     for face, axes in faces.items():
@@ -62,16 +62,16 @@ def held(mesh: Hexahedra, faces: Mapping[str, tuple[int, ...]]) -> np.ndarray:
     return mask.ravel()
 
 
-def solve(
+def solve_block(
     mesh: Hexahedra, fixed: np.ndarray, forces: np.ndarray, stiffness: sp.csc_matrix | None = None
 ) -> np.ndarray:
-    """Return how far nodes move (3 N, L), m, under nodal forces (3 N, L), N.
+    """Return the nodal displacements (3 N, L), m, under nodal forces (3 N, L), N.
 
     Args:
         mesh: the elements.
-        fixed: (3 N,), which unknowns are held.
+        fixed: (3 N,), bool, which degrees of freedom are fixed.
         forces: N.
-        stiffness: in place of the mesh's own.
+        stiffness: (3 N, 3 N), N/m; None: that of the mesh.
     """
     whole = mesh.stiffness() if stiffness is None else stiffness
     free = np.flatnonzero(~fixed)

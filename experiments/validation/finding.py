@@ -1,4 +1,4 @@
-"""The result of a law: our number, the independent one, and the tolerance."""
+"""The result of checking a law: our number, the reference and the tolerance."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -9,13 +9,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Finding:
-    """One number of ours beside the one it must be.
+    """One number and its reference.
 
     Attributes:
-        case: what was looked at.
+        case: what was computed.
         ours: our number.
         reference: the independent number.
-        error: how far they are apart, relative unless the law says otherwise.
+        error: of our number, relative unless the law says otherwise.
         tolerance: the largest error that passes.
     """
 
@@ -31,13 +31,13 @@ class Finding:
 
     @property
     def ok(self) -> bool:
-        """Whether the law holds; an error that is no number is a failure."""
+        """Whether the error is within the tolerance; an error that is not finite is not."""
         return math.isfinite(self.error) and self.error <= self.tolerance
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of a picture; ``marks`` draws points in place of a line."""
+    """One line of a plot; ``marks`` draws points instead of a line."""
 
     label: str
     x: Sequence[float] | np.ndarray
@@ -46,13 +46,13 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Where a number tells too little.
+class Plot:
+    """A plot of a check.
 
     Attributes:
-        name: of the file, without its ending.
-        title, x, y: above and beside it.
-        curves: what is drawn.
+        name: of the file, without its suffix.
+        title, x, y: title and axis labels.
+        curves: the lines.
         log: whether both axes are logarithmic.
     """
 
@@ -65,12 +65,12 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What checking a law gave: findings, remarks for the page that are judged by nobody, and pictures."""
+class CheckResult:
+    """The result of checking a law: findings, and remarks and plots for the page, which have no verdict."""
 
     findings: Sequence[Finding]
     remarks: Sequence[str] = ()
-    pictures: Sequence[Picture] = ()
+    plots: Sequence[Plot] = ()
 
 
 @dataclass(frozen=True)
@@ -78,19 +78,20 @@ class Law:
     """A law and how it is checked.
 
     Attributes:
-        name: short, lower case; ``laws=`` takes it.
+        name: short, lower case, as ``validate.laws`` takes it.
         statement: what must hold.
-        reference: where the independent answer comes from.
-        check: from whether to be quick (coarser meshes, fewer cases, the same tolerances) to the outcome.
+        reference: source of the independent solution.
+        check: takes whether to be quick (coarser meshes, fewer cases, the same tolerances) and returns the
+            result.
     """
 
     name: str
     statement: str
     reference: str
-    check: Callable[[bool], Outcome] = field(repr=False)
+    check: Callable[[bool], CheckResult] = field(repr=False)
 
 
-def compared(case: str, ours: float, reference: float, tolerance: float) -> Finding:
-    """Return the finding whose error is relative to the reference."""
+def relative_finding(case: str, ours: float, reference: float, tolerance: float) -> Finding:
+    """Return a finding whose error is relative to the reference."""
     error = abs(ours - reference) / abs(reference) if reference else abs(ours)
     return Finding(case, ours, reference, error, tolerance)

@@ -1,4 +1,4 @@
-"""Forces on an elastic half-space, integrated over rectangles; rigid objects on it.
+"""Solutions for an elastic half-space: tractions on a square, and rigid objects.
 
 Point solutions of Boussinesq (across the surface) and Cerruti (along x), as in K. L. Johnson, Contact
 Mechanics (1985), sections 3.2 and 3.6. x and y lie on the surface, z points into the body, stress is positive
@@ -37,7 +37,7 @@ class HalfSpace:
         """G, Pa."""
         return self.young / (2 * (1 + self.poisson))
 
-    def pressed(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def under_pressure(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return motion (P, 3), m, and stress (P, 3): zz, xz, yz, Pa, under pressure.
 
         Args:
@@ -51,7 +51,7 @@ class HalfSpace:
         stress = -3 * z[..., None] ** 2 / (2 * np.pi * r[..., None] ** 5) * np.stack([z, x, y], axis=-1)
         return _sum(motion, weights), _sum(stress, weights)
 
-    def dragged(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def under_shear(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the same under a traction of 1 Pa along x."""
         x, y, z, r, weights = self._about(places)
         rest = 1 - 2 * self.poisson
@@ -63,7 +63,7 @@ class HalfSpace:
         return _sum(motion, weights), _sum(stress, weights)
 
     def middle(self) -> tuple[float, float]:
-        """Return how far the middle of the square moves: down under pressure, along x under traction, m.
+        """Return the displacement of the square's middle, m: down under pressure, along x under traction.
 
         In polar coordinates the singularity cancels: the integral of f(angle) / r is that of f times the
         distance to the square's edge.
@@ -76,7 +76,7 @@ class HalfSpace:
         return float(down), float(along)
 
     def _about(self, places: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return x, y, z and r from every point of the square (Q,) to every place (P,), and their areas."""
+        """Return x, y, z and r from each point of the square (Q,) to each place (P,), and point areas."""
         source = self.half * np.stack(np.meshgrid(_POINTS, _POINTS), axis=-1).reshape(-1, 2)
         weights = self.half**2 * np.outer(_WEIGHTS, _WEIGHTS).ravel()
         x, y = (places[:, axis, None] - source[:, axis] for axis in (0, 1))
@@ -105,7 +105,7 @@ class Hertz:
         return (3 * force * self.radius / (4 * self.modulus)) ** (1 / 3)
 
     def peak(self, force: float) -> float:
-        """Return the pressure in the middle, Pa."""
+        """Return the peak pressure, Pa."""
         return 1.5 * force / (math.pi * self.contact(force) ** 2)
 
 

@@ -23,7 +23,7 @@ def main(config: DictConfig) -> None:
     from pathlib import Path
 
     from skin.build import build_device
-    from skin.plot.animation import still, write
+    from skin.plot.animation import still, write_animation
     from skin.plot.touches import recorded, simulated
 
     device = build_device(config)
@@ -33,5 +33,5 @@ def main(config: DictConfig) -> None:
         field = config.view == "skin3d"
         scene = simulated(device.simulation, list(config.labels), config.shape, config.seed, field)
     path = Path(config.out).expanduser()
-    path = (still if path.suffix == ".png" else write)(scene, config.view, path)
+    path = (still if path.suffix == ".png" else write_animation)(scene, config.view, path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

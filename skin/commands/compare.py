@@ -43,17 +43,17 @@ def main(config: DictConfig) -> None:
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )
     if config.presses is None and gesture_comparison.marked(config.session):
-        pairs = gesture_comparison.read(device, config.session, settings["seed"])
+        pairs = gesture_comparison.read_gestures(device, config.session, settings["seed"])
         truth = [[bool(pair.labels[name]) for name in device.task.names] for pair in pairs.pairs]
-        text = gesture_page.page(
-            pairs, _verdicts(config, device, gesture_comparison.touches(pairs), truth), about
+        text = gesture_page.gestures_markdown(
+            pairs, _verdicts(config, device, gesture_comparison.gesture_touches(pairs), truth), about
         )
-        picture = gesture_page.figure(pairs, settings["shown"], folder / "compare.png")
+        picture = gesture_page.plot_gestures(pairs, settings["shown"], folder / "compare.png")
     else:
-        presses = press_comparison.read(device, config.session, config.presses, settings)
-        both = press_comparison.touches(presses, device.sensors.positions, device.rate, device.window)
-        text = press_comparison.page(presses, _verdicts(config, device, both), about)
-        picture = press_comparison.figure(presses, settings["shown"], folder / "compare.png")
+        presses = press_comparison.read_presses(device, config.session, config.presses, settings)
+        both = press_comparison.press_touches(presses, device.sensors.positions, device.rate, device.window)
+        text = press_comparison.presses_markdown(presses, _verdicts(config, device, both), about)
+        picture = press_comparison.plot_presses(presses, settings["shown"], folder / "compare.png")
     print(text, write(text, folder / "compare.md"), picture, sep="\n")
 
 

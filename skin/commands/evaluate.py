@@ -17,10 +17,10 @@ from skin.files import results
 def main(config: DictConfig) -> None:
     """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
     from skin.console import quiet
+    from skin.evaluation.metrics_table import print_report
     from skin.evaluation.report import evaluate
-    from skin.evaluation.show import report
     from skin.option import option
-    from skin.plot.evaluation_page import publish, verdicts
+    from skin.plot.evaluation_page import publish_evaluation, verdicts
     from skin.reload import changed, configuration, find
     from skin.run import conclude
     from skin.tracking import Store
@@ -48,8 +48,8 @@ def main(config: DictConfig) -> None:
         found = evaluate(learner, device, config.evaluation, point)
         conclude(store, evaluation, found, device.task, {})
         about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
-        written = publish(folder / f"{name}.md", found, device.task, run.info.run_name, about)
+        written = publish_evaluation(folder / f"{name}.md", found, device.task, run.info.run_name, about)
         for path in written:
             store.client.log_artifact(evaluation.info.run_id, str(path))
-    report(found, title)
+    print_report(found, title)
     print(*written, sep="\n")

@@ -1,1 +1,1 @@
-"""The pressure that an object makes where it touches the skin."""
+"""Contact: the pressure of an object on the skin."""

@@ -1,23 +1,23 @@
-"""Pressure under rigid objects on an elastic surface, many at once, by projected conjugate gradients."""
+"""Contact of rigid objects with an elastic surface, in batches, by projected conjugate gradients."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-# Problems solved at once: their vectors then stay in the cache.
+# Problems per batch, so that their vectors stay in the processor's cache.
 _PART = 256
-# Errors under pressure this much smaller than the tolerance are rounding: no direction is taken from them.
+# Errors below this share of the tolerance are rounding, and give no search direction.
 _REST = 0.1
 
 
 class Equilibrium(NamedTuple):
-    """Where objects come to rest.
+    """Solutions of contact problems.
 
     Attributes:
         pressure: (B, N), Pa, not negative.
-        residual: (B,), how far it is from fulfilling the conditions, as :func:`solve` measures it.
-        iterations: (B,), how many were taken.
+        residual: (B,), of the contact conditions; see :func:`solve_contact`.
+        iterations: (B,), number of iterations.
     """
 
     pressure: Tensor
@@ -25,7 +25,7 @@ class Equilibrium(NamedTuple):
     iterations: Tensor
 
 
-def solve(
+def solve_contact(
     compliance: Tensor,
     gap: Tensor,
     total: Tensor,
@@ -39,19 +39,19 @@ def solve(
     the largest gap under pressure or overlap anywhere, as a share of the largest deflection max(C p). Sum and
     sign of the pressure hold exactly at any residual.
 
-    The method is that of Polonsky and Keer (Wear 231, 1999): conjugate gradients in the cells in contact;
-    pressures that turn negative leave, cells that overlap join and restart the directions. Every iteration is
-    one or two products of all pressures with C. Problems that are solved leave the batch. Where the cells in
-    contact are at rest and only others overlap, as under symmetric objects, there is no direction: what is
-    left of their errors is rounding, which differs from one processor to the next, or exactly 0.
+    The method is that of Polonsky and Keer (Wear 231, 1999): conjugate gradients over the cells in contact.
+    Cells whose pressure becomes negative leave the contact; cells that overlap enter it and restart the
+    directions. An iteration costs one or two products of all pressures with C. Solved problems leave the
+    batch. Where the errors of the cells in contact are only rounding, which differs between processors, they
+    give no direction; this happens under symmetric objects.
 
     Args:
         compliance: C (N, N), m/Pa, symmetric and positive definite; its dtype is that of the solution.
         gap: g (B, N), m; infinite where there is no object.
         total: (B,), sum of the pressures, Pa: force by the area of a cell.
-        start: (B, N), pressures to begin with, up to a factor; None: even.
+        start: (B, N), initial pressures, up to a factor; None: uniform.
         tolerance: the residual at which a problem is solved.
-        iterations: at which it is given up.
+        iterations: maximum number of iterations.
     """
     parts = [
         _solve_part(
@@ -84,7 +84,7 @@ def _solve_part(
     rows = torch.arange(len(gap))
     for step in range(iterations + 1):
         residual = state.residual()
-        # The last look is at everything that is left; a residual that is no number is never solved.
+        # The last iteration stores all remaining problems; a residual of NaN never counts as solved.
         leaves = residual <= tolerance if step < iterations else torch.ones_like(residual, dtype=torch.bool)
         if leaves.any():
             gone = rows[leaves]
@@ -111,7 +111,7 @@ class _State:
         self.gap = gap.where(self.allowed, 0)
         even = self.allowed.to(gap)
         begin = even if start is None else start.clamp(min=0) * even
-        # Where the object has left all cells that it pressed before, memory is of no use.
+        # The initial pressure is not usable where the object covers none of its cells.
         begin = torch.where(begin.sum(1, keepdim=True) > 0, begin, even)
         self.pressure = self._loaded(begin, total)
         self.deflection = self.pressure @ compliance

@@ -7,12 +7,12 @@ from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
 
 class AbstractContact(ABC):
-    """Turns what touches the skin into pressure on its cells.
+    """Computes the pressure of objects on the cells of the skin.
 
     Attributes:
-        proportional: twice the force is twice the pressure, so that a touch that stands still is one frame,
-            whatever its time profile, and that the centre of pressure moves as the object does.
-        advice: what else might help where the wanted labels are never met, to end a sentence with.
+        proportional: whether pressure is proportional to force. A static touch is then one frame for any time
+            profile, and the centre of pressure moves with the object.
+        advice: end of the error message where the wanted labels do not occur.
     """
 
     proportional: ClassVar[bool]
@@ -20,4 +20,4 @@ class AbstractContact(ABC):
 
     @abstractmethod
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
-        """Return the pressure of gestures, with the force that gives the wanted labels if there is one."""
+        """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""

@@ -1,4 +1,4 @@
-"""Pressure as in the report: the picture of an object is its pressure."""
+"""Prescribed pressure, as in the report: the image of an object is its pressure."""
 
 from typing import final
 
@@ -13,13 +13,13 @@ from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 
 @final
 class Prescribed(AbstractContact):
-    """The object's grey-scale picture is its pressure, whatever the skin does (report, equations 1 and 2).
+    """Takes the grey-scale image of an object as its pressure (report, equations 1 and 2).
 
-    Choose it for the report's gestures, for a simulator without mechanics, and for objects softer than the
-    skin, which press alike everywhere.
+    Use it for the gestures of the report, for simulators without mechanics, and for objects that are softer
+    than the skin, whose pressure does not depend on the skin.
 
     Args:
-        body, simulator: not asked: the skin has no say.
+        body, simulator: not used.
     """
 
     proportional = True
@@ -28,14 +28,12 @@ class Prescribed(AbstractContact):
         del body, simulator
 
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
-        """Return pictures at the force at which the gesture's highest cell has the wanted pressure."""
+        """Return the images at the force at which the peak cell of the gesture has the wanted pressure."""
         frames = problem.shapes.render(*trajectories.poses)
-        # Equation 2: the drawn peak is the largest cell of the whole movie.
-        highest = (
-            (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
-        )
+        # Equation 2: the drawn peak is that of the whole movie.
+        peak = (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
         width, height = problem.shapes.body.cell
-        force = trajectories.peak * (width * height) / highest
+        force = trajectories.peak * (width * height) / peak
         owner = torch.from_numpy(trajectories.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
         none = np.zeros(len(force), bool)

@@ -1,4 +1,4 @@
-"""Rigid objects: the picture is their height, and contact mechanics gives the pressure."""
+"""Rigid objects: the image gives their height, and contact mechanics the pressure."""
 
 from typing import Annotated, final
 
@@ -9,9 +9,9 @@ from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from skin.body.base import AbstractBody
-from skin.contact._force import Found, seek
-from skin.contact._grain import with_grain
-from skin.contact._unilateral import Equilibrium, solve
+from skin.contact._checkerboard import stabilise_checkerboard
+from skin.contact._force import ForceSearch, find_force
+from skin.contact._unilateral import Equilibrium, solve_contact
 from skin.contact.base import AbstractContact
 from skin.settings import checked
 from skin.simulator.base import AbstractSimulator
@@ -21,36 +21,36 @@ from skin.touch.problem import ContactProblem, ContactResult, Trajectories
 @final
 @checked("contact")
 class Rigid(AbstractContact):
-    """A rigid object, its picture a map of heights, is pressed into the skin, without friction.
+    """Presses a rigid object, whose image is a height map, into the skin, without friction.
 
-    White touches first. The rest lies lower by up to ``relief``; where the picture is black there is no
-    object. Its outline is rounded by an arc of radius ``fillet``, because a sharp edge presses without bound.
-    It stays upright. A fist is then a picture taken from below whose knuckles are white; with ``relief: 0``
-    it is a stamp with the outline of a fist. Heights do not grow with the picture's size.
+    White parts touch first. Other parts are lower by up to ``relief``; there is no object where the image is
+    black. The outline is rounded by an arc of radius ``fillet``, because the pressure under a sharp edge is
+    unbounded. The object does not rotate. The image of a fist shows it from below with white knuckles; with
+    ``relief: 0`` the object is a stamp with the outline of a fist. Heights do not scale with the image.
 
-    The pressure p fulfils p >= 0 and sum(p) = force / cell, and the surface follows the object where p > 0:
-    min p' C p / 2 + g' p, with C the compliance of the surface and g the gap to the object. The force is
-    sought at which the highest cell has the drawn pressure; where classes are wrong there, nearer to the end
-    of the pressure's range that mends them (:mod:`skin.contact._force`). A frame that is not found to
-    ``tolerance`` is never used: its gesture is drawn again, and counted.
+    The pressure p satisfies p >= 0 and sum(p) = force / cell, and the surface follows the object where p > 0:
+    min p' C p / 2 + g' p, with C the compliance of the surface and g the gap to the object. The force is that
+    at which the peak pressure is the drawn one, or, where the classes are wrong there, another one in its
+    range (:mod:`skin.contact._force`). A frame that does not converge to ``tolerance`` is not used: its
+    gesture is drawn again and counted.
 
-    Choose it for hard objects, and to see what the pictures' prescribed pressure is worth. Peaks lie where
-    the skin makes them: at the edges of flat objects, in the middle of round ones.
+    Use it for hard objects, and to assess prescribed pressure. Peaks follow from the mechanics: at the edges
+    of flat objects, in the middle of round ones.
 
     Args:
         body: the skin.
         simulator: gives the compliance of its surface.
         relief: height of white above black, m.
         fillet: radius of the rounded outline, m.
-        tolerance: largest gap under pressure, or overlap, as a share of the largest deflection.
-        iterations: at which a frame is given up.
+        tolerance: largest gap under pressure, or overlap, relative to the largest deflection.
+        iterations: maximum number of iterations per frame.
 
     Raises:
-        InputError: a simulator that has no surface to press on, or settings that cannot be used.
+        InputError: a simulator without a compliance, or settings that cannot be used.
     """
 
     proportional = False
-    advice = "; a rigid object touches less than its picture shows: lower contact.relief"
+    advice = "; a rigid object touches less than its image shows: lower contact.relief"
 
     def __init__(
         self,
@@ -63,50 +63,50 @@ class Rigid(AbstractContact):
     ) -> None:
         self.relief, self.fillet = relief, fillet
         self.tolerance, self.iterations = tolerance, iterations
-        self.compliance = with_grain(simulator.compliance().detach().cpu().double(), body).float()
+        self.compliance = stabilise_checkerboard(simulator.compliance().detach().cpu().double(), body).float()
 
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
-        """Return the pressure at the force that gives the wanted classes, if there is one."""
+        """Return the pressure at a force that gives the wanted classes, if there is one."""
         body = problem.shapes.body
         cell = body.cell[0] * body.cell[1]
         gap = self.gap(trajectories, problem)
         full = np.zeros(len(trajectories.peak))
         np.maximum.at(full, trajectories.owner, trajectories.share)
-        telling = _telling(trajectories, full, gap, problem.footprints)
-        found, lost = self._sought(trajectories, gap, telling, problem)
+        reference = _reference_frames(trajectories, full, gap, problem.footprints)
+        found, lost = self._sought(trajectories, gap, reference, problem)
         force = found.load / full
         refused = np.isnan(force)
 
         solved = np.flatnonzero(~refused[trajectories.owner])
         rows, owner = torch.from_numpy(solved), torch.from_numpy(trajectories.owner[solved])
         totals = torch.from_numpy(force[trajectories.owner[solved]] * trajectories.share[solved] / cell)
-        # A touch that stands still begins with what it was at its strongest.
-        stands = (trajectories.place[solved] == trajectories.place[telling][trajectories.owner[solved]]).all(
-            axis=1
-        )
+        # A static touch starts from its solution at the largest force.
+        stands = (
+            trajectories.place[solved] == trajectories.place[reference][trajectories.owner[solved]]
+        ).all(axis=1)
         start = found.pressure[owner] * torch.from_numpy(stands)[:, None]
-        states = solve(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
+        states = solve_contact(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
         missed = trajectories.owner[solved][(~(states.residual <= self.tolerance)).numpy()]
         lost += np.bincount(missed, minlength=len(force))
 
         frames = gap.isfinite().float()
         shares = torch.from_numpy(trajectories.share).float()[:, None]
         frames[rows] = states.pressure
-        highest = np.zeros(len(force))
-        np.maximum.at(highest, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
+        peak = np.zeros(len(force))
+        np.maximum.at(peak, trajectories.owner[solved], states.pressure.amax(1).double().numpy())
         frames = (frames / shares).view(-1, *body.shape)
-        # Other places of a path, or the mesh under a small object, may raise the peak beyond its range.
+        # At other places of a path, or under a small object, the peak may exceed its range.
         settings = problem.settings
         dangerous = trajectories.wanted[:, 3]
-        refused |= highest > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
+        refused |= peak > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
         refused |= lost > 0
-        return ContactResult(frames, force, highest, refused, found.area, lost)
+        return ContactResult(frames, force, peak, refused, found.area, lost)
 
     def gap(self, trajectories: Trajectories, problem: ContactProblem) -> Tensor:
-        """Return how far the object is above each cell when its highest point touches, (U, H * W), m.
+        """Return the gap between object and cells at first contact, (U, H * W), m.
 
-        Infinite where there is no object. On an arm the object comes down along the normal at its middle, and
-        the skin falls away to its sides.
+        Infinite where there is no object. On an arm the object moves along the normal at its middle, and the
+        gap includes the curvature of the skin.
         """
         solids = problem.shapes.solids(*trajectories.poses)
         lower = self.relief * (1 - solids.grey)
@@ -118,31 +118,31 @@ class Rigid(AbstractContact):
         return lower - lower.amin(1, keepdim=True)
 
     def _sought(
-        self, trajectories: Trajectories, gap: Tensor, telling: np.ndarray, problem: ContactProblem
-    ) -> tuple[Found, np.ndarray]:
-        """Return the loads of each gesture's telling frame, and how many of these were not found."""
-        own = gap[torch.from_numpy(telling)]
+        self, trajectories: Trajectories, gap: Tensor, reference: np.ndarray, problem: ContactProblem
+    ) -> tuple[ForceSearch, np.ndarray]:
+        """Return the loads of each gesture's reference frame, and how many of these did not converge."""
+        own = gap[torch.from_numpy(reference)]
         cell = problem.shapes.body.cell[0] * problem.shapes.body.cell[1]
 
         def solved(rows: np.ndarray, load: np.ndarray, start: Tensor) -> tuple[Equilibrium, np.ndarray]:
             total = torch.from_numpy(load / cell)
-            state = solve(
+            state = solve_contact(
                 self.compliance, own[torch.from_numpy(rows)], total, start, self.tolerance, self.iterations
             )
             return state, (~(state.residual <= self.tolerance)).numpy()
 
-        found = seek(
+        found = find_force(
             solved, own.isfinite().float(), trajectories.peak, trajectories.wanted[:, [0, 3]], problem
         )
         return found, found.failed.astype(np.int64)
 
 
 def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
-    """Return how far cells lie below the plane on which objects touch, (U, H * W), m: 0 on a flat body.
+    """Return the distance of cells below the tangent plane at each object, (U, H * W), m; 0 on a flat body.
 
     Args:
-        body: what is touched.
-        inside: (U, H * W), bool, the cells that each object is above.
+        body: the touched body.
+        inside: (U, H * W), bool, the cells under each object.
     """
     x, y = ((np.arange(count) + 0.5) * size for count, size in zip(body.cells, body.cell, strict=True))
     cells = np.stack([*np.meshgrid(x, y), np.zeros(body.shape)], axis=-1).reshape(-1, 3)
@@ -153,8 +153,10 @@ def _sag(body: AbstractBody, inside: Tensor) -> Tensor:
     return torch.from_numpy(below).float()
 
 
-def _telling(trajectories: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor) -> np.ndarray:
-    """Return the frame of each gesture that covers a sensor best, of those under its largest force, (B,)."""
+def _reference_frames(
+    trajectories: Trajectories, full: np.ndarray, gap: Tensor, footprints: Tensor
+) -> np.ndarray:
+    """Return the frame of each gesture with the largest cover of a sensor, at its largest force, (B,)."""
     cover = (gap.isfinite().float() @ footprints.T).amax(1).double().numpy()
     strongest = trajectories.share >= full[trajectories.owner] * (1 - 1e-9)
     order = np.lexsort((-cover, ~strongest, trajectories.owner))

@@ -87,6 +87,6 @@ def estimated(
 def _motion(simulator: AbstractSimulator, movie: Movie) -> Tensor:
     """Return the motion (B, T, S, 3), m, of sensors under gestures; each distinct frame is solved once."""
     home = next(simulator.buffers(), movie.frames).device
-    drag = None if movie.drag is None else movie.drag.to(home)
-    motion = simulator.motion(movie.frames.to(home), drag)[movie.index.to(home)]
+    shear = None if movie.shear is None else movie.shear.to(home)
+    motion = simulator.motion(movie.frames.to(home), shear)[movie.index.to(home)]
     return motion * movie.scale.to(home)[..., None, None]

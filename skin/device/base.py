@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # only their names are needed here
     from skin.signal.imperfection import Constants, Imperfection
     from skin.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
-    from skin.touch.stream import Strip
+    from skin.touch.stream import TouchStream
     from skin.wire.conversion import Newtons
     from skin.wire.listener import Tap
     from skin.wire.segmentation import AbstractDirector, Take
@@ -172,7 +172,9 @@ class AbstractSimulated(AbstractDevice):
         """
 
     @abstractmethod
-    def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> "Strip":
+    def simulate_stream(
+        self, frames: int, gap: Sequence[int] | None = None, number: int = 0
+    ) -> "TouchStream":
         """Return a test stream in one piece, to be cut as one likes; one device feels all of it.
 
         Args:

@@ -68,8 +68,8 @@ class Cost(AbstractDevice):
         taxel_seed: another number spreads them otherwise.
         window: frames per touch.
         full_scale: what the largest count is called, N.
-        pitch: between neighbouring taxels, m. Not in the file; nothing but the measurements of
-            ``learner=features`` depends on more than proportions.
+        pitch: between neighbouring taxels, m. Not in the file; nothing but the features of
+            ``learner=boosted_trees`` depends on more than proportions.
         split_seed: what the subjects of the splits are drawn from: about 60/10/10/20 per cent of them.
         test_subjects: number or numbers of the subjects of ``test``; None draws them.
         strict: demand the whole corpus, to the row.

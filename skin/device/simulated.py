@@ -30,7 +30,7 @@ from skin.simulator.base import AbstractSimulator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import Movie, TouchSampler, balanced
-from skin.touch.stream import Strip, draw_timeline, touched
+from skin.touch.stream import TouchStream, draw_timeline, only_touches
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
@@ -97,7 +97,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self.sampler = self._sampler(self.body, self.true_sensors, self.model)
         self.window = self.sampler.settings.window
         if self.sampler.settings.shear:
-            self.model.refuse_drag()
+            self.model.refuse_shear()
         self.imperfection = Imperfection.of(self, self.calibration)
         drawn = generator(Stream.CONSTANTS, self.seed)
         self.constants = self.imperfection.constants(len(self.sensors), drawn)
@@ -207,20 +207,20 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         starts = np.cumsum(draw.integers(*settings.stride, count, endpoint=True)) - settings.stride[0]
         length = int(starts[-1]) + self.window
         timeline = draw_timeline(self.sampler, length, settings.gap, draw)
-        true = Strip.of(timeline, self._true(timeline.movie, complete))
+        true = TouchStream.of(timeline, self._true(timeline.movie, complete))
         if self.randomise:
             return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
-        return Strip(timeline, self._felt(true.whole, noise)).cut(torch.from_numpy(starts), self.window)
+        return TouchStream(timeline, self._felt(true.whole, noise)).cut(torch.from_numpy(starts), self.window)
 
     @torch.no_grad()
-    def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Strip:
+    def simulate_stream(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> TouchStream:
         """Return a test stream in one piece; without ``gap``, [least, most], as ``touch.gap`` says."""
         if self.randomise:
-            return self.replace(randomise=False).strip(frames, gap, number)
+            return self.replace(randomise=False).simulate_stream(frames, gap, number)
         key = Stream.TEST, 1, number
         timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
-        true = Strip.of(timeline, self._true(timeline.movie, complete=False))
-        return Strip(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
+        true = TouchStream.of(timeline, self._true(timeline.movie, complete=False))
+        return TouchStream(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
 
     def _true(self, movie: Movie, complete: bool) -> Recording:
         """Return gestures as perfect sensors read them; ``complete`` adds displacements and strains."""
@@ -229,7 +229,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
         touches = Touches(readings, valid, positions, labels, float(self.rate), self.tracker.known(movie))
-        strain = self.model.strain(movie.frames, movie.drag) if complete else None
+        strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # A stream's windows have labels of their own.
         about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
@@ -248,6 +248,6 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
         about: dict[str, Any] = {"source": "simulated", "simulator": type(self.model).__name__}
         about |= {"split": split or "budget", "epoch": epoch, "device_seed": self.seed}
-        shapes, summary = list(self.sampler.shapes.names), summarise(touched(recording), self.body)
+        shapes, summary = list(self.sampler.shapes.names), summarise(only_touches(recording), self.body)
         about |= {"data_seed": self.data_seed, "shapes": shapes, "summary": summary}
         return about | {"versions": _VERSIONS}

@@ -1,4 +1,4 @@
-"""The alarm "dangerous" on a stream: touches found, and false alarms."""
+"""The alarm "dangerous" on a stream: detected touches and false alarms."""
 
 import math
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Alarms:
-    """The alarms while a window slid over a stream.
+    """The alarms on sliding windows over a stream.
 
     Attributes:
         idle_hours: time in which the window showed no touch.
-        false: alarms that began in that time; one that lasts counts once.
-        dangerous: dangerous touches of the stream.
+        false: alarms that began in that time; consecutive alarms count once.
+        dangerous: number of dangerous touches.
         found: those that raised an alarm while the window showed them.
-        safe: safe touches of the stream.
+        safe: number of safe touches.
         raised: those that raised an alarm.
     """
 
@@ -35,7 +35,7 @@ class Alarms:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Rates per hour within 95 % confidence: exact for independent events (Garwood, 1936)."""
+        """95 % confidence interval of the rate per hour, exact for independent events (Garwood, 1936)."""
         if not self.idle_hours:
             return float("nan"), float("nan")
         low = chi2.ppf(0.025, 2 * self.false) / 2 if self.false else 0.0
@@ -70,7 +70,7 @@ class Reached:
 
     @property
     def range(self) -> tuple[float, float]:
-        """False-alarm rates within 95 % confidence: exact (Clopper and Pearson, 1934)."""
+        """95 % confidence interval of the false-alarm rate, exact (Clopper and Pearson, 1934)."""
         if not self.safe:
             return math.nan, math.nan
         low, high = binomtest(self.raised, self.safe).proportion_ci(0.95)
@@ -90,13 +90,13 @@ class Reached:
 
 
 def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float) -> Alarms:
-    """Count the alarms of W windows, one after another.
+    """Return the alarms of W consecutive windows.
 
     Args:
         alarm: (W,), bool.
-        gesture: (W,), the touch that each window shows, as a row of ``dangerous``; -1: none.
+        gesture: (W,), the touch in each window, as an index into ``dangerous``; -1: none.
         dangerous: (G,), bool, of each touch.
-        hours: from one window to the next.
+        hours: time from one window to the next.
     """
     idle = gesture < 0
     wrong = alarm & idle

@@ -1,4 +1,4 @@
-"""Errors of a learner by distance from the class boundary and by faintness of the touch."""
+"""Errors of a learner by distance from the class boundary and by strength of the touch."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from torch import Tensor
 from skin.device.base import AbstractDevice
 from skin.evaluation.alarm import Reached
 from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.report import Answers
+from skin.evaluation.report import Predictor
 from skin.labels import TOUCH, Measures, Thresholds
 from skin.signal.features import above_idle
 
 ALARM = "alarm"
-"""Name of the verdict "dangerous" at the operating point; that of the label is at 0.5."""
+"""Name of the prediction "dangerous" at the operating point; the label itself uses a threshold of 0.5."""
 
 _SHARES = (0, 0.5, 0.8, 0.9, 0.95, 1, 1.05, 1.1, 1.25, 2, torch.inf)  # of the threshold
 _STRENGTHS = (0, 0.3, 0.5, 1, 2, 5, torch.inf)  # N; a touch of 0.3 N is six times the noise
@@ -24,14 +24,14 @@ _STRENGTHS = (0, 0.3, 0.5, 1, 2, 5, torch.inf)  # N; a touch of 0.3 N is six tim
 
 @dataclass(frozen=True)
 class Span:
-    """The touches whose measure lies between two shares of its threshold.
+    """The touches whose measure, relative to its threshold, lies in (low, high].
 
     Attributes:
-        low: they are above it.
-        high: they are not above it; the label holds from 1 on.
-        mean: of their shares.
-        count: how many they are.
-        said: how many the learner says the label of.
+        low: lower end.
+        high: upper end; the label holds above 1.
+        mean: mean relative measure.
+        count: number of touches.
+        said: number of touches for which the learner predicts the label.
     """
 
     low: float
@@ -42,25 +42,25 @@ class Span:
 
     @property
     def wrong(self) -> int:
-        """How many it is wrong of."""
+        """Number of wrong predictions."""
         return self.said if self.high <= 1 else self.count - self.said
 
     @property
     def range(self) -> tuple[float, float]:
-        """Shares said within 95 % confidence: exact (Clopper and Pearson, 1934)."""
+        """95 % confidence interval of the predicted share, exact (Clopper and Pearson, 1934)."""
         low, high = binomtest(self.said, self.count).proportion_ci(0.95)
         return float(low), float(high)
 
 
 @dataclass(frozen=True)
 class Faint:
-    """The touches whose highest reading lies between two forces.
+    """The touches whose largest reading above the idle level lies in (low, high].
 
     Attributes:
-        low: N above the sensor's idle level; they are above it.
-        high: N; they are not above it.
-        count: how many they are.
-        wrong: label -> how many of them the learner is wrong of.
+        low: lower end, N.
+        high: upper end, N.
+        count: number of touches.
+        wrong: label -> number of wrong predictions.
     """
 
     low: float
@@ -70,13 +70,13 @@ class Faint:
 
 
 @dataclass(frozen=True)
-class Margins:
-    """What :func:`margins` found.
+class MarginReport:
+    """Result of :func:`margins`.
 
     Attributes:
-        spans: label -> its spans, from below to above the threshold; ``ALARM`` too.
-        faint: from faint to strong.
-        point: where ``ALARM`` is raised.
+        spans: label, or ``ALARM`` -> its spans in ascending order.
+        faint: by strength, ascending.
+        point: operating point of ``ALARM``.
         reached: its alarms.
     """
 
@@ -86,17 +86,17 @@ class Margins:
     reached: Reached
 
 
-def margins(learner: Answers, device: AbstractDevice, gestures: int, point: OperatingPoint) -> Margins:
-    """Sort a learner's verdicts on whole test touches by what the labels are made of, and by strength.
+def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: OperatingPoint) -> MarginReport:
+    """Return a learner's errors on test touches by the measures that define the labels, and by strength.
 
     Args:
-        learner: trained to tell the labels of ``TOUCH``, perhaps among others.
-        device: that it was trained on, or another.
-        gestures: how many test touches.
-        point: where the learner raises the alarm.
+        learner: trained on the labels of ``TOUCH``, and possibly others.
+        device: its device, or another.
+        gestures: number of test touches.
+        point: operating point of the alarm.
 
     Raises:
-        InputError: a device that does not know how hard and where it is touched.
+        InputError: the device is not simulated, so that the measures are not known.
     """
     simulation = device.simulated(
         f"only simulated touches are known well enough, {type(device).__name__} has none"
@@ -115,15 +115,15 @@ def margins(learner: Answers, device: AbstractDevice, gestures: int, point: Oper
     danger = TOUCH.names.index(LABEL)
     found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    return Margins(found, faint, point, point.reached(chances, labels, TOUCH))
+    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH))
 
 
 def spans(said: Tensor, shares: Tensor) -> list[Span]:
-    """Return the spans of touches that are not empty.
+    """Return the spans that are not empty.
 
     Args:
-        said: (B,), bool, whether the learner says the label.
-        shares: (B,), measure over threshold.
+        said: (B,), bool, whether the learner predicts the label.
+        shares: (B,), measure divided by its threshold.
     """
     return [
         Span(low, high, float(shares[here].mean()), int(here.sum()), int(said[here].sum()))
@@ -132,7 +132,7 @@ def spans(said: Tensor, shares: Tensor) -> list[Span]:
 
 
 def _shares(measures: Measures, thresholds: Thresholds) -> Tensor:
-    """Return each measure over its threshold, (B, 4), in the order of ``TOUCH``."""
+    """Return each measure divided by its threshold, (B, 4), in the order of ``TOUCH``."""
     pairs = (
         (measures.area, thresholds.area),
         (measures.travel, thresholds.travel),

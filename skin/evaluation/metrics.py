@@ -20,24 +20,24 @@ from skin.labels import Task
 def metrics(
     probabilities: Tensor, labels: Tensor, task: Task, point: OperatingPoint | None = None
 ) -> dict[str, float]:
-    """Return accuracy, balanced accuracy, calibration error and what the alarm reaches.
+    """Return accuracy, balanced accuracy, calibration error, and recall and false-alarm rate of the alarm.
 
     Args:
-        probabilities: (B, L); of a direction the mean cosines.
-        labels: (B, L), 0 or 1; of a direction the cosines.
-        task: what the labels mean.
-        point: where the alarm is raised; None: nothing is said of the alarm.
+        probabilities: (B, L); for a direction the mean cosines.
+        labels: (B, L), 0 or 1; for a direction the cosines.
+        task: meaning of the labels.
+        point: operating point of the alarm; None: no metrics of the alarm.
 
     Returns:
         ``<label>/accuracy``, ``/balanced_accuracy`` and ``/ece`` for each label of a binary task, and
-        ``overall/accuracy``: the mean of the labels' accuracies (report, 3.2); an exclusive task has only
-        this. Accuracies are those of a threshold of 0.5. With an operating point there are
-        ``dangerous/alarm_recall`` and ``dangerous/false_alarm_rate`` at its threshold; NaN where no touch is
-        dangerous, or none safe. Where the task has a gate, the other labels are measured on the touches
-        in which it is open, and the gate itself is no part of the overall. Where it has a direction, there
-        are ``direction/degrees``, the mean size of the error, and ``direction/accuracy``, the share of errors
-        up to 45 degrees, of the touches that have one (blind guesses: 90 and .25); no part of the overall.
-        NaN where the touches do not define a value: a recall needs touches with the label and without.
+        ``overall/accuracy``, the mean of the labels' accuracies (report, 3.2); an exclusive task has only
+        this. Accuracies use a threshold of 0.5. An operating point adds ``dangerous/alarm_recall`` and
+        ``dangerous/false_alarm_rate`` at its threshold. Where the task has a gate, the other labels are
+        evaluated on the touches for which it is true, and the gate does not count in the overall values. A
+        direction adds ``direction/degrees``, the mean absolute error, and ``direction/accuracy``, the share
+        of errors up to 45 degrees, on the touches that have one (random guesses: 90 and .25); both do not
+        count in the overall values. Values are NaN where the touches do not define them: a recall needs
+        touches with and without the label.
     """
     alarm: dict[str, float] = {}
     if point is not None:
@@ -69,7 +69,7 @@ def metrics(
 def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
     """Return the angles (B',) between predicted and true directions, degrees, of the touches that have one.
 
-    Cosines of 0 and 0 say nothing: 90 degrees, as a blind guess is wrong on average.
+    Cosines of 0 and 0 give no direction; they count as 90 degrees, the mean error of random guesses.
     """
     rows = task.counts(labels)[:, -1]
     (x, y), (cos, sin) = probabilities[rows, -2:].double().T, labels[rows, -2:].double().T
@@ -78,21 +78,21 @@ def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
 
 
 def _both(label: Tensor) -> bool:
-    """Return whether a label (B,) is there in some touches and not in others."""
+    """Return whether a label (B,) has both classes."""
     return bool(label.any()) and not bool(label.all())
 
 
 def confusion(probabilities: Tensor, labels: Tensor, task: Task | None = None) -> Tensor:
-    """Return counts (L, 2, 2) of probabilities and labels (B, L): true class down, predicted across.
+    """Return confusion matrices (L, 2, 2) of probabilities and labels (B, L), true class in rows.
 
-    With a task that has a gate, each label is counted where it means something. A direction has no counts.
+    If the task has a gate, each label is counted where it is defined. A direction has no matrix.
     """
     pairs = _pairs(probabilities, labels, task)
     return torch.stack([binary_confusion_matrix(chance, label) for chance, label in pairs])
 
 
 def _pairs(probabilities: Tensor, labels: Tensor, task: Task | None) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield the probabilities and labels (B',) of each label, of the touches in which it means something."""
+    """Yield the probabilities and labels (B',) of each label, for the touches for which it is defined."""
     counts = torch.ones_like(labels, dtype=torch.bool) if task is None else task.counts(labels)
     last = probabilities.shape[1] if task is None else len(task.binary)
     for i in range(last):

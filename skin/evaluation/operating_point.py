@@ -1,4 +1,4 @@
-"""The threshold of the alarm "dangerous", chosen for a given false-alarm rate."""
+"""The threshold of the alarm "dangerous" for a given false-alarm rate."""
 
 import json
 import math
@@ -16,13 +16,13 @@ from skin.labels import Task
 from skin.recording import Touches
 
 if TYPE_CHECKING:
-    from skin.evaluation.report import Answers
+    from skin.evaluation.report import Predictor
 
 LABEL = "dangerous"
 ENOUGH = 2000
 """Safe gestures; where 2 % are wanted, the true rate is then 1.4 to 2.7 % (95 %). 5000: 1.6 to 2.4 %."""
 
-_APART = 1e-6  # scores closer than this may change places on another processor
+_APART = 1e-6  # scores closer than this may have another order on another processor
 _MOST_DRAWS = 6
 
 
@@ -31,12 +31,12 @@ class OperatingPoint:
     """An alarm is raised where the probability of ``dangerous`` is greater than the threshold.
 
     Attributes:
-        threshold: exactly representable as float32, so that every comparison gives the same answer.
-        target: largest false-alarm rate that was wanted.
-        safe: number of safe gestures it was chosen on; 0: it was not chosen but is the default of 0.5.
+        threshold: exactly representable as float32, so that comparisons do not depend on the precision.
+        target: largest wanted false-alarm rate.
+        safe: number of safe gestures on which it was chosen; 0: the default of 0.5 was not chosen on any.
         raised: how many of them raise the alarm.
-        seed: of the fresh gestures it was chosen on; None: it was chosen on a validation split.
-        dangerous: dangerous gestures among those it was chosen on.
+        seed: of the fresh gestures on which it was chosen; None: it was chosen on a validation split.
+        dangerous: number of dangerous gestures among those on which it was chosen.
         found: how many of them raise the alarm.
     """
 
@@ -50,12 +50,12 @@ class OperatingPoint:
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":
-        """Return a threshold of 0.5, whose false-alarm rate nobody knows."""
+        """Return a threshold of 0.5, whose false-alarm rate is unknown."""
         return cls(0.5, target, 0, 0, None)
 
     @property
     def silent(self) -> bool:
-        """Whether no probability can raise the alarm."""
+        """Whether the threshold is so high that no probability raises the alarm."""
         return self.threshold >= 1
 
     def alarm(self, chance: Tensor) -> Tensor:
@@ -63,14 +63,14 @@ class OperatingPoint:
         return chance > self.threshold
 
     def reached(self, chances: Tensor, labels: Tensor, task: Task) -> Reached:
-        """Return the alarms on gestures with probabilities (B, L) and labels (B, L) that mean something."""
+        """Return the alarms on gestures with probabilities (B, L) and labels (B, L)."""
         chance, dangerous = _column(chances, labels, task)
         alarm = self.alarm(chance)
         counts = dangerous.sum(), (alarm & dangerous).sum(), (~dangerous).sum(), (alarm & ~dangerous).sum()
         return Reached(*(int(count) for count in counts))
 
     def sentence(self) -> str:
-        """Return the threshold and how it was chosen, in words."""
+        """Return a sentence with the threshold and how it was chosen."""
         wanted = f"alarm above {self.threshold:.4f}"
         if not self.safe:
             return f"{wanted}: not chosen on any gestures, its false-alarm rate is unknown"
@@ -81,26 +81,26 @@ class OperatingPoint:
         return text
 
     def warning(self) -> str | None:
-        """Return what makes this operating point unreliable, in one sentence; None: nothing."""
+        """Return a sentence on why this operating point is unreliable, or None."""
         if self.silent:
             return (
                 f"no threshold has {100 * self.target:g} % false alarms or fewer: "
-                "the most probable answers are given to safe gestures too, no alarm will be raised"
+                "safe gestures have the highest probabilities too, no alarm will be raised"
             )
         if self.safe < ENOUGH:
             return f"{self.sentence()}; {ENOUGH} are needed to rely on that rate"
         return None
 
     def text(self) -> str:
-        """Return it as JSON, for :func:`read`."""
+        """Return the operating point as JSON, for :func:`parse_operating_point`."""
         return json.dumps(asdict(self) | {"label": LABEL})
 
 
-def read(text: str) -> OperatingPoint | None:
-    """Return what :meth:`OperatingPoint.text` wrote; None for ``null``, a task without ``dangerous``.
+def parse_operating_point(text: str) -> OperatingPoint | None:
+    """Return an operating point from its JSON; None for ``null``, of a task without ``dangerous``.
 
     Raises:
-        InputError: it is no operating point.
+        InputError: the text is not an operating point.
     """
     try:
         stored = json.loads(text)
@@ -127,8 +127,8 @@ def read(text: str) -> OperatingPoint | None:
     return point
 
 
-def check(settings: Evaluation) -> None:
-    """Raise InputError where no run can be evaluated, or no threshold chosen, as asked."""
+def check_evaluation(settings: Evaluation) -> None:
+    """Raise InputError where the settings of an evaluation cannot be used."""
     for name, least in (("devices", 0), ("layouts", 0), ("gestures", 1)):
         if getattr(settings, name) < least:
             raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {least}")
@@ -144,16 +144,17 @@ def check(settings: Evaluation) -> None:
         )
 
 
-def gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
+def threshold_gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     """Return the gestures on which the threshold is chosen.
 
-    A simulated device draws fresh ones, until enough of them are safe; others give their validation split.
+    A simulated device draws fresh gestures until enough of them are safe; other devices give their validation
+    split.
     """
-    check(settings)
+    check_evaluation(settings)
     simulation = device.simulation
     if simulation is None or LABEL not in device.task.names:
         return device.touches("validation")
-    # Half of the sampled gestures are safe; windows of streams show a touch less often.
+    # Half of the sampled gestures are safe; some windows of streams show no touch.
     count = 2 * settings.safe_gestures
     for _ in range(_MOST_DRAWS):
         touches = simulation.fresh_touches(count)
@@ -165,41 +166,43 @@ def gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     return touches
 
 
-def choose(learner: "Answers", device: AbstractDevice, settings: Evaluation) -> OperatingPoint | None:
+def choose_operating_point(
+    learner: "Predictor", device: AbstractDevice, settings: Evaluation
+) -> OperatingPoint | None:
     """Return the operating point of a trained learner; None if its task has no label ``dangerous``.
 
     Args:
         learner: trained on ``device``.
-        device: gives the gestures, as :func:`gestures` says.
+        device: gives the gestures; see :func:`threshold_gestures`.
         settings: the target rate and the number of safe gestures.
     """
     if LABEL not in device.task.names:
         return None
-    touches, target = gestures(device, settings), settings.false_alarm_rate
-    assert touches.labels is not None  # it has learnt from them
+    touches, target = threshold_gestures(device, settings), settings.false_alarm_rate
+    assert touches.labels is not None  # the learner was trained on them
     chances = learner.probabilities(touches)
     chance, dangerous = _column(chances, touches.labels, device.task)
     if dangerous.all():
         return OperatingPoint.default(target)
     seed = None if device.simulation is None else device.simulation.data_seed
-    point = OperatingPoint(lowest(chance[~dangerous], target), target, 0, 0, seed)
+    point = OperatingPoint(lowest_threshold(chance[~dangerous], target), target, 0, 0, seed)
     return replace(point, **asdict(point.reached(chances, touches.labels, device.task)))
 
 
-def lowest(safe: Tensor, target: float) -> float:
+def lowest_threshold(safe: Tensor, target: float) -> float:
     """Return the lowest threshold that keeps the false-alarm rate, a float32 number.
 
-    Of n safe gestures k = floor(target (n + 1)) - 1 or fewer raise the alarm. A new safe one then raises it
-    with a probability of (k + 1) / (n + 1) <= target or less (split conformal prediction; Vovk, Gammerman and
-    Shafer 2005). Where n < 1 / target - 1 the threshold is above all scores, and the target is not kept.
-    Scores that differ by less than 2e-6 count as equal: all of them raise the alarm or none.
+    At most k = floor(target (n + 1)) - 1 of n safe gestures raise the alarm. A new safe gesture then raises
+    it with a probability of at most (k + 1) / (n + 1) <= target (split conformal prediction; Vovk, Gammerman
+    and Shafer 2005). If n < 1 / target - 1, the threshold is above all scores, and the target is not met.
+    Scores that differ by less than 2e-6 count as equal: either all of them raise the alarm or none.
 
     Args:
         safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.
         target: largest rate.
     """
     scores = safe.detach().cpu().double().sort(descending=True).values
-    # The summand keeps a product such as 0.29 * 100 from falling below its whole number.
+    # 1e-9 keeps a product such as 0.29 * 100 from rounding below its whole number.
     allowed = max(math.floor(target * (len(scores) + 1) + 1e-9) - 1, 0)
     gaps = scores[:-1] - scores[1:] > 2 * _APART  # [i]: between the first i + 1 scores and the others
     cuts = torch.nonzero(gaps[:allowed]).flatten()
@@ -208,7 +211,7 @@ def lowest(safe: Tensor, target: float) -> float:
 
 
 def _column(chances: Tensor, labels: Tensor, task: Task) -> tuple[Tensor, Tensor]:
-    """Return probabilities (B',) and truth (B',), bool, of the gestures in which it means something."""
+    """Return probabilities (B',) and truth (B',), bool, of the gestures for which the label is defined."""
     place = task.names.index(LABEL)
     rows = task.counts(labels)[:, place]
     return chances[rows, place], labels[rows, place] > 0.5

@@ -24,30 +24,30 @@ from skin.recording import Touches
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
 SHARES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
-"""How the names of the metrics end that are shown in per cent."""
+"""Suffixes of the metrics that are shown in per cent."""
 
 _SHOWN = (*SHARES, "/degrees")
 _UNDEFINED = "not defined, because the test has only gestures with this label or only gestures without it"
 
 
-class Answers(Protocol):
-    """What can be evaluated: a trained learner, or whatever else has an answer to touches."""
+class Predictor(Protocol):
+    """The interface that an evaluation needs: a trained learner, an ensemble of runs, or a peer."""
 
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L); InputError where it cannot take such touches."""
+        """Return the probability of each label, (B, L); raise InputError for touches that do not fit."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What an evaluation found.
+    """Result of an evaluation.
 
     Attributes:
         metrics: ``<column>/<label>/<metric>``, NaN where the touches do not define it. Columns: ``same``
-            (test gestures felt by the device of the training), ``holdout`` (the training budget's last
-            tenth), ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
-        cannot: column, or metric that is not defined -> why there is no figure.
+            (test gestures on the device of the training), ``holdout`` (the last tenth of the training
+            budget), ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
+        cannot: column, or metric that is not defined -> why there is no value.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
-        predictions: a row per test gesture: its labels, probabilities (``p_<label>``) and how it was drawn.
+        predictions: a row per test gesture: labels, probabilities (``p_<label>``) and drawn parameters.
         point: where the alarm is raised; None where the task has no label ``dangerous``.
         reached: the alarms on the gestures of ``same``; None without ``point``.
     """
@@ -61,9 +61,9 @@ class Report:
 
 
 def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
-    """Return the sets of touches behind every column of a report, drawn as they are asked for.
+    """Return the sets of touches of each column of a report, drawn lazily.
 
-    Those of ``unseen_layout`` raise InputError where the sensors make no grid that could be scattered anew.
+    Those of ``unseen_layout`` raise InputError where the sensors cannot form a grid.
     """
     sets = {"same": _once(device, "same"), "holdout": _once(device, "holdout")}
     if (simulation := device.simulation) is not None:
@@ -73,15 +73,15 @@ def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[
 
 
 def evaluate(
-    learner: Answers, device: AbstractDevice, settings: Evaluation, point: OperatingPoint | None
+    learner: Predictor, device: AbstractDevice, settings: Evaluation, point: OperatingPoint | None
 ) -> Report:
-    """Try a trained learner on a device and, where it is simulated, on others like it.
+    """Evaluate a trained learner on a device and, if it is simulated, on other devices and layouts.
 
     Args:
-        learner: trained.
-        device: that it was trained on, or another.
-        settings: which other devices and layouts.
-        point: where the learner raises the alarm; None where its task has no label ``dangerous``.
+        learner: trained learner.
+        device: its device, or another.
+        settings: number of other devices and layouts.
+        point: operating point of the alarm; None where the task has no label ``dangerous``.
     """
     task, found, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
@@ -125,18 +125,18 @@ def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterato
 
 
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield test touches as other devices of the same kind feel them."""
+    """Yield test touches on other devices of the same kind."""
     for number in range(settings.devices):
         other = device.replace(seed=_FIRST_DEVICE + number, test_gestures=settings.gestures)
         yield other.touches("test")
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield test touches as as many sensors at other places, as deep and leaning as these, feel them."""
+    """Yield test touches on other layouts with the same number, depths and normals of sensors."""
     count = len(device.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
-        raise InputError(f"{count} sensors make no grid that could be scattered anew")
+        raise InputError(f"{count} sensors cannot form a grid, so there are no other layouts of them")
     for number in range(settings.layouts):
         layout = Scattered(
             rows,

@@ -63,7 +63,7 @@ def positions(length: int, width: int) -> Tensor:
     return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)
 
 
-class Transformer(nn.Module):
+class TransformerHead(nn.Module):
     """The mean over time of what two layers of self-attention make of the frames.
 
     Positions are computed, not learnt, so that windows of other lengths are taken too.
@@ -111,6 +111,6 @@ HEADS: dict[Head, Callable[[int, int], nn.Module]] = {
     "gru": lambda width, hidden: Recurrent(nn.GRU(width, hidden, batch_first=True)),
     "attention+gru": AttentionGru,
     "residual": Residual,
-    "transformer": Transformer,
+    "transformer": TransformerHead,
 }
 """Each makes a module (B, T, E) -> (B, ``module.width``) from E and the width of its hidden layer."""

@@ -1,4 +1,4 @@
-"""Learning thresholds on what one would look at first."""
+"""One threshold per label on an engineered feature."""
 
 import json
 import time
@@ -15,7 +15,7 @@ from skin.errors import InputError
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
-from skin.signal.features import measurements
+from skin.signal.features import engineered_features
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -29,7 +29,7 @@ LOOK_AT = {
     "dangerous": ("raw sensor maximum 1", "sensor maximum 1"),
     "touch": ("sensor maximum 1",),
 }
-"""How the names of the measurements begin that a rule for a label may use."""
+"""Label -> beginnings of the names of the features that its rule may use."""
 
 _LARGEST_LOGIT = 12.0
 
@@ -38,12 +38,12 @@ _Split = tuple[dict[str, Tensor], np.ndarray]
 
 @dataclass(frozen=True)
 class Rule:
-    """A label holds where a measurement exceeds a threshold.
+    """A label holds where a feature exceeds a threshold.
 
     Attributes:
-        measurement: its name.
-        threshold: in the unit of the measurement.
-        slope: of the log odds above the threshold, per unit; it makes a probability of a distance.
+        measurement: name of the feature; stored under this key in ``rules.json``.
+        threshold: in the unit of the feature.
+        slope: of the log odds above the threshold, per unit of the feature.
     """
 
     measurement: str
@@ -58,8 +58,8 @@ class Rule:
 class Rules(AbstractLearner):
     """Tunes one threshold per label: peak force, duration of contact, travel of the centre, active sensors.
 
-    For every label the measurement and the threshold of the highest training accuracy are taken; the slope is
-    fitted to the validation split. Takes any layout.
+    Each label uses the feature and the threshold with the highest training accuracy. The slope is fitted to
+    the validation split. Any layout is accepted.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -69,22 +69,22 @@ class Rules(AbstractLearner):
         """Tune the thresholds.
 
         Raises:
-            InputError: labels that are not the report's, or the touches have none.
+            InputError: the labels are not those of the report, or the touches have no labels.
         """
         if not set(data.task.names) <= set(LOOK_AT):
             raise InputError(
                 f"learner=rules knows the labels {', '.join(LOOK_AT)}, got {', '.join(data.task.names)}: "
-                "use learner=features"
+                "use learner=boosted_trees"
             )
         began = time.perf_counter()
         train, validation = data.touches("train"), data.touches("validation")
-        known, other = measurements(train.to("cpu")), measurements(validation.to("cpu"))
+        known, other = engineered_features(train.to("cpu")), engineered_features(validation.to("cpu"))
         self._set(
             {
                 name: _tune(
                     name,
-                    _told(known, train.known_labels, data.task, i),
-                    _told(other, validation.known_labels, data.task, i),
+                    _defined(known, train.known_labels, data.task, i),
+                    _defined(other, validation.known_labels, data.task, i),
                 )
                 for i, name in enumerate(data.task.names)
             }
@@ -95,7 +95,7 @@ class Rules(AbstractLearner):
         """Return the probability of each label, (B, L), for touches of any layout."""
         if not self._rules:
             raise RuntimeError("fit or load the learner first")
-        values = measurements(touches.to("cpu"))
+        values = engineered_features(touches.to("cpu"))
         return torch.stack([rule.probability(values) for rule in self._rules.values()], dim=1)
 
     def save(self, folder: Path) -> Path:
@@ -107,10 +107,10 @@ class Rules(AbstractLearner):
         return path
 
     def load(self, data: "TouchData", path: Path) -> None:
-        """Take the rules that ``save`` wrote."""
+        """Load the rules that :meth:`save` wrote."""
         stored = json.loads(Path(path).read_text())
         rules = {name: Rule(**stored[name]) for name in data.task.names}
-        known = measurements(data.touches("train")[:1].to("cpu"))
+        known = engineered_features(data.touches("train")[:1].to("cpu"))
         for name, rule in rules.items():
             numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
             if rule.measurement not in known or not numbers:
@@ -122,16 +122,16 @@ class Rules(AbstractLearner):
         self.parameters = 2 * len(rules)
 
 
-def _told(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
-    """Return the measurements and one label of the touches in which that label means something."""
+def _defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
+    """Return the features and one label of the touches for which that label is defined."""
     rows = task.counts(labels)[:, label].cpu()
     return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()
 
 
 def _tune(label: str, known: _Split, other: _Split) -> Rule:
-    """Return the best rule for one label: measurement and threshold from ``known``, slope from ``other``."""
+    """Return the best rule for one label: feature and threshold from ``known``, slope from ``other``."""
     values, truth = known
-    # A blank ends both, so that maximum 1 does not mean maximum 10 too.
+    # The trailing blank keeps "maximum 1" from matching "maximum 10".
     looked_at = tuple(f"{name} " for name in LOOK_AT[label])
     allowed = [name for name in values if f"{name} ".startswith(looked_at)]
     _, threshold, name = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
@@ -142,7 +142,7 @@ def _tune(label: str, known: _Split, other: _Split) -> Rule:
     def loss(log_slope: float) -> float:
         return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * truth)).mean())
 
-    # No steeper than float32 can tell apart at the furthest touch: ties would blur the ranking.
+    # The slope is limited so that float32 probabilities have no ties, which would change the ranking.
     steepest = np.log(_LARGEST_LOGIT * unit / max(float(np.abs(distance).max()), 1e-12))
     log_slope = minimize_scalar(loss, bounds=(steepest - 9, steepest), method="bounded").x
     return Rule(name, threshold, float(np.exp(log_slope) / unit))
@@ -152,7 +152,7 @@ def _threshold(scores: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Return the highest accuracy of ``scores > threshold`` and that threshold, between two scores."""
     order = np.argsort(scores)
     scores, truth = scores[order], truth[order]
-    # right when cutting after i: the zeros up to i and the ones beyond it
+    # Correct when cutting after i: the zeros up to i and the ones after it.
     right = np.cumsum(1 - truth) + truth.sum() - np.cumsum(truth)
     cut = np.diff(scores) > 0
     if not cut.any():

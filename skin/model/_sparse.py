@@ -53,7 +53,7 @@ def _tap_table() -> Tensor:
     return torch.where(inside[:, None, :, None] & inside[None, :, None, :], tap, TAPS).reshape(4, WINDOW**2)
 
 
-def plan(active: Tensor) -> Plan:
+def plan_convolution(active: Tensor) -> Plan:
     """Return the plan of a 3x3 convolution without padding and a 2x2 pooling of active cells (H, W), bool."""
     count = int(active.sum())
     slot = torch.full(active.shape, count, device=active.device)

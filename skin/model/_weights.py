@@ -14,7 +14,7 @@ _SOURCE = f"https://download.pytorch.org/models/{_OFFICIAL}"
 _WAYS = "model.weights=random trains from scratch"
 
 
-def find(weights: str) -> Path:
+def find_weights(weights: str) -> Path:
     """Return the file that ``model.weights`` stands for.
 
     Args:
@@ -46,7 +46,7 @@ def find(weights: str) -> Path:
     return found
 
 
-def load(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
+def load_weights(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
     """Give a module the weights of a file, without running code that the file may hold.
 
     Args:

@@ -89,7 +89,7 @@ class Cnn(AbstractModel):
         difference = x.flatten(2)[:, :, active.flatten()].permute(2, 1, 0)
         cells = _sparse.Cells(difference, x.new_zeros(x.shape[1], 1), active)
         for weight, bias in self._weights():
-            cells = _sparse.convolve_and_pool(cells, _sparse.plan(cells.active), weight, bias)
+            cells = _sparse.convolve_and_pool(cells, _sparse.plan_convolution(cells.active), weight, bias)
             background = F.relu(cells.background)
             difference = F.relu(cells.difference + cells.background) - background
             # spatial dropout takes whole channels of an image: background and difference alike

@@ -38,7 +38,7 @@ class EfficientNet(AbstractModel):
     Args:
         kind: must be ``image``.
         shape: (C, H, W) with C = 1, fed three times, or C = 3.
-        weights: ``imagenet`` (torchvision's file, see :func:`skin.model._weights.find`; nothing is
+        weights: ``imagenet`` (torchvision's file, see :func:`skin.model._weights.find_weights`; nothing is
             downloaded), the path of such a file, or ``random``.
         frozen: keep the weights and the statistics of batch norm as they are.
         dropout: share of the embedding dropped in training.
@@ -73,7 +73,7 @@ class EfficientNet(AbstractModel):
         if weights == "random":
             self.features.apply(_start)
         else:
-            _weights.load(self, _weights.find(weights), spare=HEAD)
+            _weights.load_weights(self, _weights.find_weights(weights), spare=HEAD)
         self.requires_grad_(not frozen)
         self.train()
 

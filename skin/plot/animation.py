@@ -14,10 +14,10 @@ from PIL.Image import Dither, Image, fromarray, new
 
 from skin.errors import InputError
 from skin.files import whole
-from skin.plot.figures import save
+from skin.plot.figures import save_figure
 from skin.plot.plot3d import sensors_in_space, skin_in_space
 from skin.plot.surface import draw_surface
-from skin.plot.view import FORCE, Draw, Scene, clear, norm, places, space_and_traces, traces
+from skin.plot.view import FORCE, Draw, Scene, clear, draw_traces, norm, places, space_and_traces
 from skin.representation._pixels import centres
 from skin.representation.interp import weights
 
@@ -29,7 +29,7 @@ _SHOWN = 0.15  # share of the strongest reading
 _HALO = (withStroke(linewidth=2, foreground="white"),)
 
 
-def write(scene: Scene, view: str, path: Path) -> Path:
+def write_animation(scene: Scene, view: str, path: Path) -> Path:
     """Write the animation of a touch as GIF, whole: under a temporary name, then in place of what was there.
 
     It plays in real time; more than 100 frames, or more than 25 a second, are thinned out.
@@ -55,15 +55,15 @@ def still(scene: Scene, view: str, path: Path) -> Path:
     """Write the frame with the largest sum of readings as PNG, whole.
 
     Args:
-        scene, view: as in :func:`write`.
+        scene, view: as in :func:`write_animation`.
         path: ``x.png``.
 
     Raises:
-        InputError: as in :func:`write`.
+        InputError: as in :func:`write_animation`.
     """
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     _stage(figure, scene, view)(int(scene.readings.sum(axis=1).argmax()))
-    return save(figure, path)
+    return save_figure(figure, path)
 
 
 def thinning(frames: int, rate: float) -> int:
@@ -119,7 +119,7 @@ def _flat(figure: Figure, scene: Scene) -> Draw:
     few = range(scene.readings.shape[1]) if scene.readings.shape[1] <= _NAMED else range(0)
     numbers = [left.text(0, 0, "", fontsize=7, color="#B03A00", ha="center", path_effects=_HALO) for _ in few]
     left.set(xlabel="x, mm", ylabel="y, mm", xlim=scene.extent[:2], ylim=scene.extent[2:])
-    now = traces(right, scene)
+    now = draw_traces(right, scene)
 
     def draw(frame: int) -> None:
         picture.set_data(movie[frame])
@@ -141,7 +141,7 @@ def _sensors3d(figure: Figure, scene: Scene) -> Draw:
     if scene.body is not None:
         return sensors_in_space(figure, scene, scene.body)
     axis, right = space_and_traces(figure)
-    now, colour = traces(right, scene), norm(scene)
+    now, colour = draw_traces(right, scene), norm(scene)
     width = 450 * math.sqrt(scene.size[0] * scene.size[1] / scene.readings.shape[1])
     axis.set(xlabel="x, mm", ylabel="y, mm", zlabel="reading, N", zlim=(0, scene.strongest))
     axis.set(xlim=scene.extent[:2], ylim=scene.extent[2:])
@@ -164,7 +164,7 @@ def _skin3d(figure: Figure, scene: Scene) -> Draw:
         return skin_in_space(figure, scene, scene.body)
     moved = scene.known(scene.moved)
     axis, right = space_and_traces(figure)
-    now = traces(right, scene)
+    now = draw_traces(right, scene)
 
     def draw(frame: int) -> None:
         clear(axis)

@@ -9,15 +9,15 @@ import pyarrow as pa
 import pyarrow.csv
 from torch import Tensor
 
+from skin.evaluation.metrics_table import format_number
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import SHARES, Report
-from skin.evaluation.show import number
 from skin.files import whole, write
 from skin.labels import Task
-from skin.plot.figures import confusions, save
+from skin.plot.figures import confusions, save_figure
 
 
-def page(found: Report, task: Task, title: str, about: str) -> str:
+def evaluation_markdown(found: Report, task: Task, title: str, about: str) -> str:
     """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.
 
     Args:
@@ -33,10 +33,12 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
     for row in rows:
         if row.endswith(SHARES):
             shares = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join(map(number, shares))} |")
+            lines.append(f"| {row} | {' | '.join(map(format_number, shares))} |")
         if row.endswith("/degrees"):
             sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join(number(x, 1) + '°' * (x is not None) for x in sizes)} |")
+            lines.append(
+                f"| {row} | {' | '.join(format_number(x, 1) + '°' * (x is not None) for x in sizes)} |"
+            )
     if found.point is not None and found.reached is not None:
         lines += ["", f"{found.point.sentence()}; {found.reached.sentence()}."]
     lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
@@ -51,12 +53,12 @@ def page(found: Report, task: Task, title: str, about: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def publish(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
+def publish_evaluation(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [write(page(found, task, title, about), path)]
+    written = [write(evaluation_markdown(found, task, title, about), path)]
     if found.confusion is not None:
         named = dict(zip(task.binary, found.confusion.numpy(), strict=True))
-        written.append(save(confusions(named, ("no", "yes")), path.with_suffix(".png")))
+        written.append(save_figure(confusions(named, ("no", "yes")), path.with_suffix(".png")))
     return written
 
 

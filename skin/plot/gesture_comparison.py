@@ -91,7 +91,7 @@ def marked(path: str) -> bool:
     return isinstance(about, dict) and "window" in about
 
 
-def read(device: AbstractSimulated, path: str, seed: int) -> Gestures:
+def read_gestures(device: AbstractSimulated, path: str, seed: int) -> Gestures:
     """Return the gestures of a session beside their simulation.
 
     Announced gestures are those of an emulator: the same ones are simulated, on the device that is given.
@@ -152,7 +152,7 @@ def _felt(device: AbstractSimulated, drawn: Sequence[Gesture]) -> np.ndarray:
     return (said[:, _IDLE:] - said[:, :_IDLE].median(dim=1, keepdim=True).values).numpy()
 
 
-def touches(found: Gestures) -> tuple[Touches, Touches]:
+def gesture_touches(found: Gestures) -> tuple[Touches, Touches]:
     """Return both sides as a model sees them, simulated and recorded."""
     valid = torch.from_numpy(np.stack([pair.valid for pair in found.pairs]))
     places = torch.from_numpy(found.positions).float()

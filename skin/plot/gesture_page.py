@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from skin.plot.figures import COLOURS, save
+from skin.plot.figures import COLOURS, save_figure
 from skin.plot.gesture_comparison import Gestures
 from skin.plot.press_comparison import Verdicts, agreement
 from skin.wire.segmentation import sentence
 
 
-def page(found: Gestures, verdicts: Verdicts | None, about: str) -> str:
+def gestures_markdown(found: Gestures, verdicts: Verdicts | None, about: str) -> str:
     """Return a page in Markdown.
 
     Args:
@@ -58,7 +58,7 @@ def page(found: Gestures, verdicts: Verdicts | None, about: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def figure(found: Gestures, shown: int, path: Path) -> Path:
+def plot_gestures(found: Gestures, shown: int, path: Path) -> Path:
     """Draw applied force and reading, simulated above, recorded below, for the strongest gestures."""
     strongest = sorted(found.pairs, key=lambda pair: -pair.peaks[0])[:shown]
     drawn = Figure(figsize=(3.6 * len(strongest), 5.4), layout="constrained")
@@ -80,4 +80,4 @@ def figure(found: Gestures, shown: int, path: Path) -> Path:
             twin.set_ylim(-0.05 * max(pair.peaks), 1.1 * max(pair.peaks))
             axis.set_title(f"{name}, gesture {pair.number}, sensor {sensors[row]}", fontsize=9)
         axes[1, column].set_xlabel("time, s")
-    return save(drawn, path)
+    return save_figure(drawn, path)

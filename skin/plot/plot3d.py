@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from skin.body.base import AbstractBody
-from skin.plot.view import FORCE, Draw, Scene, clear, norm, space_and_traces, traces
+from skin.plot.view import FORCE, Draw, Scene, clear, draw_traces, norm, space_and_traces
 
 _ELEVATION, _AZIMUTH = 38.0, -62.0  # degrees, of the eye
 # Towards the eye; y is drawn upside down, so that the chart is seen from outside as it is in flat pictures.
@@ -65,7 +65,7 @@ def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
     known = scene.known(scene.pressure if scene.moved is None else scene.moved)
     axis, right = space_and_traces(figure)
-    now, shell, most = traces(right, scene), _Shell(body), max(float(known.max()), 1e-9)
+    now, shell, most = draw_traces(right, scene), _Shell(body), max(float(known.max()), 1e-9)
     stretch = 1.0
     if scene.moved is None:
         scale, what = Normalize(0, most / 1e3), "pressure, kPa"
@@ -92,7 +92,7 @@ def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
 def sensors_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     """Show each sensor's reading as a bar that stands out of the surface over its place."""
     axis, right = space_and_traces(figure)
-    now, colour, shell = traces(right, scene), norm(scene), _Shell(body)
+    now, colour, shell = draw_traces(right, scene), norm(scene), _Shell(body)
     bare = np.broadcast_to(_SKIN, (*body.shape, 4))
     surface = shell.surface(np.zeros_like(shell.lines[0]))
     figure.colorbar(ScalarMappable(colour, FORCE), ax=axis, label="reading, N", shrink=0.6, pad=0.02)

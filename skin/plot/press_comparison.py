@@ -13,7 +13,7 @@ from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration import bench_session, gauge
 from skin.hardware.calibration.bench import Bench, bench
-from skin.plot.figures import COLOURS, save
+from skin.plot.figures import COLOURS, save_figure
 from skin.recording import Touches
 from skin.rng import Stream, generator
 from skin.signal.resampling import resample
@@ -91,7 +91,7 @@ def agreement(verdicts: Verdicts | None, things: str) -> list[str]:
     return lines
 
 
-def read(
+def read_presses(
     device: AbstractSimulated, path: str, presses: str | None, settings: Mapping[str, Any]
 ) -> "Comparison":
     """Return the presses of a session beside their simulation.
@@ -157,7 +157,9 @@ def _press(found: Comparison, number: int) -> Press | None:
     return Press(number, sensor, float(x @ y / (x @ x)), rmse, float(force[mine].max()), peaks)
 
 
-def touches(found: Comparison, positions: np.ndarray, rate: float, window: int) -> tuple[Touches, Touches]:
+def press_touches(
+    found: Comparison, positions: np.ndarray, rate: float, window: int
+) -> tuple[Touches, Touches]:
     """Return the presses as a model sees them, simulated and recorded: a window from each one's beginning."""
     time, gauge = found.bench.session.time, found.bench.gauge
     begins = [gauge.time[gauge.first[press.number]] for press in found.presses]
@@ -172,7 +174,7 @@ def touches(found: Comparison, positions: np.ndarray, rate: float, window: int) 
     return both[0], both[1]
 
 
-def page(found: Comparison, verdicts: Verdicts | None, about: str) -> str:
+def presses_markdown(found: Comparison, verdicts: Verdicts | None, about: str) -> str:
     """Return a page in Markdown.
 
     Args:
@@ -209,7 +211,7 @@ def page(found: Comparison, verdicts: Verdicts | None, about: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def figure(found: Comparison, shown: int, path: Path) -> Path:
+def plot_presses(found: Comparison, shown: int, path: Path) -> Path:
     """Draw applied force and reading, simulated above, recorded below, for the strongest presses."""
     strongest = sorted(found.presses, key=lambda press: -press.peaks[0])[:shown]
     drawn = Figure(figsize=(3.6 * len(strongest), 5.4), layout="constrained")
@@ -230,4 +232,4 @@ def figure(found: Comparison, shown: int, path: Path) -> Path:
             twin.set_ylim(-0.05 * top, top)
             axis.set_title(f"{name}, press {one.number}, sensor {one.sensor}", fontsize=9)
         axes[1, column].set_xlabel("time, s")
-    return save(drawn, path)
+    return save_figure(drawn, path)

@@ -78,7 +78,7 @@ def clear(axis: Axes3D) -> None:
         shown.remove()
 
 
-def traces(axis: Axes, scene: Scene) -> Draw:
+def draw_traces(axis: Axes, scene: Scene) -> Draw:
     """Draw all readings over time, with a line that says when the rest of the picture is."""
     axis.plot(np.arange(len(scene.readings)) / scene.rate, scene.readings, linewidth=0.8)
     line = axis.axvline(0, color="black", linewidth=0.8, linestyle=":")

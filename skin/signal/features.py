@@ -12,8 +12,8 @@ IDLE = 0.2  # a touch rests for at least a fifth of its window
 BEST = 10  # how many sorted values are kept
 
 
-def measurements(touches: Touches) -> dict[str, Tensor]:
-    """Return about 130 named measurements, (B,) each, of touches of any layout.
+def engineered_features(touches: Touches) -> dict[str, Tensor]:
+    """Return about 130 named features, (B,) each, of touches of any layout.
 
     Nearly all are of what exceeds a sensor's idle level; readings that are not valid count as idle.
     """

@@ -140,9 +140,9 @@ class Structure:
     def _layer(self, level: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Return rows, columns and values of one layer's plates and of its beams."""
         layer = self.body.layers[level]
-        plate = _plate.stiffness(*self.body.cell, layer.thickness, layer.material)
+        plate = _plate.plate_stiffness(*self.body.cell, layer.thickness, layer.material)
         width, height = (np.diff(_section_edges(self.body, axis)) for axis in (0, 1))
-        beams = _beam.stiffness(
+        beams = _beam.beam_stiffness(
             np.tile(width, len(height)), np.repeat(height, len(width)), layer.thickness, layer.material
         )
         beams = beams * _beam_moduli(self.body)[level].reshape(-1, 1, 1)

@@ -12,7 +12,7 @@ from skin.material import Material
 _AXES = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 
 
-def stiffness(width: np.ndarray, height: np.ndarray, length: float, material: Material) -> np.ndarray:
+def beam_stiffness(width: np.ndarray, height: np.ndarray, length: float, material: Material) -> np.ndarray:
     """Return the stiffness (n, 12, 12) of n beams of one length.
 
     Args:

@@ -17,7 +17,7 @@ _BENDING = [6 * node + dof for node in range(4) for dof in (2, 3, 4)]
 _MEMBRANE = [6 * node + dof for node in range(4) for dof in (0, 1)]
 
 
-def stiffness(a: float, b: float, thickness: float, material: Material) -> np.ndarray:
+def plate_stiffness(a: float, b: float, thickness: float, material: Material) -> np.ndarray:
     """Return the stiffness (24, 24) of a plate a x b x thickness, m: forces in N, moments in N m."""
     elastic = (
         material.young

@@ -100,32 +100,32 @@ class Relaxing(AbstractSimulator):
     def _relaxed(self) -> AbstractSimulator:
         return self.models[0]  # type: ignore[return-value]
 
-    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+    def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa, that has always been there."""
-        return self._relaxed(pressure, drag)
+        return self._relaxed(pressure, shear)
 
-    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return how far sensors move under pressure that has always been there, (..., S, 3), m."""
-        return self._relaxed.motion(pressure, drag)
+        return self._relaxed.motion(pressure, shear)
 
     def compliance(self) -> Tensor:
         """Return the compliance for pressure that has always been there, (H*W, H*W), m/Pa."""
         return self._relaxed.compliance()
 
-    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor | None:
+    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
         """Return the largest strain under pressure that has always been there, (U,): no load has a larger."""
-        return self._relaxed.strain(pressure, drag)
+        return self._relaxed.strain(pressure, shear)
 
     def play(
         self,
         frames: Tensor,
         index: Tensor,
         scale: Tensor,
-        drag: Tensor | None = None,
+        shear: Tensor | None = None,
         displacement: bool = True,
     ) -> Response:
         """Return the response to movies that begin at rest."""
-        parts = [model.linear(frames, drag)[index] * scale[..., None] for model in self.models]  # type: ignore[operator]
+        parts = [model.linear(frames, shear)[index] * scale[..., None] for model in self.models]  # type: ignore[operator]
         time = torch.arange(index.shape[1], device=scale.device) / self.rate
         felt = parts[-1]
         # A difference of operators that are alike; in float32 the lags' shares would magnify its rounding.

@@ -40,19 +40,19 @@ class AbstractSimulator(nn.Module, ABC):
     mechanical: ClassVar[bool] = True
 
     @abstractmethod
-    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+    def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa.
 
         Args:
             pressure: on the surface cells, into the skin.
-            drag: (..., 2), the traction along x and y that goes with each frame, over its pressure: the
+            shear: (..., 2), the traction along x and y that goes with each frame, over its pressure: the
                 coefficient of friction times the direction in which the object moves. None: no friction.
 
         Raises:
-            InputError: drag, where the simulator feels none.
+            InputError: shear, where the simulator feels none.
         """
 
-    def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def linear(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return what is linear in the pressure, (..., R): that of which :meth:`read` makes the response.
 
         Raises:
@@ -72,7 +72,7 @@ class AbstractSimulator(nn.Module, ABC):
         frames: Tensor,
         index: Tensor,
         scale: Tensor,
-        drag: Tensor | None = None,
+        shear: Tensor | None = None,
         displacement: bool = True,
     ) -> Response:
         """Return the response to movies, (B, T, ...); each distinct frame is solved for once.
@@ -81,10 +81,10 @@ class AbstractSimulator(nn.Module, ABC):
             frames: (U, H, W), Pa.
             index: (B, T), which frame is shown.
             scale: (B, T), by what it is multiplied.
-            drag: (U, 2), as of :meth:`forward`.
+            shear: (U, 2), as of :meth:`forward`.
             displacement: False leaves it out.
         """
-        readings, moves = self(frames, drag)
+        readings, moves = self(frames, shear)
         shown = readings[index] * scale[..., None]
         if moves is None or not displacement:
             return Response(shown, None)
@@ -96,11 +96,11 @@ class AbstractSimulator(nn.Module, ABC):
         The displacement is None if the simulator knows none, or if it is not asked for.
         """
         home = next(self.buffers(), movie.frames).device
-        drag = None if movie.drag is None else movie.drag.to(home)
+        shear = None if movie.shear is None else movie.shear.to(home)
         index, scale = movie.index.to(home), movie.scale.to(home)
-        return self.play(movie.frames.to(home), index, scale, drag, displacement)
+        return self.play(movie.frames.to(home), index, scale, shear, displacement)
 
-    def refuse_drag(self) -> None:
+    def refuse_shear(self) -> None:
         """Raise an InputError that says which simulator feels friction, unless this one does."""
         if not self.feels_shear:
             raise InputError(
@@ -116,13 +116,13 @@ class AbstractSimulator(nn.Module, ABC):
                 "forces across the surface: set simulator=solid, or give normals (0, 0, 1)"
             )
 
-    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
 
-        Positively homogeneous like the response, and with ``drag`` (..., 2) as :meth:`forward` takes it.
+        Positively homogeneous like the response, and with ``shear`` (..., 2) as :meth:`forward` takes it.
 
         Raises:
-            InputError: in this simulator sensors do not move along the sheet, or it feels no drag.
+            InputError: in this simulator sensors do not move along the sheet, or it feels no shear.
         """
         raise InputError(
             f"sensors that move need a simulator in which they can, got simulator={self._name}: "
@@ -140,7 +140,7 @@ class AbstractSimulator(nn.Module, ABC):
             f"simulator={self._name}: set simulator=solid, or contact=prescribed"
         )
 
-    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor | None:
+    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
         """Return the largest principal strain of the top layer under pressures (U, H, W), (U,), 1.
 
         By the linear solution, which holds to about 0.3. None where the simulator has no mechanics.

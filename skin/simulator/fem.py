@@ -77,18 +77,18 @@ class PlatesAndBeams(AbstractSimulator):
         moves = np.concatenate([self.operator.along_x, self.operator.along_y, self.operator.sensor])
         self.register_buffer("along", torch.from_numpy(moves.T.copy()).float())
 
-    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+    def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa, with D_s and D_t as its displacement.
 
         Raises:
-            InputError: drag; only normal forces are felt.
+            InputError: shear; only normal forces are felt.
         """
-        return self.read(self.linear(pressure, drag))
+        return self.read(self.linear(pressure, shear))
 
-    def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def linear(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return D_s, D_t and the force that the reading is made of, (..., 3 S)."""
-        if drag is not None:
-            self.refuse_drag()
+        if shear is not None:
+            self.refuse_shear()
         return flatten(pressure, self.shape, self.transfer.dtype) @ self.transfer
 
     def read(self, linear: Tensor) -> Response:
@@ -103,7 +103,7 @@ class PlatesAndBeams(AbstractSimulator):
         share = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
         return Response(share * force, displacement)
 
-    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return by how much of its thickness the top layer is squeezed where it is most, (U,)."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         return largest(cells, self._squeeze.to(cells.device))
@@ -112,14 +112,14 @@ class PlatesAndBeams(AbstractSimulator):
     def _squeeze(self) -> Tensor:
         return torch.from_numpy(squeeze(self._structure)[None]).float()
 
-    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
 
         Raises:
-            InputError: nodes are held along x and y; or drag.
+            InputError: nodes are held along x and y; or shear.
         """
-        if drag is not None:
-            self.refuse_drag()
+        if shear is not None:
+            self.refuse_shear()
         if self.constraint != "free":
             raise InputError(
                 "sensors that move need a skin that does, got simulator.constraint="

@@ -42,13 +42,13 @@ class Naive(AbstractSimulator):
         area = body.footprint_areas(sensors).sum(axis=1)
         self.register_buffer("area", torch.from_numpy(area).float())
 
-    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
+    def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the response to pressure (..., H, W), Pa; it knows no displacement.
 
         Raises:
-            InputError: drag; only normal forces are felt.
+            InputError: shear; only normal forces are felt.
         """
-        if drag is not None:
-            self.refuse_drag()
+        if shear is not None:
+            self.refuse_shear()
         cells = flatten(pressure, self.shape, self.area.dtype)
         return Response(cells[..., self.cell] * self.area, None)

@@ -76,22 +76,22 @@ class Solid(AbstractSimulator):
         self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
         self._sensors = len(sensors)
 
-    def forward(self, pressure: Tensor, drag: Tensor | None = None) -> Response:
-        """Return the response to pressure (..., H, W), Pa, and drag (..., 2), with D_s and D_t."""
-        return self.read(self.linear(pressure, drag))
+    def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
+        """Return the response to pressure (..., H, W), Pa, and shear (..., 2), with D_s and D_t."""
+        return self.read(self.linear(pressure, shear))
 
-    def linear(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def linear(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return readings, D_s and D_t, (..., 3 S)."""
-        return self._rows(pressure, drag, slice(3 * self._sensors))
+        return self._rows(pressure, shear, slice(3 * self._sensors))
 
-    def _rows(self, pressure: Tensor, drag: Tensor | None, chosen: slice) -> Tensor:
-        """Return some rows of the operator times the load of pressure and drag."""
+    def _rows(self, pressure: Tensor, shear: Tensor | None, chosen: slice) -> Tensor:
+        """Return some rows of the operator times the load of pressure and shear."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         felt = cells @ self.transfer[_INWARDS, :, chosen]
-        if drag is not None:
+        if shear is not None:
             for axis in (0, 1):
                 part = cells @ self.transfer[axis, :, chosen]
-                felt = felt + drag[..., axis, None].to(part) * part
+                felt = felt + shear[..., axis, None].to(part) * part
         return felt
 
     def read(self, linear: Tensor) -> Response:
@@ -99,10 +99,10 @@ class Solid(AbstractSimulator):
         readings, sensor, surface = linear.chunk(3, dim=-1)
         return Response(readings, torch.stack([sensor, surface], dim=-1))
 
-    def motion(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m."""
         count = self._sensors
-        inwards, _, x, y = self._rows(pressure, drag, slice(count, 5 * count)).chunk(4, dim=-1)
+        inwards, _, x, y = self._rows(pressure, shear, slice(count, 5 * count)).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:
@@ -114,13 +114,13 @@ class Solid(AbstractSimulator):
         compliance = loads.T @ self.influence(_INWARDS) / self._area
         return torch.from_numpy((compliance + compliance.T) / 2)
 
-    def strain(self, pressure: Tensor, drag: Tensor | None = None) -> Tensor:
+    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the largest principal strain of the top layer, (U,); friction counts too."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         axes, loads = [_INWARDS], [cells]
-        if drag is not None:
+        if shear is not None:
             axes += [0, 1]
-            loads += [cells * drag[:, axis, None].to(cells) for axis in (0, 1)]
+            loads += [cells * shear[:, axis, None].to(cells) for axis in (0, 1)]
         load, fields = torch.cat(loads, dim=1), [self.influence(axis) for axis in axes]
 
         def read(rows: sp.csr_matrix) -> np.ndarray:
@@ -138,7 +138,7 @@ class Solid(AbstractSimulator):
 
         Exact, whatever their places: read from :meth:`influence`, so a layout costs milliseconds.
         """
-        rows = readings(self._mesh, sensors)
+        rows = reading_rows(self._mesh, sensors)
         return np.stack([_read(rows, self.influence(axis)) for axis in range(3)])
 
     @cached_property
@@ -157,7 +157,7 @@ class Solid(AbstractSimulator):
         shape = (3, 5 * len(sensors), self.shape[0] * self.shape[1])
 
         def build() -> dict[str, np.ndarray]:
-            rows = sp.vstack([readings(self._mesh, sensors), *_motions(self._mesh, sensors)]).tocsr()
+            rows = sp.vstack([reading_rows(self._mesh, sensors), *_motions(self._mesh, sensors)]).tocsr()
             return {"rows": self._elastic.transfer(rows)}
 
         return _store.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
@@ -185,7 +185,7 @@ def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) 
     return Hexahedra((x, y, np.array(depths)), np.stack(young), np.array(ratio), body.place, body.frame)
 
 
-def readings(mesh: Hexahedra, sensors: Sensors) -> sp.csr_matrix:
+def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_matrix:
     """Return rows (S, 3 N) that read the force that pushes on each sensor across its normal, N."""
     points, areas, owner = quadrature(sensors, mesh.lines)
     sums = sp.csr_matrix((-areas, (owner, np.arange(len(owner)))), shape=(len(sensors), len(points)))

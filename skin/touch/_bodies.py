@@ -1,4 +1,4 @@
-"""Draw the object that presses: shape, angle, stretch and size, so that it fits on the sheet."""
+"""Draw the pressing object: shape, angle, stretch and size, so that it fits on the sheet."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 _TRIES = 2000
 _PROBES = 500
 _RARE = 0.01
-# What is fitted exactly would be refused for its last digit.
+# Tolerance for rounding in shapes that fit exactly.
 _SLACK = 1e-9
 
 
 class Fit(NamedTuple):
-    """How shapes are fitted to a sheet.
+    """The fit of shapes to a sheet.
 
     Attributes:
-        big: (N,), bool, which shapes have room when they are big.
-        small: (N,), bool, which have room when they are small.
+        big: (N,), bool, shapes that fit with a big area.
+        small: (N,), bool, shapes that fit with a small area.
     """
 
     big: np.ndarray
@@ -32,18 +32,18 @@ class Fit(NamedTuple):
 
     @classmethod
     def of(cls, settings: GestureSettings, shapes: Shapes) -> Fit | None:
-        """Return how shapes are fitted, or None where they are redrawn until they fit.
+        """Return the fit of shapes, or None where they are redrawn until they fit.
 
-        They are redrawn, as the report's are, unless the shape would then tell big from small by more than
-        ``settings.leak``, as the balanced accuracy of the best guess. Deterministic.
+        They are redrawn, as in the report, unless the shape alone would then predict the label ``big`` with a
+        balanced accuracy above ``settings.leak``. Deterministic.
 
         Raises:
-            InputError: none of the shapes has room.
+            InputError: no shape fits.
         """
         chance = np.random.default_rng(0).random((2, _PROBES, 4))
 
         def fits(fitted: bool) -> np.ndarray:
-            """Return the share of small and big bodies of each shape that have room, (2, N)."""
+            """Return the share of small and big bodies of each shape that fit, (2, N)."""
             found = np.empty((2, len(shapes.names)))
             for row, shape in np.ndindex(found.shape):
                 same, number = np.full(_PROBES, bool(row)), np.full(_PROBES, shape)
@@ -62,7 +62,7 @@ class Fit(NamedTuple):
         return cls(big, small | big)
 
     def draw(self, big: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """Draw a shape (B,) for each body, evenly among those that have room as it is, big (B,) or small."""
+        """Draw a shape (B,) per body, uniformly among those that fit with its area, big (B,) or small."""
         chance = generator.random(len(big))
         options = [np.flatnonzero(which) for which in (self.small, self.big)]
         small, large = (one[(chance * len(one)).astype(int)] for one in options)
@@ -81,19 +81,19 @@ def draw_bodies(
 
     Args:
         big: (B,), bool, which are to be big.
-        settings: the difficulty.
-        shapes: what presses, on which sheet.
-        generator: where randomness comes from; it draws for all bodies in every round.
-        fit: None: shape, angle and size are redrawn until they fit, and nothing is stretched. Else each body
-            is stretched along the sheet's axes just as far as it needs, up to ``settings.stretch``, and
-            turned anew where that is not enough. Whether it fits is asked of a big touch, whatever is wanted,
-            so that shape, angle and stretch say nothing about the size; only a shape that has no room as a
-            big one is asked as it is.
-        kept: (B,), the shapes that are fitted, from :meth:`Fit.draw`.
+        settings: ranges of the gestures.
+        shapes: the shapes and the sheet.
+        generator: source of randomness; it draws for all bodies in every round.
+        fit: None: shape, angle and size are redrawn until they fit, without stretching. Otherwise each body
+            is stretched along the sheet's axes by as little as necessary, up to ``settings.stretch``, and
+            gets another angle where that is not enough. The fit is tested with a big area for big and small
+            touches, so that shape, angle and stretch are independent of the size; only shapes that do not
+            fit with a big area are tested with their own.
+        kept: (B,), the shapes to fit, from :meth:`Fit.draw`.
 
     Returns:
-        shape, angle (rad), stretch (``Shapes.render``), scale (m), low and high (B, 2) (m), and misfits: how
-        many bodies were drawn before that did not fit.
+        shape, angle (rad), stretch (``Shapes.render``), scale (m), low and high (B, 2) (m), and misfits:
+        number of bodies drawn before that did not fit.
 
     Raises:
         InputError: none fits.

@@ -1,4 +1,4 @@
-"""Gesture settings, and the draws of shape, time and path."""
+"""Gesture settings, and random draws of shape, timing and path."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,9 +27,9 @@ _Frames = Annotated[tuple[PositiveInt, PositiveInt], RISING]
 @checked("touch")
 @dataclass(frozen=True)
 class GestureSettings:
-    """The difficulty of the task; ``conf/touch.yaml`` holds the same defaults and says each unit.
+    """Ranges of the gestures; ``conf/touch.yaml`` holds the same defaults and their units.
 
-    Ranges are (least, most), drawn evenly, both ends included.
+    Ranges are (least, most), drawn uniformly, both ends included.
 
     Raises:
         InputError: a range that is empty, out of order, or on the wrong side of its threshold.
@@ -66,7 +66,7 @@ class GestureSettings:
 
     @classmethod
     def of(cls, given: "Mapping[str, Any] | GestureSettings | None") -> "GestureSettings":
-        """Return the settings that a configuration means; what it leaves out keeps its default."""
+        """Return the settings of a configuration; missing ones keep their default."""
         if isinstance(given, GestureSettings):
             return given
         values = dict(given or {})
@@ -78,7 +78,7 @@ class GestureSettings:
 
     def __post_init__(self) -> None:
         lines = self.thresholds
-        # (name, lowest allowed, highest allowed): a range beyond its threshold would be redrawn for ever.
+        # (name, lowest allowed, highest allowed): a range beyond its threshold would be redrawn forever.
         for name, low, high in (
             ("small_area", 0, lines.area),
             ("big_area", lines.area, 1),
@@ -109,21 +109,21 @@ def draw_gestures(
     fit: Fit | None = None,
     kept: np.ndarray | None = None,
 ) -> Draws:
-    """Draw what the path does not change: shape, angle, stretch, area, duration, onset.
+    """Draw the parameters that do not depend on the path: shape, angle, stretch, area, duration, onset.
 
-    The outline leaves ``spare`` along both axes of the sheet, for static and dynamic alike: then every shape
-    has room to slide, and only the path tells sliding from standing.
+    The outline leaves ``spare`` along both axes of the sheet, for static and sliding touches alike. Every
+    shape can then slide, and only the path distinguishes sliding from static touches.
 
     Args:
         labels: (B, 4), bool, the wanted combinations.
-        settings: the difficulty.
-        shapes: what presses, on which sheet.
-        padded: the touch begins at a random frame of the window, not at its first.
-        generator: where randomness comes from; it draws for all gestures in every round.
-        fit, kept: as :func:`skin.touch._bodies.draw_bodies` takes them.
+        settings: ranges of the gestures.
+        shapes: the shapes and the sheet.
+        padded: whether a touch begins at a random frame of the window instead of its first.
+        generator: source of randomness; it draws for all gestures in every round.
+        fit, kept: see :func:`skin.touch._bodies.draw_bodies`.
 
     Returns:
-        What :func:`skin.touch._bodies.draw_bodies` gives, and duration and onset (frames).
+        The result of :func:`skin.touch._bodies.draw_bodies`, and duration and onset (frames).
     """
     dynamic, press = labels[:, 1], labels[:, 2]
     drawn = draw_bodies(labels[:, 0], settings, shapes, generator, fit, kept)
@@ -142,54 +142,54 @@ def draw_paths(
     size: tuple[float, float],
     chance: np.ndarray,
 ) -> Draws:
-    """Draw where gestures begin, where they go, how fast, and how hard they press.
+    """Draw start, direction, speed and peak pressure of gestures.
 
-    A sliding touch moves along a straight line at constant speed, reflected at the limits of its room, so
-    that neither its duration nor its speed depends on its size.
+    A sliding touch moves along a straight line at constant speed and is reflected at the limits of its span,
+    so that neither its duration nor its speed depends on its size.
 
     Args:
         labels: (B, 4), bool, the wanted combinations.
-        gestures: what :func:`draw_gestures` gave, (B, ...).
-        settings: the difficulty.
+        gestures: the draws of :func:`draw_gestures`, (B, ...).
+        settings: ranges of the gestures.
         size: extent (x, y) of the sheet, m.
         chance: (B, 5), 0 to 1.
 
     Returns:
-        start (B, 2) within the room (m), room (B, 2) (m), direction (rad), speed (m per frame), peak (Pa).
+        start (B, 2) within the span (m), span (B, 2) (m), direction (rad), speed (m per frame), peak (Pa).
     """
     dynamic, dangerous = labels[:, 1], labels[:, 3]
-    room = size - (gestures["high"] - gestures["low"])
+    span = size - (gestures["high"] - gestures["low"])
     slowest = np.maximum(settings.speed[0], settings.path / np.maximum(gestures["duration"] - 1, 1))
     speed = slowest + (settings.speed[1] - slowest) * chance[:, 3]
     least, most = np.where(dangerous[:, None], settings.dangerous_peak, settings.safe_peak).T
     return {
-        "start": chance[:, :2] * room,
-        "room": room,
+        "start": chance[:, :2] * span,
+        "span": span,
         "direction": np.where(dynamic, 2 * np.pi * chance[:, 2], 0.0),
         "speed": np.where(dynamic, speed, 0.0),
         "peak": least + (most - least) * chance[:, 4],
     }
 
 
-def fold(place: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Return places reflected at 0 and ``room``, as a ball between two walls (a triangle wave)."""
-    round_trip = np.mod(place, 2 * room)
-    return np.minimum(round_trip, 2 * room - round_trip)
+def fold(place: np.ndarray, span: np.ndarray) -> np.ndarray:
+    """Return places reflected at 0 and ``span`` (a triangle wave)."""
+    round_trip = np.mod(place, 2 * span)
+    return np.minimum(round_trip, 2 * span - round_trip)
 
 
-def heading(way: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return the unit vectors (U, 2) along which objects have come to their places; 0 where they stand still.
+def heading(place: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (U, 2) of the last step to each place; 0 for objects at rest.
 
-    A step that a wall reflects counts as what it is: from place to place. The first frame of a path, to which
-    nothing has led, takes the direction of its first step.
+    A reflected step points from place to place. The first frame of a path takes the direction of the first
+    step.
 
     Args:
-        way: (U, 2), m, the places of all paths, one path after another.
-        first: (B,), ascending, where each path begins.
+        place: (U, 2), m, the places of all paths, one path after another.
+        first: (B,), ascending, the first frame of each path.
     """
-    steps = np.diff(way, axis=0, prepend=way[:1])
+    steps = np.diff(place, axis=0, prepend=place[:1])
     steps[first] = 0
-    more = first[np.diff(first, append=len(way)) > 1]
+    more = first[np.diff(first, append=len(place)) > 1]
     steps[more] = steps[more + 1]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     return np.divide(steps, length, out=np.zeros_like(steps), where=length > 0)

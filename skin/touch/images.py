@@ -1,4 +1,4 @@
-"""Grey-scale images of objects: found by name, checked, prepared for sampling."""
+"""Find, check and prepare grey-scale images of objects."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from skin.paths import BUNDLED, candidates
 _FOLDER = BUNDLED / "data" / "shapes"
 
 
-def load(name: str) -> np.ndarray:
+def load_image(name: str) -> np.ndarray:
     """Return a shape's image (h, w), float64, 0 to 1.
 
     Args:
@@ -42,7 +42,7 @@ def load(name: str) -> np.ndarray:
             f"cannot read the shape {name} ({path}): {error}; touch.shapes takes grey-scale pictures, "
             "such as a PNG, white = full pressure"
         ) from error
-    return check(pixels, name)
+    return check_image(pixels, name)
 
 
 def _find(name: str) -> Path:
@@ -57,7 +57,7 @@ def _find(name: str) -> Path:
     )
 
 
-def check(pixels: np.ndarray, name: str) -> np.ndarray:
+def check_image(pixels: np.ndarray, name: str) -> np.ndarray:
     """Return pixels (h, w) scaled so that the brightest is 1.
 
     Raises:
@@ -76,8 +76,8 @@ def check(pixels: np.ndarray, name: str) -> np.ndarray:
 def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
     """Return the images at halving resolutions, each centred in a square of ``pixels``, a power of two.
 
-    An image with more pixels is averaged over areas down to the square; one with fewer keeps its own. A rim
-    of one black pixel stays around it, so that it ends where it ends.
+    A larger image is averaged down to the square; a smaller one keeps its pixels. A border of one black
+    pixel remains around it, so that sampling does not extend its edge.
 
     Returns:
         levels (N, 1, p, p), float32, p = pixels, pixels / 2, ... 1.

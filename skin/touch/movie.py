@@ -12,12 +12,12 @@ from skin.labels import sliding
 
 @dataclass(frozen=True)
 class Movie:
-    """Pressure movies of a batch of gestures; a touch that stands still is one frame under a time profile.
+    """Pressure movies of a batch of gestures; a static touch is one frame with a time profile.
 
     Attributes:
         frames: (U, H, W), Pa, the distinct frames at full force.
-        index: (B, T), which frame is shown.
-        scale: (B, T), its share of full force; 0 where nothing touches.
+        index: (B, T), the frame at each time.
+        scale: (B, T), its share of full force; 0 without contact.
         labels: (B, 4), 0 or 1, float32, in the order of ``skin.labels.TOUCH``.
         parameters: (B,) each: shape (index), angle (rad), stretch (``Shapes.render``), misfits (bodies drawn
             that had no room on the sheet), duration and onset (frames), direction (rad), speed (m per frame),
@@ -26,8 +26,8 @@ class Movie:
             its last), x and y (m, that first place); area, travel, frames and pressure
             (``skin.labels.Measures``), which make the labels; and where pressure is solved for, unconverged
             (frames of all its draws that were not found).
-        drag: (U, 2), traction along x and y of each frame over its pressure: the coefficient of friction
-            times the direction of motion, 0 where nothing slides; None: no friction.
+        shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
+            coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
     """
 
     frames: Tensor
@@ -35,13 +35,13 @@ class Movie:
     scale: Tensor
     labels: Tensor
     parameters: dict[str, Tensor]
-    drag: Tensor | None = None
+    shear: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.index)
 
     def __getitem__(self, rows: Tensor) -> "Movie":
-        """Return the movies of some gestures, with no frame that they do not show."""
+        """Return the movies of some gestures, without unused frames."""
         index = self.index[rows]
         shown = torch.zeros(len(self.frames), dtype=torch.bool)
         shown[index.flatten()] = True
@@ -51,7 +51,7 @@ class Movie:
             self.scale[rows],
             self.labels[rows],
             {name: values[rows] for name, values in self.parameters.items()},
-            None if self.drag is None else self.drag[shown],
+            None if self.shear is None else self.shear[shown],
         )
 
     @property
@@ -61,7 +61,7 @@ class Movie:
 
     @property
     def slides(self) -> Tensor:
-        """Cosines of the directions in which touches slide, (B, 2), as ``skin.labels.sliding`` gives them."""
+        """Cosines of the sliding directions, (B, 2); see ``skin.labels.sliding``."""
         known = self.parameters
         net = torch.stack([known["net_x"], known["net_y"]], dim=1)
         return sliding(net, known["speed"] * (known["duration"] - 1))
@@ -71,15 +71,15 @@ class Movie:
         return self.frames[self.index] * self.scale[..., None, None]
 
 
-def join(movies: Sequence[Movie]) -> Movie:
+def join_movies(movies: Sequence[Movie]) -> Movie:
     """Return one movie of all gestures of ``movies``, in order."""
     starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
-    drags = [movie.drag for movie in movies if movie.drag is not None]
+    shears = [movie.shear for movie in movies if movie.shear is not None]
     return Movie(
         torch.cat([movie.frames for movie in movies]),
         torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
         torch.cat([movie.scale for movie in movies]),
         torch.cat([movie.labels for movie in movies]),
         {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
-        torch.cat(drags) if drags else None,
+        torch.cat(shears) if shears else None,
     )

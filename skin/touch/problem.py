@@ -1,4 +1,4 @@
-"""The data of a contact: objects on their paths, and the pressure that they make."""
+"""The data of a contact: objects on their paths, and the resulting pressure."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -11,12 +11,12 @@ from skin.touch.shapes import Shapes
 
 
 class ContactProblem(NamedTuple):
-    """What is touched, and how touches of it are judged.
+    """The touched body and the criteria for labels.
 
     Attributes:
-        shapes: what presses, on which body.
+        shapes: the shapes and the body.
         footprints: (S, H * W), area weights of each sensor that sum to 1, float32.
-        settings: the difficulty; its thresholds say where labels change.
+        settings: ranges of the gestures, and the thresholds of the labels.
     """
 
     shapes: Shapes
@@ -26,15 +26,15 @@ class ContactProblem(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Gestures (B,) as the distinct frames (U,) that they show, those of one gesture side by side.
+    """Gestures (B,) as distinct frames (U,); the frames of one gesture are adjacent.
 
     Attributes:
         owner: (U,), the gesture of each frame, ascending.
         shape, angle, scale: (U,), as ``Shapes.render`` takes them.
         place: (U, 2), m.
-        share: (U,), the largest part of full force at which a frame is shown.
-        index: (B, T), which frame is shown.
-        profile: (B, T), at what part of full force; 0 where nothing touches.
+        share: (U,), the largest share of full force at which a frame is shown.
+        index: (B, T), the frame at each time.
+        profile: (B, T), its share of full force; 0 without contact.
         peak: (B,), the wanted highest cell pressure, Pa.
         wanted: (B, 4), bool, the wanted labels in the order of ``skin.labels.TOUCH``.
         stretch: (U,), as ``Shapes.render`` takes it.
@@ -54,7 +54,7 @@ class Trajectories:
 
     @property
     def poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-        """What ``Shapes.render`` and ``Shapes.solids`` take."""
+        """Arguments of ``Shapes.render`` and ``Shapes.solids``."""
         return self.shape, self.angle, self.scale, self.place, self.stretch
 
 
@@ -62,14 +62,14 @@ class ContactResult(NamedTuple):
     """The pressure of trajectories.
 
     Attributes:
-        frames: (U, H, W), Pa, float32, each divided by its share of full force: every one of a gesture sums
-            to the same total force.
+        frames: (U, H, W), Pa, float32, each divided by its share of full force, so that all frames of a
+            gesture have the same total force.
         force: (B,), full force, N.
-        peak: (B,), the highest cell pressure of the gesture, Pa.
-        refused: (B,), bool, gestures whose frames mean nothing, because no force gives the wanted labels or
-            because the pressure was not found.
-        hopeless: (B,), bool, those of them that no other path would save.
-        unconverged: (B,), how many frames were not found to the stated tolerance; None where all are exact.
+        peak: (B,), peak cell pressure of the gesture, Pa.
+        refused: (B,), bool, gestures whose frames are not valid, because no force gives the wanted labels or
+            the contact did not converge.
+        hopeless: (B,), bool, the refused gestures for which no other path can succeed.
+        unconverged: (B,), number of frames that did not converge to the tolerance; None where all are exact.
     """
 
     frames: Tensor
@@ -80,8 +80,8 @@ class ContactResult(NamedTuple):
     unconverged: np.ndarray | None = None
 
 
-class Contact(Protocol):
-    """What the sampler asks of a contact: see :class:`skin.contact.base.AbstractContact`."""
+class ContactModel(Protocol):
+    """The interface of a contact for the sampler; see :class:`skin.contact.base.AbstractContact`."""
 
     @property
     def proportional(self) -> bool: ...
@@ -90,4 +90,4 @@ class Contact(Protocol):
     def advice(self) -> str: ...
 
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
-        """Return the pressure of gestures, with the force that gives the wanted labels if there is one."""
+        """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""

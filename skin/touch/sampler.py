@@ -13,10 +13,10 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.labels import TOUCH, measure
 from skin.touch._bodies import Fit
-from skin.touch._strokes import course
+from skin.touch._paths import sample_paths
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
-from skin.touch.movie import Movie, join
-from skin.touch.problem import Contact, ContactProblem, ContactResult
+from skin.touch.movie import Movie, join_movies
+from skin.touch.problem import ContactModel, ContactProblem, ContactResult
 from skin.touch.shapes import Shapes
 
 _ATTEMPTS = 50
@@ -35,12 +35,12 @@ def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Tally:
-    """Counts per gesture (B,), which grow as the search goes on.
+    """Running counts per gesture (B,).
 
     Attributes:
-        draws: how many paths were drawn.
-        unconverged: frames whose pressure was not found.
-        misfits: bodies that had no room on the sheet.
+        draws: paths drawn.
+        unconverged: frames whose contact did not converge.
+        misfits: drawn bodies that did not fit on the sheet.
     """
 
     draws: np.ndarray
@@ -49,34 +49,34 @@ class _Tally:
 
     @classmethod
     def of(cls, count: int) -> "_Tally":
-        """Return one that begins at 0."""
+        """Return counts of 0."""
         return cls(*np.zeros((3, count)))
 
     def warn(self) -> None:
-        """Say how many frames were not found, if any."""
+        """Warn of frames that did not converge, if there are any."""
         lost = int(self.unconverged.sum())
         if lost:
             warnings.warn(
-                f"{lost} frames were not found to contact.tolerance in contact.iterations; their gestures "
-                "were drawn again: raise contact.iterations or contact.tolerance",
+                f"{lost} frames did not converge to contact.tolerance within contact.iterations; their "
+                "gestures were drawn again: raise contact.iterations or contact.tolerance",
                 RuntimeWarning,
                 stacklevel=3,
             )
 
 
 class TouchSampler:
-    """Draws gestures of wanted labels and renders their movies.
+    """Draws gestures with wanted labels and renders their movies.
 
-    The label is what the movie gives (docs/adr/0009 for rigid objects that slide). Where it differs from the
-    wanted one the path is drawn again (start, direction, speed, peak), up to ``redraws`` times; only then the
-    whole gesture.
+    Labels are computed from the movie (docs/adr/0009 for rigid objects that slide). Where they differ from
+    the wanted ones, the path is drawn again (start, direction, speed, peak), up to ``redraws`` times, and
+    then the whole gesture.
 
     Args:
         body: the sheet.
         footprints: (S, H * W), area weights of each sensor that sum to 1 (``AbstractBody.footprints``).
-        contact: what pressure gestures make.
-        settings: the difficulty, as ``conf/touch.yaml`` gives it.
-        padded: gestures begin at a random frame of the window, not at its first.
+        contact: computes the pressure of gestures.
+        settings: ranges of the gestures, as in ``conf/touch.yaml``.
+        padded: whether gestures begin at a random frame of the window instead of its first.
 
     Raises:
         InputError: settings or pictures that cannot be used.
@@ -86,7 +86,7 @@ class TouchSampler:
         self,
         body: AbstractBody,
         footprints: np.ndarray,
-        contact: Contact,
+        contact: ContactModel,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
     ) -> None:
@@ -99,7 +99,7 @@ class TouchSampler:
 
     @cached_property
     def fit(self) -> Fit | None:
-        """How shapes are fitted to the sheet; None where they are redrawn until they fit."""
+        """The fit of shapes to the sheet; None where shapes are redrawn until they fit."""
         return Fit.of(self.settings, self.shapes)
 
     @torch.no_grad()
@@ -108,11 +108,11 @@ class TouchSampler:
 
         Args:
             count: B.
-            generator: where all randomness comes from.
+            generator: source of randomness.
             labels: (B, 4), bool, the wanted combinations; None: balanced.
 
         Raises:
-            InputError: some combination of labels is never met on this sheet with these settings.
+            InputError: a combination of labels that does not occur on this sheet with these settings.
         """
         wanted = balanced(count, generator) if labels is None else labels
         redraws = self.settings.redraws
@@ -134,9 +134,9 @@ class TouchSampler:
             gestures["misfits"] = tally.misfits
             tried, hopeless = 0, []
             while tried < redraws and len(pending):
-                # The last few gestures try several paths at once: a round costs more than what it draws.
+                # The last few gestures try several paths at once, because a round has a fixed cost.
                 ahead = min(redraws - tried, max(1, _AHEAD // len(pending)))
-                # Drawn for the whole batch, so that one gesture's redraws never move another's.
+                # Drawn for the whole batch, so that redrawing one gesture does not change another.
                 chance = generator.random((ahead, count, 5))
                 # Sorted by scale, because frames of one texture level are rendered together.
                 pending = pending[np.argsort(gestures["scale"][pending], kind="stable")]
@@ -148,15 +148,15 @@ class TouchSampler:
                 pending = pending[~chosen & ~given_up]
             pending = np.concatenate([pending, *hopeless])
         tally.warn()
-        return join(movies)[torch.from_numpy(np.concatenate(found).argsort())]
+        return join_movies(movies)[torch.from_numpy(np.concatenate(found).argsort())]
 
     def _round(
         self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: _Tally
     ) -> tuple[np.ndarray, np.ndarray, Movie]:
-        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture, and count.
+        """Try one path per row of ``chance`` (A, B, 5) for each pending gesture, and update the counts.
 
         Returns:
-            Which of the pending found a path with the wanted labels, bool, which need not look for another,
+            Which of the pending gestures have a path with the wanted labels, bool, which cannot have one,
             bool, and the movie of those paths.
         """
         ahead = len(chance)
@@ -177,34 +177,34 @@ class TouchSampler:
         return chosen, given_up, movie[torch.from_numpy(first[chosen])]
 
     def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
-        """Return the movie of gestures (B,), with the labels that it gives."""
+        """Return the movie of gestures (B,) with its labels."""
         settings = self.settings
-        taken = course(gestures, wanted, settings, self.contact.proportional)
+        paths = sample_paths(gestures, wanted, settings, self.contact.proportional)
         pressed = self.contact.press(
-            taken.trajectories, ContactProblem(self.shapes, self.footprints, settings)
+            paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
-        shown, shares = taken.trajectories.index, taken.trajectories.profile
+        shown, shares = paths.trajectories.index, paths.trajectories.profile
         measures = measure(
             pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
         if not self.contact.proportional:
-            # More of an object comes down as force grows, which moves the centre of pressure though it rests.
-            measures = measures._replace(travel=torch.from_numpy(taken.travel))
-        begin = taken.trajectories.place[taken.first]
-        values = pressed.peak, pressed.force, gestures["draws"], *taken.net.T, *begin.T
+            # The contact area grows with force, which moves the centre of pressure of a static touch.
+            measures = measures._replace(travel=torch.from_numpy(paths.travel))
+        begin = paths.trajectories.place[paths.first]
+        values = pressed.peak, pressed.force, gestures["draws"], *paths.net.T, *begin.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
         known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
         known |= {name: value.float() for name, value in measures._asdict().items()}
-        pull = settings.shear * heading(taken.way, taken.first) if settings.shear else None
-        drag = None if pull is None else torch.from_numpy(pull).float()
+        pull = settings.shear * heading(paths.place, paths.first) if settings.shear else None
+        shear = None if pull is None else torch.from_numpy(pull).float()
         labels = measures.labels(settings.thresholds)
-        return Movie(pressed.frames, shown, shares, labels, known, drag), pressed
+        return Movie(pressed.frames, shown, shares, labels, known, shear), pressed
 
     def _never(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))
         return InputError(
             f"no gesture in {_ATTEMPTS * self.settings.redraws} draws was {', '.join(names)}: on this sheet, "
-            "with these sensors, the ranges under touch rule it out; sensors far apart hardly feel a small "
-            "dangerous touch, so raise touch.small_area or touch.dangerous_peak, or add sensors"
+            "with these sensors, the ranges under touch rule it out; sensors far apart have small readings "
+            "under a small dangerous touch: raise touch.small_area or touch.dangerous_peak, or add sensors"
             f"{self.contact.advice}"
         )

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from skin.body.base import AbstractBody
 from skin.body.sheet import Sheet
-from skin.touch.images import hulls, load, pyramid
+from skin.touch.images import hulls, load_image, pyramid
 
 # Frames rendered at once: their sampling grid (32 KiB a frame on 32 x 32 cells) then stays in the cache.
 _CELLS_AT_ONCE = 128 * 1024
@@ -23,11 +23,11 @@ _CALIBRATION_SIZES, _CALIBRATION_POSES = 24, 6
 
 
 class Solids(NamedTuple):
-    """What cells see of shapes that are taken for objects with an outline.
+    """Shapes as objects with an outline, sampled on the cells.
 
     Attributes:
-        inside: (F, H, W), bool, the cells that the object covers by at least half; if there is none, those
-            that it covers most.
+        inside: (F, H, W), bool, cells that the object covers by at least half; if there are none, those with
+            the largest cover.
         grey: (F, H, W), mean grey of the covered part, 1 = white; 0 outside.
         rim: (F, H, W), its mean distance from the outline, m; 0 outside.
     """
@@ -40,8 +40,8 @@ class Solids(NamedTuple):
 class Shapes:
     """Grey-scale images that can be pressed on a sheet at any place, angle and size.
 
-    A shape's *scale* is the length, m, of half its texture's side; its place is that of its texture's centre.
-    Its *stretch* is by how much it is then made longer along x than along y, its area kept; None means 1.
+    The *scale* of a shape is half the side of its texture, m; its place is the centre of its texture. The
+    *stretch* is its extent along x over that along y, relative to the original, at constant area; None is 1.
 
     Args:
         names: stems in ``data/shapes`` or paths of pictures.
@@ -53,7 +53,7 @@ class Shapes:
         hulls: (N, K, 2), corners of each shape's convex outline (pixels above ``contact``), in scales.
 
     Raises:
-        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load`).
+        InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load_image`).
     """
 
     def __init__(self, names: Sequence[str], body: AbstractBody, contact: float = 0.02) -> None:
@@ -63,13 +63,13 @@ class Shapes:
         # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
         finest = max(64, max(body.size) / self.spacing)
-        self.levels = pyramid([load(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
+        self.levels = pyramid([load_image(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
         self.hulls = hulls(self.levels[0][:, 0].numpy(), contact)
 
     def extent(
         self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, stretch: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the outline reaches from its place: lowest and highest (x, y), each (B, 2), m."""
+        """Return the bounding box of the outline around its place: lowest and highest (x, y), (B, 2), m."""
         cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
         x, y = self.hulls[shape, :, 0], self.hulls[shape, :, 1]
         corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) * scale[:, None, None]
@@ -81,7 +81,7 @@ class Shapes:
     def scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which shapes cover a share of the sheet, on average over places.
 
-        What reaches beyond the sheet does not count.
+        Parts beyond the sheet do not count.
         """
         scales, roots = self._calibration
         result = np.empty(len(shape))
@@ -97,10 +97,10 @@ class Shapes:
 
     @cached_property
     def _large(self) -> "Shapes":
-        """The same shapes on a square of such cells on which all of a long shape has room."""
+        """The same shapes on a square of the same cells that is large enough for a long shape."""
         count = int(np.ceil(_LARGE * np.sqrt(np.prod(self.body.cells))))
         size = (count * self.body.cell[0], count * self.body.cell[1])
-        # The same pictures, because a scale is in terms of them; what was measured on this sheet is not.
+        # The same images, because scales refer to them, but without values computed for this sheet.
         large = copy(self)
         for known in ("_calibration", "_points"):
             vars(large).pop(known, None)
@@ -109,10 +109,10 @@ class Shapes:
 
     @cached_property
     def _calibration(self) -> tuple[np.ndarray, np.ndarray]:
-        """Scales and the square roots of the area shares found there, each (N, sizes).
+        """Scales and the square roots of the area shares at them, each (N, sizes).
 
-        Cells at the rim count as whole although the shape covers them in part, so what a shape of a given
-        size covers depends on the mesh: it is measured once. The root is nearly linear in the scale.
+        Cells at the rim count as whole although the shape covers them in part. The area of a shape of a given
+        size therefore depends on the mesh, and is computed once. Its root is nearly linear in the scale.
         """
         poses = np.random.default_rng(0).random((_CALIBRATION_POSES, 3))
         width = np.ptp(self.hulls, axis=1).min(axis=1)
@@ -140,16 +140,16 @@ class Shapes:
     ) -> Tensor:
         """Return frames (F, H, W), float32, each of sum 1 (report, equation 1).
 
-        Every cell is the mean of 2 x 2 bilinear samples of the texture whose pixels are about as far apart as
-        the samples, so that coarse cells see the average of the image and not single pixels of it. Sorted by
-        scale, frames are rendered in few runs.
+        Each cell is the mean of 2 x 2 bilinear samples of the texture level whose pixels are about as far
+        apart as the samples, so that coarse cells get the average of the image instead of single pixels.
+        Frames that are sorted by scale are rendered in fewer runs.
 
         Args:
-            shape: (F,), which shape.
-            angle: (F,), by which it is turned, from x towards y, rad.
+            shape: (F,), index of the shape.
+            angle: (F,), rotation from x towards y, rad.
             scale: (F,), m.
             place: (F, 2), m.
-            stretch: (F,), along x after the turn.
+            stretch: (F,), along x after the rotation.
         """
         frames = torch.empty(len(shape), *self.body.shape)
         for part, cells in self._rendered(self.levels, shape, angle, scale, place, stretch):
@@ -164,10 +164,9 @@ class Shapes:
         place: np.ndarray,
         stretch: np.ndarray | None = None,
     ) -> Solids:
-        """Return what cells see of shapes as objects: poses as :meth:`render` takes them.
+        """Return shapes as objects on the cells; the arguments are those of :meth:`render`.
 
-        The object is where the picture is brighter than ``contact``. A stretched one is stretched as a whole:
-        its ``rim`` is what it was before.
+        The object is where the image is brighter than ``contact``. Stretching does not change ``rim``.
         """
         cells = torch.empty(len(shape), 3, *self.body.shape)
         for part, values in self._rendered(self._objects, shape, angle, scale, place, stretch):
@@ -180,10 +179,10 @@ class Shapes:
 
     @cached_property
     def _objects(self) -> list[Tensor]:
-        """Levels (N, 3, p, p): is it inside, and there, its grey and its distance from the rim in scales."""
+        """Levels (N, 3, p, p): inside or not, and inside, grey and distance from the rim in scales."""
         finest = self.levels[0][:, 0]
         inside = finest > self.contact
-        # To the outline, which runs between pixels, and not to the middle of the next pixel outside.
+        # Distance to the outline between pixels instead of the centre of the next pixel outside.
         rim = np.stack([distance_transform_edt(mask) for mask in inside.numpy()]) - 0.5
         scales = torch.from_numpy(rim).float() * (2 / finest.shape[-1])
         levels = [torch.stack([inside.float(), finest * inside, scales * inside], dim=1)]
@@ -192,7 +191,7 @@ class Shapes:
         return levels
 
     def _visible(self, scale: np.ndarray, stretch: np.ndarray | None) -> np.ndarray:
-        """Return scales (F,), m, at which shapes do not fall between the samples."""
+        """Return scales (F,), m, of at least the spacing of the samples."""
         narrow = 1.0 if stretch is None else np.sqrt(np.maximum(stretch, 1 / stretch))
         return np.maximum(scale, max(self.body.cell) / 4 * narrow)
 
@@ -237,7 +236,7 @@ class Shapes:
         """Return sums (f, C, H, W) of textures (f, C, p, p) seen at turns * (x, i y) - shift, in scales."""
         x, y = self._points
         turn_x, turn_y, shifts = (torch.from_numpy(one)[:, None, None] for one in (*turns, shift))
-        # A turn of the plane is a product of complex numbers; its two real halves are what grid_sample takes.
+        # A rotation is a product of complex numbers; grid_sample takes real and imaginary parts.
         across, down = (turn_x * x - shifts).to(torch.complex64), (turn_y * y).to(torch.complex64)
         grid = torch.view_as_real(across + down)
         samples = grid_sample(texture, grid, mode="bilinear", padding_mode="zeros", align_corners=False)

@@ -11,21 +11,21 @@ from torch import Tensor
 
 from skin.labels import TOUCH_OR_NOT
 from skin.recording import Recording
-from skin.touch.sampler import Movie, TouchSampler, join
+from skin.touch.movie import Movie, join_movies
+from skin.touch.sampler import TouchSampler
 
 _LEAST = 16
 
 
-class Look(NamedTuple):
-    """What W windows show.
+class WindowContent(NamedTuple):
+    """The content of W windows.
 
     Attributes:
-        frames: (W, T), which frames of the stream.
-        gesture: (W,), the gesture that a window shows: that of which it shows the most frames, the first of
-            equals; -1 where nothing touches.
-        share: (W,), part of that gesture's frames in contact that the window shows, 0 to 1.
-        labels: (W, 5), 0 or 1, float32, in the order of ``skin.labels.TOUCH_OR_NOT``: the whole gesture's,
-            however little of it is seen; all 0 without touch.
+        frames: (W, T), indices into the stream.
+        gesture: (W,), the gesture with the most frames in the window, the first in a tie; -1 without contact.
+        share: (W,), fraction of that gesture's contact frames in the window, 0 to 1.
+        labels: (W, 5), 0 or 1, float32, in the order of ``skin.labels.TOUCH_OR_NOT``: those of the whole
+            gesture, even if the window shows a part of it; all 0 without contact.
     """
 
     frames: Tensor
@@ -36,12 +36,12 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """What touches when.
+    """The gestures of a stream and their times.
 
     Attributes:
         movie: G gestures.
-        begin: (G,), ascending, the frame of the stream in which each one's contact begins.
-        length: F, frames; the last gesture may be cut off.
+        begin: (G,), ascending, the frame of the stream at which each contact begins.
+        length: F, frames; the last gesture may be truncated.
     """
 
     movie: Movie
@@ -59,14 +59,11 @@ class Timeline:
 
     @property
     def end(self) -> Tensor:
-        """The frame after each gesture's last, (G,)."""
+        """The frame after the last one of each gesture, (G,)."""
         return self.begin + self.duration
 
     def spread(self, values: Tensor) -> Tensor:
-        """Return what gestures give per frame of their movies, (G, T, ...), along the stream, (F, ...).
-
-        Gaps are 0.
-        """
+        """Return values per gesture and frame, (G, T, ...), along the stream, (F, ...); 0 in the gaps."""
         gesture = torch.arange(len(self.begin)).repeat_interleave(self.duration)
         step = torch.arange(len(gesture)) - (self.duration.cumsum(0) - self.duration)[gesture]
         frame = self.begin[gesture] + step
@@ -76,8 +73,8 @@ class Timeline:
         result[frame[inside]] = values[gesture[inside], shown]
         return result
 
-    def look(self, starts: Tensor, window: int) -> Look:
-        """Return what windows of ``window`` frames show that begin at ``starts`` (W,)."""
+    def window_content(self, starts: Tensor, window: int) -> WindowContent:
+        """Return the content of windows of ``window`` frames that begin at ``starts`` (W,)."""
         nearest = torch.searchsorted(self.end, starts, right=True)
         last = torch.searchsorted(self.begin, starts + window)
         most = max(1, int((last - nearest).amax()))
@@ -88,7 +85,7 @@ class Timeline:
         gesture = candidates[torch.arange(len(starts)), best]
         touched = seen > 0
         labels = torch.cat([self.movie.labels[gesture], torch.ones(len(starts), 1)], dim=1)
-        return Look(
+        return WindowContent(
             starts[:, None] + torch.arange(window),
             gesture.where(touched, -1),
             seen / self.duration[gesture],
@@ -102,10 +99,10 @@ def draw_timeline(
     """Draw a stream of ``length`` frames that begins with a gap.
 
     Args:
-        sampler: where gestures come from, balanced.
+        sampler: draws the gestures, with balanced labels.
         length: F, frames.
-        gap: [least, most] idle frames between two touches, drawn evenly, both ends included.
-        generator: where all randomness comes from.
+        gap: [least, most] idle frames between two touches, drawn uniformly, both ends included.
+        generator: source of randomness.
     """
     settings = sampler.settings
     typical = (sum(settings.tap) + sum(settings.press)) / 4 + sum(gap) / 2
@@ -121,29 +118,29 @@ def draw_timeline(
         filled = int(ends[-1])
     begin = torch.from_numpy(np.concatenate(begins))
     kept = begin < length
-    kept[0] = True  # one at least, though a short stream may end before it
-    return Timeline(join(movies)[kept], begin[kept], length)
+    kept[0] = True  # at least one, even if a short stream ends before it
+    return Timeline(join_movies(movies)[kept], begin[kept], length)
 
 
 @dataclass(frozen=True)
-class Strip:
-    """A stream as a skin feels it.
+class TouchStream:
+    """The readings of a stream.
 
     Attributes:
-        timeline: what touches when.
-        whole: the stream as one touch of F frames, (1, F, ...), whose windows have labels, not itself.
+        timeline: the gestures and their times.
+        whole: the stream as one touch of F frames, (1, F, ...), without labels; its windows have labels.
     """
 
     timeline: Timeline
     whole: Recording
 
     @classmethod
-    def of(cls, timeline: Timeline, gestures: Recording) -> "Strip":
-        """Return the stream of gestures that were felt one by one.
+    def of(cls, timeline: Timeline, gestures: Recording) -> "TouchStream":
+        """Return the stream of gestures that were simulated one by one.
 
         Args:
-            timeline: when each of them touches.
-            gestures: (G, T, ...), idle where nothing touches, so without noise or offset.
+            timeline: the times of the gestures.
+            gestures: (G, T, ...), 0 without contact, so without noise or offset.
         """
 
         def along(values: Tensor | None) -> Tensor | None:
@@ -170,11 +167,11 @@ class Strip:
     def cut(self, starts: Tensor, window: int) -> Recording:
         """Return the windows (W, T, ...) of T = ``window`` frames that begin at ``starts`` (W,).
 
-        Labels and ``share`` are as :class:`Look` has them. The other parameters are those of the gesture
-        shown, its onset counted from the window's first frame, and 0 without touch; but ``clipped`` is of
-        the frames of the window.
+        Labels and ``share`` are those of :class:`WindowContent`. The other parameters are those of the
+        gesture in the window, with its onset counted from the window's first frame, and 0 without a touch;
+        ``clipped`` refers to the frames of the window.
         """
-        frames, gesture, share, labels = self.timeline.look(starts, window)
+        frames, gesture, share, labels = self.timeline.window_content(starts, window)
 
         def windows(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[0][frames]
@@ -202,8 +199,8 @@ class Strip:
         )
 
 
-def touched(recording: Recording) -> Recording:
-    """Return what shows a touch: all, unless the labels say otherwise."""
+def only_touches(recording: Recording) -> Recording:
+    """Return the windows that show a touch; all of them where the task has no label for that."""
     labels, gate = recording.touches.labels, recording.task.gate
     if labels is None or gate is None:
         return recording

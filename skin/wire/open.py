@@ -31,7 +31,7 @@ class Streamed(Protocol):
 
     rate: float
 
-    def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Any:
+    def simulate_stream(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Any:
         """Return a stream in one piece; ``whole.touches`` are its touches."""
 
 
@@ -158,7 +158,9 @@ def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
 
 def _strips(device: "Streamed") -> Iterator[Piece]:
     for number in count():
-        yield from _pieces(device.strip(max(1, round(_STRIP * device.rate)), number=number).whole.touches)
+        yield from _pieces(
+            device.simulate_stream(max(1, round(_STRIP * device.rate)), number=number).whole.touches
+        )
 
 
 def _pieces(touches: "Touches") -> Iterator[Piece]:

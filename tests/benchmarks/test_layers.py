@@ -27,6 +27,6 @@ def test_poolings_give_the_same(name):
 
 def test_every_layer_of_both_rows_is_timed(monkeypatch):
     monkeypatch.setattr(layers, "ROWS", {"temporal_graph": (2, (3, 4, 5)), "sequence_graph": (3, (1, 2, 4))})
-    found = layers.measure(1)
+    found = layers.measure_layers(1)
     assert set(found) == {"temporal_graph", "sequence_graph"}
     assert all(len(ratios) == 2 * 3 + 3 * 2 + 1 and min(ratios.values()) >= 0 for ratios in found.values())

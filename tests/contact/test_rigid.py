@@ -31,7 +31,7 @@ COMPLIANCE = torch.from_numpy(love(BODY.shape, BODY.cell, 10 * BODY.layers[0].ma
 class HalfSpace(AbstractSimulator):
     """A surface of known compliance, and nothing below it."""
 
-    def forward(self, pressure: torch.Tensor, drag: torch.Tensor | None = None) -> Response:
+    def forward(self, pressure: torch.Tensor, shear: torch.Tensor | None = None) -> Response:
         """Read nothing."""
         return Response(pressure.new_zeros(*pressure.shape[:-2], len(SENSORS)), None)
 
@@ -234,7 +234,7 @@ def test_draws_that_fail_are_counted():
 
 def test_what_is_not_found_is_told_and_never_used():
     hasty = sampler(rigid(iterations=5))
-    with pytest.warns(RuntimeWarning, match=r"\d+ frames were not found to contact.tolerance"):
+    with pytest.warns(RuntimeWarning, match=r"\d+ frames did not converge to contact.tolerance"):
         movie = hasty.sample(32, np.random.default_rng(5))
     assert movie.parameters["unconverged"].sum() > 0
 

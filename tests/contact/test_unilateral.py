@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from skin.contact._unilateral import solve
+from skin.contact._unilateral import solve_contact
 
 from .halfspace import love
 
@@ -23,7 +23,7 @@ def pressed(cells: int, gap, force: float):
     middle = (np.arange(cells) + 0.5) * side - EXTENT / 2
     radius = np.hypot(middle, middle[:, None]).ravel()
     gaps = torch.from_numpy(gap(radius))[None]
-    state = solve(compliance, gaps, torch.tensor([force / side**2]), tolerance=1e-7)
+    state = solve_contact(compliance, gaps, torch.tensor([force / side**2]), tolerance=1e-7)
     assert state.residual <= 1e-7
     pressure = state.pressure[0]
     touched = pressure > 0
@@ -90,7 +90,7 @@ def problems(count: int = 40, size: int = 12, seed: int = 0):
 
 def test_the_conditions_of_contact_hold():
     compliance, gaps, totals = problems()
-    state = solve(compliance, gaps, totals, tolerance=1e-6)
+    state = solve_contact(compliance, gaps, totals, tolerance=1e-6)
     assert (state.residual <= 1e-6).all()
     for gap, pressure, total in zip(gaps, state.pressure, totals, strict=True):
         deflection = compliance @ pressure
@@ -107,7 +107,7 @@ def test_the_conditions_of_contact_hold():
 
 def test_a_general_solver_finds_the_same():
     compliance, gaps, totals = (values.numpy() for values in problems(count=4, size=5))
-    state = solve(*problems(count=4, size=5), tolerance=1e-9)
+    state = solve_contact(*problems(count=4, size=5), tolerance=1e-9)
     for gap, total, pressure in zip(gaps, totals, state.pressure.numpy(), strict=True):
         free = np.isfinite(gap)
         small, own = compliance[np.ix_(free, free)], gap[free]
@@ -126,16 +126,16 @@ def test_a_general_solver_finds_the_same():
 
 def test_a_batch_is_its_problems_one_by_one():
     compliance, gaps, totals = problems(count=300)
-    together = solve(compliance, gaps, totals, tolerance=1e-8).pressure
+    together = solve_contact(compliance, gaps, totals, tolerance=1e-8).pressure
     for number in (0, 7, 255, 256, 299):
-        alone = solve(compliance, gaps[[number]], totals[[number]], tolerance=1e-8).pressure[0]
+        alone = solve_contact(compliance, gaps[[number]], totals[[number]], tolerance=1e-8).pressure[0]
         torch.testing.assert_close(together[number], alone, rtol=0, atol=1e-6 * alone.max().item())
 
 
 def test_single_precision_is_enough():
     compliance, gaps, totals = problems()
-    exact = solve(compliance, gaps, totals, tolerance=1e-9).pressure
-    single = solve(compliance.float(), gaps, totals, tolerance=1e-4)
+    exact = solve_contact(compliance, gaps, totals, tolerance=1e-9).pressure
+    single = solve_contact(compliance.float(), gaps, totals, tolerance=1e-4)
     assert (single.residual <= 1e-4).all()
     error = (single.pressure - exact).abs().amax(1) / exact.amax(1)
     assert error.max() < 2e-3
@@ -143,12 +143,12 @@ def test_single_precision_is_enough():
 
 def test_the_start_changes_the_way_and_not_the_end():
     compliance, gaps, totals = problems()
-    even = solve(compliance, gaps, totals, tolerance=1e-8)
-    warm = solve(compliance, gaps, totals, start=even.pressure, tolerance=1e-8)
+    even = solve_contact(compliance, gaps, totals, tolerance=1e-8)
+    warm = solve_contact(compliance, gaps, totals, start=even.pressure, tolerance=1e-8)
     assert warm.iterations.sum() < even.iterations.sum() / 4
     # One cell in contact, which alone can take no step, and none at all.
     for start in (torch.zeros_like(gaps).index_fill(1, torch.tensor([3]), 1.0), torch.zeros_like(gaps)):
-        other = solve(compliance, gaps, totals, start, tolerance=1e-8)
+        other = solve_contact(compliance, gaps, totals, start, tolerance=1e-8)
         worst = (other.pressure - even.pressure).abs().amax(1) / even.pressure.amax(1)
         assert worst.max() < 1e-6
 
@@ -163,7 +163,7 @@ def test_cells_that_are_exactly_at_rest_let_others_join(touching):
     gap[0, touching] = 0
     start = (gap == 0).double()
     for total in (1.0, 4.0, 32.0):
-        state = solve(compliance, gap, torch.tensor([total]), start, tolerance=1e-8)
+        state = solve_contact(compliance, gap, torch.tensor([total]), start, tolerance=1e-8)
         assert state.residual <= 1e-8
         height = compliance @ state.pressure[0] + gap[0]
         touched = state.pressure[0] > 0
@@ -174,7 +174,7 @@ def test_cells_that_are_exactly_at_rest_let_others_join(touching):
 
 def test_what_is_not_found_is_told():
     compliance, gaps, totals = problems()
-    state = solve(compliance, gaps, totals, tolerance=1e-8, iterations=2)
+    state = solve_contact(compliance, gaps, totals, tolerance=1e-8, iterations=2)
     assert (state.residual > 1e-8).any()
     assert (state.iterations <= 2).all()
     torch.testing.assert_close(state.pressure.sum(1), totals)
@@ -182,4 +182,4 @@ def test_what_is_not_found_is_told():
 
 def test_no_problems_are_no_trouble():
     compliance, gaps, totals = problems()
-    assert solve(compliance, gaps[:0], totals[:0]).pressure.shape == (0, 144)
+    assert solve_contact(compliance, gaps[:0], totals[:0]).pressure.shape == (0, 144)

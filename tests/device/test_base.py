@@ -13,9 +13,9 @@ from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.evaluation.margins import margins
-from skin.evaluation.operating_point import OperatingPoint, gestures
+from skin.evaluation.operating_point import OperatingPoint, threshold_gestures
 from skin.evaluation.report import columns
-from skin.evaluation.sliding import slide
+from skin.evaluation.sliding_windows import evaluate_windows
 from skin.storage import write
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -87,7 +87,7 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     settings = Evaluation(devices=2, layouts=2, gestures=20, false_alarm_rate=0.02)
     assert list(columns(made_up_device, settings)) == ["same", "holdout"]
     assert torch.equal(
-        gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
+        threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )
     announce(made_up_device)
     assert not capsys.readouterr().err
@@ -102,7 +102,10 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
         (lambda device: device.recording(), "only simulated or recorded touches"),
         (lambda device: device.source(), "can be watched: give device=serial"),
         (lambda device: margins(None, device, 20, POINT), "MadeUpDevice has none: .* add device=simulated"),
-        (lambda device: slide(None, device, None, POINT), "MadeUpDevice has none: .* add device=simulated"),
+        (
+            lambda device: evaluate_windows(None, device, None, POINT),
+            "MadeUpDevice has none: .* add device=simulated",
+        ),
     ],
 )
 def test_what_it_does_not_know_is_refused_in_a_sentence(made_up_device, ask, said):

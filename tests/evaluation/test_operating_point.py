@@ -14,7 +14,14 @@ from skin.config import Evaluation
 from skin.errors import InputError
 from skin.evaluation.alarm import Reached
 from skin.evaluation.metrics import metrics
-from skin.evaluation.operating_point import OperatingPoint, check, choose, gestures, lowest, read
+from skin.evaluation.operating_point import (
+    OperatingPoint,
+    check_evaluation,
+    choose_operating_point,
+    lowest_threshold,
+    parse_operating_point,
+    threshold_gestures,
+)
 from skin.evaluation.report import evaluate
 from skin.labels import TOUCH, TOUCH_OR_NOT, Task
 
@@ -47,7 +54,7 @@ def test_as_many_safe_gestures_raise_the_alarm_as_are_allowed(count, target, all
     """k = floor(target (n + 1)) - 1; 0.29 * 100 is 28.999999999999996 in floating point."""
     generator = torch.Generator().manual_seed(0)
     scores = torch.linspace(0.1, 0.9, count)[torch.randperm(count, generator=generator)]
-    threshold = lowest(scores, target)
+    threshold = lowest_threshold(scores, target)
     assert int((scores > threshold).sum()) == allowed
     assert allowed / count <= target
 
@@ -56,7 +63,7 @@ def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
     """The true rate is a beta variable of mean (k + 1) / (n + 1): exact, whatever the scores are."""
     rng = np.random.default_rng(0)
     # The true rate of a threshold on uniform scores is one minus the threshold.
-    rates = [1 - lowest(torch.from_numpy(rng.random(499)), 0.02) for _ in range(400)]
+    rates = [1 - lowest_threshold(torch.from_numpy(rng.random(499)), 0.02) for _ in range(400)]
     assert np.mean(rates) == pytest.approx(10 / 500, abs=4 * beta(10, 490).std() / 20)
     assert np.std(rates) == pytest.approx(beta(10, 490).std(), rel=0.15)
 
@@ -64,24 +71,24 @@ def test_a_new_safe_gesture_raises_the_alarm_as_often_as_wanted():
 def test_equal_scores_raise_the_alarm_together_or_not_at_all():
     """A vote of five members: 3 % of the safe gestures have all of them, 10 % four or more."""
     votes = torch.tensor([1.0] * 30 + [0.8] * 70 + [0.0] * 900)
-    assert 0.8 < lowest(votes, 0.05) < 1
-    assert int((votes > lowest(votes, 0.05)).sum()) == 30
-    assert int((votes > lowest(votes, 0.2)).sum()) == 100
-    assert lowest(votes, 0.02) > 1
+    assert 0.8 < lowest_threshold(votes, 0.05) < 1
+    assert int((votes > lowest_threshold(votes, 0.05)).sum()) == 30
+    assert int((votes > lowest_threshold(votes, 0.2)).sum()) == 100
+    assert lowest_threshold(votes, 0.02) > 1
 
 
 def test_the_last_digit_of_a_score_decides_nothing():
     """Scores of another processor differ in the last digit; the same gestures raise the alarm."""
     scores = torch.rand(3000, generator=torch.Generator().manual_seed(0)).round(decimals=3)
-    threshold = lowest(scores, 0.05)
+    threshold = lowest_threshold(scores, 0.05)
     up, down = (torch.nextafter(scores, torch.tensor(end)) for end in (2.0, -1.0))
     for other in (up, down):
         assert torch.equal(other > threshold, scores > threshold)
-        assert int((scores > lowest(other, 0.05)).sum()) == int((scores > threshold).sum())
+        assert int((scores > lowest_threshold(other, 0.05)).sum()) == int((scores > threshold).sum())
 
 
 def test_one_comparison_in_single_and_double_precision():
-    threshold = lowest(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
+    threshold = lowest_threshold(torch.rand(500, generator=torch.Generator().manual_seed(1)), 0.1)
     assert threshold == float(np.float32(threshold))
     near = np.nextafter(np.float32(threshold), np.float32([0, 0.5, 1]), dtype=np.float32)
     chances = torch.from_numpy(np.append(near, np.float32(threshold)))
@@ -139,36 +146,39 @@ def test_fresh_gestures_belong_to_no_split_and_enough_are_safe(device):
         for split in ("train", "validation", "holdout", "test")
         for row in device.touches(split).readings.flatten(1).sum(1)
     }
-    fresh = gestures(device, SETTINGS)
+    fresh = threshold_gestures(device, SETTINGS)
     assert len(fresh) == 128
     assert int((fresh.labels[:, 3] < 0.5).sum()) == 64
     assert not known & {row.item() for row in fresh.readings.flatten(1).sum(1)}
-    assert torch.equal(gestures(device.replace(), SETTINGS).readings, fresh.readings)
+    assert torch.equal(threshold_gestures(device.replace(), SETTINGS).readings, fresh.readings)
     other = device.replace(data_seed=1)
-    assert not torch.equal(gestures(other, SETTINGS).readings, fresh.readings)
+    assert not torch.equal(threshold_gestures(other, SETTINGS).readings, fresh.readings)
 
 
 def test_the_chosen_point_has_the_wanted_rate_on_its_gestures(device):
-    point = choose(Peak(), device, SETTINGS)
-    fresh = gestures(device, SETTINGS)
+    point = choose_operating_point(Peak(), device, SETTINGS)
+    fresh = threshold_gestures(device, SETTINGS)
     reached = point.reached(Peak().probabilities(fresh), fresh.labels, TOUCH)
     assert (point.safe, point.raised, point.target, point.seed) == (64, 5, 0.1, 0)
     assert (reached.safe, reached.raised) == (64, 5)
     assert (point.dangerous, point.found) == (reached.dangerous, reached.found) == (64, reached.found)
     assert f"finds {100 * reached.recall:.1f} % of 64 dangerous ones" in point.sentence()
-    assert choose(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold < point.threshold
+    assert (
+        choose_operating_point(Peak(), device, replace(SETTINGS, false_alarm_rate=0.5)).threshold
+        < point.threshold
+    )
 
 
 def test_streams_are_drawn_until_enough_windows_show_a_safe_touch(device):
     streamed = device.replace(stream=True)
-    fresh = gestures(streamed, SETTINGS)
+    fresh = threshold_gestures(streamed, SETTINGS)
     here = fresh.labels[:, 4] > 0.5
     assert int((here & (fresh.labels[:, 3] < 0.5)).sum()) >= 64
-    assert choose(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
+    assert choose_operating_point(Peak(TOUCH_OR_NOT), streamed, SETTINGS).safe >= 64
 
 
 def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(made_up_device):
-    point = choose(Peak(), made_up_device, SETTINGS)
+    point = choose_operating_point(Peak(), made_up_device, SETTINGS)
     labels = made_up_device.touches("validation").labels
     assert point.safe == int((labels[:, 3] < 0.5).sum())
     assert point.seed is None
@@ -178,7 +188,7 @@ def test_a_device_without_fresh_gestures_gives_its_validation_split_and_says_so(
 
 def test_a_task_without_dangerous_has_no_operating_point(made_up_device):
     made_up_device.task = Task(("big", "dynamic", "press", "hard"))
-    assert choose(Peak(), made_up_device, SETTINGS) is None
+    assert choose_operating_point(Peak(), made_up_device, SETTINGS) is None
     found = evaluate(Peak(), made_up_device, SETTINGS, None)
     assert found.reached is None
     assert not [name for name in found.metrics if "alarm" in name]
@@ -191,9 +201,9 @@ def test_a_threshold_that_nothing_passes_is_told():
 
 
 def test_what_is_stored_reads_back_to_the_last_digit():
-    point = replace(POINT, threshold=lowest(torch.linspace(0.1, 0.7, 500), 0.02))
-    assert read(point.text()) == point
-    assert read("null") is None
+    point = replace(POINT, threshold=lowest_threshold(torch.linspace(0.1, 0.7, 500), 0.02))
+    assert parse_operating_point(point.text()) == point
+    assert parse_operating_point("null") is None
 
 
 @pytest.mark.parametrize(
@@ -213,13 +223,13 @@ def test_what_is_stored_reads_back_to_the_last_digit():
 )
 def test_a_damaged_one_is_refused(change):
     with pytest.raises(InputError, match="cannot be read"):
-        read(json.dumps(json.loads(POINT.text()) | change))
+        parse_operating_point(json.dumps(json.loads(POINT.text()) | change))
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "0.5", "[" * 5000])
 def test_what_is_no_operating_point_is_refused(text):
     with pytest.raises(InputError, match="cannot be read"):
-        read(text)
+        parse_operating_point(text)
 
 
 @pytest.mark.parametrize(
@@ -232,4 +242,4 @@ def test_what_is_no_operating_point_is_refused(text):
 )
 def test_what_cannot_be_chosen_is_refused(change, said):
     with pytest.raises(InputError, match=said):
-        check(replace(SETTINGS, **change))
+        check_evaluation(replace(SETTINGS, **change))

@@ -10,11 +10,11 @@ from rich.console import Console
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.errors import InputError
+from skin.evaluation.metrics_table import print_report as show
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import columns, evaluate
-from skin.evaluation.show import report as show
 from skin.labels import TOUCH
-from skin.plot.evaluation_page import page
+from skin.plot.evaluation_page import evaluation_markdown
 
 SETTINGS = Evaluation(devices=2, layouts=2, gestures=32, false_alarm_rate=0.02)
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
@@ -151,4 +151,4 @@ def test_what_is_not_defined_has_a_reason_and_is_shown_as_a_dash(made_up_device,
     assert "100.0" not in line
     assert line.count(" - ") == 2
     assert "same/dangerous/false_alarm_rate: not defined" in seen.getvalue()
-    assert "| dangerous/false_alarm_rate | - | - |" in page(found, TOUCH, "title", "about")
+    assert "| dangerous/false_alarm_rate | - | - |" in evaluation_markdown(found, TOUCH, "title", "about")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.motion import change
+from experiments.studies.motion import motion_change
 from skin.body.arm import Arm
 from skin.build import build_data, build_device
 from skin.errors import InputError
@@ -41,7 +41,7 @@ def test_plates_do_not_bend_and_a_sentence_says_what_does(run, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("representation", ["image", "interp", "graph", "measured"])
+@pytest.mark.parametrize("representation", ["image", "interp", "graph", "features"])
 def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configured, representation):
     """Touches, labels and pictures live in the chart, so nothing but mechanics can tell the two apart."""
     shown = []
@@ -84,7 +84,7 @@ def test_sensors_on_the_arm_move_and_graphs_follow_them(configured):
     graph = "representation=graph", "representation.positions=deformed", "device.track=oracle"
     config = configured("body=arm", *SOLID, *graph, "fusion=late", "model=gcn")
     device = build_device(config)
-    found = change(device, 16)
+    found = motion_change(device, 16)
     assert 1e-4 < found.largest < 1
     assert min(found.furthest) > 1e-5
     assert np.isfinite(found.explained).all()

@@ -49,8 +49,8 @@ def test_building_starts_cold_each_time(run, tmp_path, monkeypatch):
 def test_what_is_not_installed_is_left_out():
     script = (
         "import sys; sys.modules['Pynite'] = None\n"
-        "from experiments.benchmarks import mechanics, setting\n"
-        "print(mechanics.pynite_seconds_per_frame(3), *setting.versions(['numpy', 'no-such-package']))"
+        "from experiments.benchmarks import harness, mechanics\n"
+        "print(mechanics.pynite_seconds_per_frame(3), *harness.versions(['numpy', 'no-such-package']))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
     assert done.stdout.split() == ["None", "numpy"], done.stderr
@@ -58,7 +58,7 @@ def test_what_is_not_installed_is_left_out():
 
 @pytest.mark.slow
 def test_a_verdict_is_timed_by_the_wall_and_by_the_core(run, tmp_path):
-    done = run(tmp_path, "benchmarks/live.py", "30", store=False)
+    done = run(tmp_path, "benchmarks/live_latency.py", "30", store=False)
     figures = json.loads(done.stdout)
     assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share"}
     assert 0 < figures["p50_ms"] <= figures["p99_ms"]

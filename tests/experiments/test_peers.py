@@ -12,7 +12,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
-from experiments.peers.exchange import export
+from experiments.peers.exchange import export_touches
 from skin.build import build_device
 from skin.config import Evaluation, Tracking, checked, fingerprint
 from skin.paths import ROOT
@@ -58,7 +58,7 @@ def exchanged(configured, tmp_path_factory):
     """A device with a dead sensor and the folder of its exported touches."""
     device = build_device(configured("simulator=naive", *SMALL, "device.dead=1"))
     folder = tmp_path_factory.mktemp("exchanged") / "files"
-    export(device, Evaluation(1, 1, 48, 0.02, 64), folder)
+    export_touches(device, Evaluation(1, 1, 48, 0.02, 64), folder)
     return device, folder
 
 

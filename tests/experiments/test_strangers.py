@@ -163,9 +163,9 @@ def test_what_a_run_is_called_leads_out_of_no_folder(store, put):
         configuration(store, found)
 
 
-@pytest.mark.parametrize("learner", ["features", "network"])
+@pytest.mark.parametrize("learner", ["boosted_trees", "network"])
 def test_what_a_run_learned_holds_numbers_alone(learner, run, folder, put, tmp_path, marker):
-    if learner == "features":
+    if learner == "boosted_trees":
         path, evil = tmp_path / "features.npz", np.array([Payload(marker)], dtype=object)
         np.savez(path, train=evil, train_labels=evil, validation=evil, validation_labels=evil)
     else:

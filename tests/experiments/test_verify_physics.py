@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.validation.index import LAWS
+from experiments.validation.laws import LAWS
 from skin.paths import ROOT
 
 

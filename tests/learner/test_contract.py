@@ -23,7 +23,7 @@ CHEAP = {
         "optimizer.lr=0.01",
         "trainer.max_epochs=15",
     ],
-    "features": ["learner.rounds=20"],
+    "boosted_trees": ["learner.rounds=20"],
     "ensemble": [
         "representation=readings",
         "model=mlp",
@@ -148,7 +148,7 @@ def test_a_direction_is_learnt_or_refused_by_name(made, configured, tmp_path):
     learner = made[0]()
     data = TouchData(device, instantiate(configured("representation=readings").representation), 32)
     if isinstance(learner, Rules):
-        with pytest.raises(InputError, match=r"got big, .*slide_x, slide_y: use learner=features"):
+        with pytest.raises(InputError, match=r"got big, .*slide_x, slide_y: use learner=boosted_trees"):
             learner.fit(data)
         return
     learner.fit(data)

@@ -6,20 +6,20 @@ from hydra.utils import instantiate
 
 from skin.datamodule import TouchData
 from skin.errors import InputError
+from skin.learner.boosted_trees import BoostedTrees
 from skin.learner.ensemble import Ensemble
-from skin.learner.features import Features
 
 
 def test_it_says_the_mean_of_what_its_members_say(configured, made_up_device):
     data = TouchData(made_up_device, instantiate(configured("representation=readings").representation), 32)
     whole = Ensemble(
-        {"few": lambda seed: Features(5, seed=seed), "many": lambda seed: Features(20, seed=seed)}
+        {"few": lambda seed: BoostedTrees(5, seed=seed), "many": lambda seed: BoostedTrees(20, seed=seed)}
     )
     whole.fit(data)
     touches = made_up_device.touches("test")
     each = []
     for number, rounds in enumerate((5, 20)):
-        member = Features(rounds, seed=number)
+        member = BoostedTrees(rounds, seed=number)
         member.fit(data)
         each.append(member.probabilities(touches))
     torch.testing.assert_close(whole.probabilities(touches), (each[0] + each[1]) / 2)
@@ -30,7 +30,7 @@ def test_copies_have_seeds_of_their_own():
 
     def make(seed):
         seeds.append(seed)
-        return Features(seed=seed)
+        return BoostedTrees(seed=seed)
 
     Ensemble({"trees": make}, {"trees": 3}, seed=2)
     assert seeds == [2000, 2001, 2002]
@@ -38,6 +38,6 @@ def test_copies_have_seeds_of_their_own():
 
 def test_what_cannot_be_is_refused():
     with pytest.raises(InputError, match="no member"):
-        Ensemble({"trees": Features}, {"trees": 0})
+        Ensemble({"trees": BoostedTrees}, {"trees": 0})
     with pytest.raises(InputError, match="copies names net"):
-        Ensemble({"trees": Features}, {"net": 1})
+        Ensemble({"trees": BoostedTrees}, {"net": 1})

@@ -129,7 +129,7 @@ def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_devi
         ["representation=image", "model=cnn"],
         ["representation=graph", "model=gcn", "model.norm=batch", "fusion=early"],
         ["representation=graph", "model=pyg"],
-        ["representation=measured", "model=mlp", "fusion.head=residual"],
+        ["representation=features", "model=mlp", "fusion.head=residual"],
         ["representation=graph", "model=transformer", "fusion.head=transformer"],
     ],
 )

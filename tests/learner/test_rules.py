@@ -38,5 +38,5 @@ def test_one_half_is_at_the_threshold_and_the_rule_can_be_read(made_up_device, t
 
 def test_other_labels_are_refused(made_up_device):
     made_up_device.task = Task(("grab", "hit"), "exclusive")
-    with pytest.raises(InputError, match="got grab, hit: use learner=features"):
+    with pytest.raises(InputError, match="got grab, hit: use learner=boosted_trees"):
         Rules().fit(TouchData(made_up_device, Readings))

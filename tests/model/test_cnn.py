@@ -43,7 +43,9 @@ def test_few_pixels_give_what_all_pixels_give(given, options, monkeypatch):
     model = Cnn("image", given.shape[1:], **options).eval()
     assert 32 * int((given != 0).flatten(0, 1).any(0).sum()) < 64 * 64
     taken = []
-    monkeypatch.setattr(_sparse, "plan", lambda a, plan=_sparse.plan: taken.append(1) or plan(a))
+    monkeypatch.setattr(
+        _sparse, "plan_convolution", lambda a, plan=_sparse.plan_convolution: taken.append(1) or plan(a)
+    )
     short, short_gradients = embed(model, given, monkeypatch, 32)
     assert len(taken) == len(options["channels"])
     long, long_gradients = embed(model, given, monkeypatch, float("inf"))

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from experiments.peers.exchange import Foreign, export
+from experiments.peers.exchange import PeerPredictions, export_touches
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.evaluation.report import columns
@@ -37,7 +37,7 @@ def device(configured):
 @pytest.fixture(scope="module")
 def folder(device, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exchange") / "naive"
-    export(device, SETTINGS, folder)
+    export_touches(device, SETTINGS, folder)
     return folder
 
 
@@ -53,7 +53,7 @@ def answer(folder, known, device):
 
 def test_every_set_of_learning_and_evaluating_is_written(folder):
     assert tuple(json.loads((folder / "sets.json").read_text())) == NAMES
-    for kind in ("touches", "measurements"):
+    for kind in ("touches", "features"):
         assert {path.stem for path in (folder / kind).iterdir()} == set(NAMES)
 
 
@@ -67,18 +67,18 @@ def test_touches_read_back_as_the_device_felt_them(device, folder):
     assert (moved - device.touches("test").positions).norm(dim=1).max() > 1e-3
 
 
-def test_measurements_have_one_row_per_touch(folder):
-    table = pq.read_table(folder / "measurements" / "holdout_0.parquet")
+def test_features_have_one_row_per_touch(folder):
+    table = pq.read_table(folder / "features" / "holdout_0.parquet")
     assert table.num_rows == 6
     assert table.num_columns > 100
-    # a measurement that anyone can repeat: the largest reading of each touch
+    # a feature that is easy to compute again: the largest reading of each touch
     readings = read(folder / "touches" / "holdout_0.parquet").touches.readings
     assert table["raw sensor maximum 1"].to_pylist() == readings.amax(dim=(1, 2)).tolist()
 
 
 def test_answers_meet_the_touches_they_were_given_for(device, folder):
     answer(folder, NAMES, device)
-    peer = Foreign(folder, "peer", device.task)
+    peer = PeerPredictions(folder, "peer", device.task)
     assert peer.about["parameters"] == 7
     found = {
         name: [float(peer.probabilities(touches).unique()) for touches in sets]
@@ -92,18 +92,18 @@ def test_touches_that_were_not_exported_get_no_answer(device, folder):
     answer(folder, NAMES, device)
     stranger = device.replace(seed=77).touches("test")
     with pytest.raises(LookupError, match="other touches"):
-        Foreign(folder, "peer", device.task).probabilities(stranger)
+        PeerPredictions(folder, "peer", device.task).probabilities(stranger)
 
 
 def test_what_lies_there_stays_and_what_changed_is_written_anew(device, tmp_path):
-    export(device, SETTINGS, tmp_path / "x")
+    export_touches(device, SETTINGS, tmp_path / "x")
     answer(tmp_path / "x", NAMES, device)
     before = (tmp_path / "x" / "touches" / "train.parquet").stat().st_mtime_ns
-    export(device, SETTINGS, tmp_path / "x")
+    export_touches(device, SETTINGS, tmp_path / "x")
     assert (tmp_path / "x" / "touches" / "train.parquet").stat().st_mtime_ns == before
     assert (tmp_path / "x" / "peer").is_dir()
     other = device.replace(seed=5)
-    export(other, SETTINGS, tmp_path / "x")
+    export_touches(other, SETTINGS, tmp_path / "x")
     known = json.loads((tmp_path / "x" / "sets.json").read_text())
     assert known["train"] == digest(other.touches("train"))
     assert not (tmp_path / "x" / "peer").exists()

@@ -7,7 +7,7 @@ from PIL import Image
 
 from skin.build import build_device
 from skin.errors import InputError
-from skin.plot.animation import VIEWS, Scene, thinning, write
+from skin.plot.animation import VIEWS, Scene, thinning, write_animation
 from skin.plot.touches import recorded, simulated
 from skin.storage import write as store
 
@@ -35,7 +35,7 @@ def frames_of(path):
 def test_every_view_shows_the_touch_in_its_frame(view, tmp_path):
     moved = np.zeros((6, 5, 7))
     moved[2, 2, 3] = 0.002
-    path = write(made(moved=moved), view, tmp_path / "new" / "x.gif")
+    path = write_animation(made(moved=moved), view, tmp_path / "new" / "x.gif")
     assert [one.name for one in path.parent.iterdir()] == ["x.gif"]
     shown, seconds = frames_of(path)
     assert len(shown) == 6
@@ -50,7 +50,7 @@ def test_every_view_shows_the_touch_in_its_frame(view, tmp_path):
 def test_the_pressure_is_shown_where_it_is(tmp_path):
     pressure = np.zeros((6, 6, 10))
     pressure[2, :3, 5:] = 50e3  # the upper right corner of the sheet
-    shown, _ = frames_of(write(made(pressure=pressure), "flat", tmp_path / "x.gif"))
+    shown, _ = frames_of(write_animation(made(pressure=pressure), "flat", tmp_path / "x.gif"))
     rows, columns = np.nonzero(np.abs(shown[2] - shown[1]).max(axis=-1) > 60)
     picture = columns < shown.shape[2] * 0.45
     assert rows[picture].mean() < 0.4 * shown.shape[1]
@@ -62,12 +62,14 @@ def test_sensors_that_move_are_shown_moving(tmp_path):
     away = scene.positions.copy()
     away[4:] += [0.005, 0.0, 0.0]
     moving = Scene(scene.readings, away, scene.size, scene.rate, scene.title)
-    shown, _ = frames_of(write(moving, "flat", tmp_path / "x.gif"))
+    shown, _ = frames_of(write_animation(moving, "flat", tmp_path / "x.gif"))
     assert (np.abs(shown[4] - shown[3]).max(axis=-1) > 60).sum() > 50
 
 
 def test_long_and_fast_touches_are_thinned_out(tmp_path):
-    shown, seconds = frames_of(write(made(frames=7, sensors=2, rate=50.0), "flat", tmp_path / "x.gif"))
+    shown, seconds = frames_of(
+        write_animation(made(frames=7, sensors=2, rate=50.0), "flat", tmp_path / "x.gif")
+    )
     assert len(shown) == 4
     assert seconds == pytest.approx(0.04)
     # the corpus of social touch: up to 1747 frames at 135 Hz
@@ -106,7 +108,7 @@ def test_a_touch_of_another_device_is_taken_by_its_number(made_up_device, tmp_pa
     assert torch.equal(torch.from_numpy(scene.readings), touches.readings[3])
     assert scene.title.startswith("touch 3: ")
     with pytest.raises(InputError, match="view=flat or view=sensors3d"):
-        write(scene, "skin3d", tmp_path / "x.gif")
+        write_animation(scene, "skin3d", tmp_path / "x.gif")
     with pytest.raises(InputError, match="give index=0 to 39"):
         recorded(made_up_device, 40)
     assert not list(tmp_path.iterdir())
@@ -118,7 +120,7 @@ def test_a_slide_on_the_arm_is_drawn_in_space(view, configured, tmp_path):
     scene = simulated(device, ["press", "dynamic"], "bar", 5, field=True)
     assert scene.body == device.body
     assert scene.moved is None
-    shown, _ = frames_of(write(scene, view, tmp_path / "x.gif"))
+    shown, _ = frames_of(write_animation(scene, view, tmp_path / "x.gif"))
     assert len(shown) == 30
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.plot.figures import confusions, force_and_reading, images, misclassified, save, traces
+from skin.plot.figures import confusions, force_and_reading, images, misclassified, save_figure, traces
 
 
 def test_a_confusion_matrix_shows_shares_of_each_true_class():
@@ -46,7 +46,7 @@ def test_force_and_reading_share_the_time():
 def test_a_picture_is_saved_whole(tmp_path):
     pictures = {name: torch.rand(8, 8) for name in ("image", "fourier")}
     figure = images(pictures, np.array([[0.05, 0.05]]), (0.1, 0.1))
-    path = save(figure, tmp_path / "new" / "figure.png")
+    path = save_figure(figure, tmp_path / "new" / "figure.png")
     assert [one.name for one in path.parent.iterdir()] == ["figure.png"]
     with Image.open(path) as picture:
         assert min(picture.size) > 200

@@ -14,7 +14,7 @@ from skin.hardware.record.log import Log
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
 from skin.plot import gesture_comparison as compared
-from skin.plot.gesture_page import figure, page
+from skin.plot.gesture_page import gestures_markdown, plot_gestures
 from skin.plot.press_comparison import Verdicts
 from skin.signal.frame import Frame
 from skin.simulator.naive import Naive
@@ -55,50 +55,50 @@ def session(device, path, labels):
 def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
     path = session(device, tmp_path / "s.csv", "announced")
     assert compared.marked(path)
-    found = compared.read(device, path, 0)
+    found = compared.read_gestures(device, path, 0)
     assert (found.same, len(found.pairs)) == (True, COUNT)
     for pair, played in zip(found.pairs, gestures(device), strict=False):
         assert pair.slope == pytest.approx(GAIN, rel=1e-3)
         assert pair.rmse == pytest.approx((1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3)
         # The applied force is the sum of the pressure, told by the movie and not by any sensor.
         assert pair.applied.max() > pair.peaks[0]
-    said = page(found, None, "Here.")
+    said = gestures_markdown(found, None, "Here.")
     assert "gain ratio of readings (recorded over simulated), median: 0.800" in said
-    assert figure(found, 2, tmp_path / "x.png").stat().st_size > 10_000
-    simulated, recorded = compared.touches(found)
+    assert plot_gestures(found, 2, tmp_path / "x.png").stat().st_size > 10_000
+    simulated, recorded = compared.gesture_touches(found)
     assert recorded.readings.numpy() == pytest.approx(GAIN * simulated.readings.numpy(), abs=2e-3)
 
 
 def test_verdicts_are_counted(device, tmp_path):
-    found = compared.read(device, session(device, tmp_path / "s.csv", "announced"), 0)
+    found = compared.read_gestures(device, session(device, tmp_path / "s.csv", "announced"), 0)
     truth = np.array([[bool(pair.labels[name]) for name in TOUCH.names] for pair in found.pairs])
     wrong = truth.copy()
     wrong[:2, 1] ^= True
-    said = page(found, Verdicts(TOUCH.names, truth, wrong, truth), "Here.")
+    said = gestures_markdown(found, Verdicts(TOUCH.names, truth, wrong, truth), "Here.")
     assert "the same of `big` on 6 of 6 gestures, and is right on 6 simulated and 6 recorded ones" in said
     assert "the same of `dynamic` on 4 of 6 gestures, and is right on 6 simulated and 4 recorded" in said
 
 
 def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, tmp_path):
-    found = compared.read(device, session(device, tmp_path / "s.csv", "prompted"), 0)
+    found = compared.read_gestures(device, session(device, tmp_path / "s.csv", "prompted"), 0)
     assert not found.same
     played = list(islice(gestures(device), COUNT))
     assert [pair.labels for pair in found.pairs] == [one.labels for one in played]
     assert not np.allclose(found.pairs[0].simulated, played[0].force)
-    said = page(found, None, "Here.")
+    said = gestures_markdown(found, None, "Here.")
     assert said.startswith("# Gestures of the same labels")
     assert "RMSE of readings" not in said
-    assert figure(found, 2, tmp_path / "x.png").stat().st_size > 10_000
+    assert plot_gestures(found, 2, tmp_path / "x.png").stat().st_size > 10_000
 
 
 def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
     path = session(device, tmp_path / "s.csv", "announced")
     with pytest.raises(InputError, match=r"emulate\.seed as compare\.seed"):
-        compared.read(device, path, 1)
+        compared.read_gestures(device, path, 1)
     with pytest.raises(InputError, match="another layout"):
-        compared.read(device.replace(layout=Grid(1, 9)), path, 0)
+        compared.read_gestures(device.replace(layout=Grid(1, 9)), path, 0)
     with pytest.raises(InputError, match=r"30 frames at 10 Hz, .* at 5 Hz: give .*device\.rate=10"):
-        compared.read(device.replace(rate=5.0), path, 0)
+        compared.read_gestures(device.replace(rate=5.0), path, 0)
 
 
 def test_gestures_without_labels_are_refused(device, tmp_path):
@@ -107,7 +107,7 @@ def test_gestures_without_labels_are_refused(device, tmp_path):
     kept = [line.split(', "labels"')[0] + ', "labels": null}' if "begin" in line else line for line in lines]
     (tmp_path / "s.csv").write_text("\n".join(kept) + "\n")
     with pytest.raises(InputError, match=r"no gesture with labels.*device\.labels=prompted"):
-        compared.read(device, path, 0)
+        compared.read_gestures(device, path, 0)
 
 
 def test_a_bench_session_marks_no_gestures(tmp_path):

@@ -7,7 +7,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Path3DCollection, Poly3
 
 from skin.body.arm import Arm
 from skin.errors import InputError
-from skin.plot.animation import still, write
+from skin.plot.animation import still, write_animation
 from skin.plot.plot3d import sensors_in_space, skin_in_space
 from skin.plot.view import Scene
 
@@ -82,6 +82,6 @@ def test_the_skin_is_coloured_by_pressure_where_nobody_knows_how_it_moves():
 def test_every_view_shows_the_arm(view, tmp_path):
     """Only the touched frame differs, on the left, where the arm is."""
     known = scene(moved=moved())
-    assert write(known, view, tmp_path / "x.gif").stat().st_size > 1000
+    assert write_animation(known, view, tmp_path / "x.gif").stat().st_size > 1000
     assert still(known, view, tmp_path / "x.png").stat().st_size > 1000
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.gif", "x.png"]

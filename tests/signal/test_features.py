@@ -1,4 +1,4 @@
-"""Measurements of touches made by hand."""
+"""Features of touches made by hand."""
 
 from itertools import groupby
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from skin.recording import Touches
-from skin.signal.features import measurements
+from skin.signal.features import engineered_features
 
 PLACES = torch.tensor([[0.02, 0.02, 0.0], [0.06, 0.02, 0.0], [0.10, 0.02, 0.0], [0.06, 0.08, 0.0]])
 
@@ -20,7 +20,7 @@ def touch(*forces, offset=0.0):
 
 
 def value(name, *forces, **options):
-    return measurements(touch(*forces, **options))[name].item()
+    return engineered_features(touch(*forces, **options))[name].item()
 
 
 def test_a_press_of_three_frames_then_one_more():
@@ -32,7 +32,7 @@ def test_a_press_of_three_frames_then_one_more():
 
 def test_an_offset_of_the_sensors_does_not_matter():
     press = [(2, 0, 2.5), (3, 1, 1.5)]
-    plain, moved = measurements(touch(*press)), measurements(touch(*press, offset=0.8))
+    plain, moved = engineered_features(touch(*press)), engineered_features(touch(*press, offset=0.8))
     for name in plain:
         if "raw" not in name:
             assert moved[name].item() == pytest.approx(plain[name].item(), abs=1e-5), name
@@ -72,11 +72,11 @@ def test_the_order_of_sensors_does_not_matter_and_their_number_not_to_the_names(
     readings = 3 * torch.rand(5, 10, 4, generator=generator)
     valid = torch.rand(5, 10, 4, generator=generator) > 0.1
     order = torch.tensor([2, 0, 3, 1])
-    plain = measurements(Touches(readings, valid, PLACES, None, 10.0))
-    turned = measurements(Touches(readings[..., order], valid[..., order], PLACES[order], None, 10.0))
+    plain = engineered_features(Touches(readings, valid, PLACES, None, 10.0))
+    turned = engineered_features(Touches(readings[..., order], valid[..., order], PLACES[order], None, 10.0))
     for name in plain:
         torch.testing.assert_close(turned[name], plain[name], msg=name, atol=1e-4, rtol=1e-4)
-    one = measurements(Touches(readings[..., :1], valid[..., :1], PLACES[:1], None, 10.0))
+    one = engineered_features(Touches(readings[..., :1], valid[..., :1], PLACES[:1], None, 10.0))
     assert list(one) == list(plain)
     assert 120 <= len(plain) <= 140
 
@@ -87,7 +87,7 @@ def test_an_idle_window_or_a_dead_sensor_gives_numbers():
     broken.readings[0, :, 2] = float("nan")
     broken.valid[0, :, 2] = False
     for touches in (idle, broken):
-        for name, column in measurements(touches).items():
+        for name, column in engineered_features(touches).items():
             assert torch.isfinite(column.float()).all(), name
 
 
@@ -101,15 +101,15 @@ def random_touches(count, seed=3):
 
 def test_a_window_alone_gives_what_it_gives_in_a_batch():
     touches = random_touches(20)
-    together = measurements(touches)
+    together = engineered_features(touches)
     for place in range(len(touches)):
-        for name, alone in measurements(touches[place : place + 1]).items():
+        for name, alone in engineered_features(touches[place : place + 1]).items():
             torch.testing.assert_close(alone[0], together[name][place], rtol=1e-6, atol=1e-6, msg=name)
 
 
 def test_runs_and_counts_are_those_that_plain_python_finds():
     touches = random_touches(50)
-    found = measurements(touches)
+    found = engineered_features(touches)
     raw = touches.readings.where(touches.valid, 0)
     x = (raw - raw.quantile(0.2, dim=1, keepdim=True)) * touches.valid
     for place, rows in enumerate(x):

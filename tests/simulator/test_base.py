@@ -119,12 +119,12 @@ def test_its_state_is_all_in_its_buffers(simulator):
 
 
 def test_drag_is_felt_or_refused_by_name(simulator):
-    frames, drag = pressure(3), torch.tensor([[0.5, 0.0], [0.0, 0.5], [0.0, 0.0]])
+    frames, shear = pressure(3), torch.tensor([[0.5, 0.0], [0.0, 0.5], [0.0, 0.0]])
     if not simulator.feels_shear:
         with pytest.raises(InputError, match=r"friction needs a simulator .* set simulator=solid"):
-            simulator(frames, drag)
+            simulator(frames, shear)
         return
-    plain, dragged, twice = simulator(frames), simulator(frames, drag), simulator(2 * frames, drag)
-    assert not torch.allclose(plain.readings[:2], dragged.readings[:2], rtol=1e-3)
-    torch.testing.assert_close(plain.readings[2], dragged.readings[2], rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(twice.readings, 2 * dragged.readings, rtol=1e-4, atol=1e-5)
+    plain, sheared, twice = simulator(frames), simulator(frames, shear), simulator(2 * frames, shear)
+    assert not torch.allclose(plain.readings[:2], sheared.readings[:2], rtol=1e-3)
+    torch.testing.assert_close(plain.readings[2], sheared.readings[2], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(twice.readings, 2 * sheared.readings, rtol=1e-4, atol=1e-5)

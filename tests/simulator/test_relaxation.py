@@ -157,13 +157,13 @@ def test_layers_that_relax_alike_share_a_load_as_ever(make):
 
 
 def test_shear_relaxes_too():
-    pressure, drag = movie(), torch.full((40, 2), 0.5)
+    pressure, shear = movie(), torch.full((40, 2), 0.5)
     relaxing = Relaxing(Solid, sheet(None, SLOW), SENSORS, RATE)
     assert relaxing.feels_shear
     index, scale = torch.arange(40)[None], torch.ones(1, 40)
-    plain, dragged = (relaxing.play(pressure[0], index, scale, along) for along in (None, drag))
-    more = relaxing.play(pressure[0], index, scale, 2 * drag)
-    felt = dragged.readings - plain.readings
+    plain, sheared = (relaxing.play(pressure[0], index, scale, along) for along in (None, shear))
+    more = relaxing.play(pressure[0], index, scale, 2 * shear)
+    felt = sheared.readings - plain.readings
     assert felt.abs().max() > 0.01 * plain.readings.abs().max()
     torch.testing.assert_close(more.readings - plain.readings, 2 * felt, rtol=1e-3, atol=1e-4)
 

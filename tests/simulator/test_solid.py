@@ -11,7 +11,7 @@ from skin.errors import InputError
 from skin.sensors import Sensors
 from skin.simulator._elastic import Elastic
 from skin.simulator._hexahedra import Hexahedra
-from skin.simulator.solid import Solid, hexahedra, readings
+from skin.simulator.solid import Solid, hexahedra, reading_rows
 
 LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
@@ -91,9 +91,9 @@ def test_the_operator_is_a_direct_solve():
     load = mesh.loads(2) @ pressure - 0.4 * mesh.loads(0) @ pressure
     moved = np.zeros(len(load))
     moved[free] = spsolve(mesh.stiffness()[free][:, free].tocsc(), load[free])
-    frame, drag = torch.from_numpy(pressure).reshape(12, 12), torch.tensor([-0.4, 0.0])
-    felt = solid(where)(frame, drag).readings.numpy()
-    assert felt == pytest.approx(readings(mesh, where) @ moved, rel=2e-6)
+    frame, shear = torch.from_numpy(pressure).reshape(12, 12), torch.tensor([-0.4, 0.0])
+    felt = solid(where)(frame, shear).readings.numpy()
+    assert felt == pytest.approx(reading_rows(mesh, where) @ moved, rel=2e-6)
 
 
 def test_forces_are_mutual():
@@ -115,9 +115,9 @@ def test_a_tilted_sensor_feels_shear():
     skin = solid(where, wide)
     nothing = torch.full(wide.shape, 1e3)
     pushed = skin(nothing).readings.double()
-    dragged = skin(nothing, torch.tensor([0.5, 0.0])).readings.double()
+    sheared = skin(nothing, torch.tensor([0.5, 0.0])).readings.double()
     # The traction pushes the surface along +x; on the plane across n it pulls where n leans into the motion.
-    change = (dragged - pushed).numpy() / (1e3 * 1e-4)
+    change = (sheared - pushed).numpy() / (1e3 * 1e-4)
     assert change[0] == pytest.approx(2 * 0.5 * np.sin(angle) * np.cos(angle), rel=0.03)
     assert change[1] == pytest.approx(0, abs=0.01)
 
@@ -179,7 +179,7 @@ def test_the_measured_ratio_of_dragon_skin_is_refused_by_name():
 
 
 def test_sensors_move_with_what_slides_over_them():
-    """Under a drag along x they go along x, and by symmetry neither along y nor deeper."""
+    """Under a shear along x they go along x, and by symmetry neither along y nor deeper."""
     body = Sheet([0.16, 0.16], [8, 8], LAYERS)
     solid = Solid(body, Sensors(np.array([[0.08, 0.08, 0.005]]), (0.02, 0.02)), divisions=1)
     pressure = torch.zeros(1, 8, 8)

@@ -5,7 +5,7 @@ import math
 import pytest
 from scipy.stats import ttest_rel
 
-from experiments.studies.comparison import Paired, conclude, paired, verdict
+from experiments.studies.comparison import Paired, combine_verdicts, paired, verdict
 
 
 def test_a_paired_difference_is_that_of_the_paired_t_test():
@@ -74,4 +74,4 @@ def test_two_seeds_decide_nothing():
     ],
 )
 def test_a_statement_about_several_holds_against_each(each, whole):
-    assert conclude(each) == whole
+    assert combine_verdicts(each) == whole

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.studies.embedding.probe import FRAME, Found, Space
-from experiments.studies.embedding_spaces import lines, planes, spaces, statements
+from experiments.studies.embedding.probe import FRAME, ProbeResult, Space
+from experiments.studies.embedding_spaces import embedding_statements, embeddings_table, planes, spaces
 
 NAMES = ("big", "press")
 
@@ -16,7 +16,7 @@ def found(attribute, name, seed, right, layout):
     space = Space(generator.standard_normal((40, 5)), labels, 30, generator.standard_normal((40, 5)),
                   np.arange(40) % 2, labels)  # fmt: skip
     accuracy = {"big": right, "press": right - 0.1, "layout": 1.0}
-    return Found(attribute, name, seed, accuracy, {"layout": layout, "big": 0.2, "press": 0.1}, space)
+    return ProbeResult(attribute, name, seed, accuracy, {"layout": layout, "big": 0.2, "press": 0.1}, space)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def three():
 
 
 def test_the_table_has_means_and_deviations(three):
-    head, degree, *_ = lines(three, NAMES)
+    head, degree, *_ = embeddings_table(three, NAMES)
     assert head[:4] == ["input", "big", "press", "mean"]
     assert degree[0] == "Graph2Vec, degree"
     assert degree[1:4] == ["55.0 ± 1.0", "45.0 ± 1.0", "50.0 ± 1.0"]
@@ -42,22 +42,22 @@ def test_the_table_has_means_and_deviations(three):
 
 
 def test_verdicts_follow_the_figures(three):
-    words = [line.split("**")[1] for line in statements(three, NAMES)]
+    words = [line.split("**")[1] for line in embedding_statements(three, NAMES)]
     # the layout's share against the best label's; against readings, 0 ± 1.2; chance is 50 %
     assert words == ["agree", "agree", "agree", "disagree", "undecided", "disagree"]
 
 
 def test_one_seed_decides_nothing(three):
-    assert all("**undecided**" in line for line in statements(three[:3], NAMES))
+    assert all("**undecided**" in line for line in embedding_statements(three[:3], NAMES))
 
 
 def test_without_layouts_morphology_is_undecided(three):
     alone = [one._replace(explained={}, space=one.space._replace(mixed=None)) for one in three]
-    said = statements(alone, NAMES)
+    said = embedding_statements(alone, NAMES)
     assert "**undecided**" in said[0]
     assert "one layout only" in said[0]
     assert "**agree**" in said[1]
-    assert lines(alone, NAMES)[1][-2:] == ["", ""]
+    assert embeddings_table(alone, NAMES)[1][-2:] == ["", ""]
 
 
 def test_clusters_stay_apart_in_the_plane():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.motion import Change, _changes, change
+from experiments.studies.motion import Change, _changes, motion_change
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
@@ -43,7 +43,7 @@ def test_change_of_distance_by_hand():
 
 def test_a_skin_is_measured_over_all_its_gestures(device):
     """Independent answer: every pair of the 3 x 3 grid by itself, in numpy."""
-    found = change(device, 40, neighbourhood=8)
+    found = motion_change(device, 40, neighbourhood=8)
     touches = device.replace(track="oracle", test_gestures=40).touches("test")
     rest, motion = touches.positions.double().numpy(), touches.motion.double().numpy()
     largest = 0.0
@@ -66,7 +66,7 @@ def test_below_one_per_cent_nothing_is_to_be_had(largest, says):
 
 def test_a_single_sensor_has_no_neighbour(device):
     with pytest.raises(InputError, match="add sensors"):
-        change(device.replace(layout=Grid(1, 1)), 20)
+        motion_change(device.replace(layout=Grid(1, 1)), 20)
 
 
 def test_the_motion_is_told_in_millimetres():

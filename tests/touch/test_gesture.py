@@ -104,9 +104,9 @@ def test_time_spans(drawn):
 def test_every_gesture_leaves_room(drawn):
     _, gestures, paths = drawn
     assert (gestures["high"] - gestures["low"]).max() <= 0.15
-    assert paths["room"].min() >= 0.01
+    assert paths["span"].min() >= 0.01
     assert (paths["start"] >= 0).all()
-    assert (paths["start"] <= paths["room"]).all()
+    assert (paths["start"] <= paths["span"]).all()
 
 
 def test_paths(drawn):

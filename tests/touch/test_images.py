@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from skin.errors import InputError
-from skin.touch.images import check, load, pyramid
+from skin.touch.images import check_image, load_image, pyramid
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -22,7 +22,7 @@ def test_the_shipped_shapes_are_what_the_script_draws():
     shapes = runpy.run_path(str(DATA / "make_shapes.py"))["SHAPES"]
     assert {path.stem for path in (DATA / "shapes").glob("*.png")} == set(shapes)
     for name, shape in shapes.items():
-        np.testing.assert_allclose(load(name), shape() / shape().max(), atol=1.01 / 255)
+        np.testing.assert_allclose(load_image(name), shape() / shape().max(), atol=1.01 / 255)
 
 
 @pytest.mark.parametrize(
@@ -36,43 +36,45 @@ def test_the_shipped_shapes_are_what_the_script_draws():
 )
 def test_any_depth(tmp_path, pixels):
     suffix = "tiff" if pixels.dtype == np.float32 else "png"
-    image = load(save(tmp_path / f"mine.{suffix}", pixels))
+    image = load_image(save(tmp_path / f"mine.{suffix}", pixels))
     np.testing.assert_allclose(image, [[0, 128 / 255], [1, 64 / 255], [0, 0]], atol=1e-3)
 
 
 def test_transparent_means_no_force(tmp_path):
     pixels = np.full((4, 4, 4), 255, np.uint8)
     pixels[:2, :, 3] = 0
-    np.testing.assert_array_equal(load(save(tmp_path / "mine.png", pixels)), [[0] * 4] * 2 + [[1] * 4] * 2)
+    np.testing.assert_array_equal(
+        load_image(save(tmp_path / "mine.png", pixels)), [[0] * 4] * 2 + [[1] * 4] * 2
+    )
 
 
 def test_a_relative_path_starts_in_the_working_directory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save(tmp_path / "mine.png", np.full((3, 3), 9, np.uint8))
-    assert load("mine.png").shape == (3, 3)
+    assert load_image("mine.png").shape == (3, 3)
 
 
 def test_refusals_name_the_picture(tmp_path):
     with pytest.raises(InputError, match=r"no shape nothing: touch.shapes takes bar, .*square"):
-        load("nothing")
+        load_image("nothing")
     (tmp_path / "text.png").write_text("no picture")
     with pytest.raises(InputError, match=r"cannot read the shape .*text.png"):
-        load(str(tmp_path / "text.png"))
+        load_image(str(tmp_path / "text.png"))
     (tmp_path / "empty.png").touch()
     with pytest.raises(InputError, match=r"cannot read the shape .*empty.png"):
-        load(str(tmp_path / "empty.png"))
+        load_image(str(tmp_path / "empty.png"))
     good = (DATA / "shapes" / "hand.png").read_bytes()
     (tmp_path / "cut.png").write_bytes(good[: len(good) // 2])
     with pytest.raises(InputError, match=r"cannot read the shape .*cut.png"):
-        load(str(tmp_path / "cut.png"))
+        load_image(str(tmp_path / "cut.png"))
     with pytest.raises(InputError, match=r"black.png must be .* got \(5, 5\) pixels from 0 to 0"):
-        load(save(tmp_path / "black.png", np.zeros((5, 5), np.uint8)))
+        load_image(save(tmp_path / "black.png", np.zeros((5, 5), np.uint8)))
     with pytest.raises(InputError, match=r"nan.tiff must be .* finite values .* from nan"):
-        load(save(tmp_path / "nan.tiff", np.array([[1, np.nan]], np.float32)))
+        load_image(save(tmp_path / "nan.tiff", np.array([[1, np.nan]], np.float32)))
     with pytest.raises(InputError, match=r"pull.tiff must be .* from 0 up, .* from -1 to 1"):
-        load(save(tmp_path / "pull.tiff", np.array([[1, -1]], np.float32)))
+        load_image(save(tmp_path / "pull.tiff", np.array([[1, -1]], np.float32)))
     with pytest.raises(InputError, match=r"must be a grey-scale picture"):
-        check(np.zeros((0, 4)), "nothing")
+        check_image(np.zeros((0, 4)), "nothing")
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 50), (640, 480), (97, 1)])

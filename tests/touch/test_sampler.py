@@ -10,7 +10,8 @@ from skin.body.sheet import Sheet
 from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
-from skin.touch.sampler import TouchSampler, balanced, join
+from skin.touch.movie import join_movies
+from skin.touch.sampler import TouchSampler, balanced
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 SHEETS = {
@@ -166,7 +167,7 @@ def test_rows_of_a_movie_are_its_gestures():
     some = movie[rows]
     assert torch.equal(some.pressure(), movie.pressure()[rows])
     assert len(some.frames) < len(movie.frames)
-    again = join([movie[:10], movie[10:]])
+    again = join_movies([movie[:10], movie[10:]])
     assert torch.equal(again.pressure(), movie.pressure())
     assert torch.equal(again.parameters["peak"], movie.parameters["peak"])
 
@@ -202,16 +203,16 @@ def test_friction_changes_nothing_but_the_drag():
     plain, rough = (
         sampler(SHEETS["default"], shear=shear).sample(48, np.random.default_rng(3)) for shear in (0.0, 0.5)
     )
-    assert plain.drag is None
+    assert plain.shear is None
     assert torch.equal(plain.frames, rough.frames)
     assert all(torch.equal(plain.parameters[name], rough.parameters[name]) for name in plain.parameters)
 
 
 def test_drag_follows_the_centre_of_pressure():
-    """Seen in the frames alone: the drag points from where the pressure was to where it is."""
+    """Seen in the frames alone: the shear points from where the pressure was to where it is."""
     source = sampler(SHEETS["default"], shear=0.5)
     movie = source.sample(96, np.random.default_rng(3))
-    size = torch.linalg.vector_norm(movie.drag, dim=1)
+    size = torch.linalg.vector_norm(movie.shear, dim=1)
     dynamic = movie.labels[:, 1] == 1
     x, y = (torch.arange(32) + 0.5) * 0.005, (torch.arange(32) + 0.5) * 0.005
     for index, scale, slides in zip(movie.index, movie.scale, dynamic.tolist(), strict=True):
@@ -225,7 +226,7 @@ def test_drag_follows_the_centre_of_pressure():
         steps = centre.diff(dim=0)
         far = torch.linalg.vector_norm(steps, dim=1) > 2e-3
         # Rendering on cells of 5 mm moves a centre by parts of a millimetre.
-        cosine = torch.cosine_similarity(steps, movie.drag[shown][1:].double())
+        cosine = torch.cosine_similarity(steps, movie.shear[shown][1:].double())
         assert (cosine[far] > 0.97).all()
         torch.testing.assert_close(size[shown], torch.full((len(shown),), 0.5))
 
@@ -233,8 +234,8 @@ def test_drag_follows_the_centre_of_pressure():
 def test_rows_and_joined_movies_keep_their_drag():
     movie = sampler(SHEETS["default"], shear=0.5).sample(32, np.random.default_rng(3))
     rows = torch.tensor([5, 2, 19])
-    for part in (movie[rows], join([movie[rows[:1]], movie[rows[1:]]])):
-        assert torch.equal(part.drag[part.index], movie.drag[movie.index[rows]])
+    for part in (movie[rows], join_movies([movie[rows[:1]], movie[rows[1:]]])):
+        assert torch.equal(part.shear[part.index], movie.shear[movie.index[rows]])
 
 
 def test_net_is_from_the_first_place_to_the_last(sampled):

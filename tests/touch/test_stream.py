@@ -30,7 +30,7 @@ def device(**changes) -> Simulated:
 @pytest.fixture(scope="module")
 def dense():
     """A strip of a perfect device with touches close together, and its dense movie (F, H, W)."""
-    strip = device(**PERFECT).strip(500, gap=[1, 25])
+    strip = device(**PERFECT).simulate_stream(500, gap=[1, 25])
     movie = strip.timeline.movie
     pressure, onset = movie.pressure(), movie.parameters["onset"].long()
     stream = torch.zeros(500, *BODY.shape)
@@ -102,7 +102,7 @@ def test_what_else_is_known_of_a_window(dense):
 
 
 def test_overlapping_windows_share_their_noise():
-    strip = device().strip(300)
+    strip = device().simulate_stream(300)
     one, other = strip.cut(torch.tensor([100, 110]), 30).touches.readings
     assert torch.equal(one[10:], other[:-10])
     idle = strip.whole.touches.readings[0][strip.whole.force[0] == 0]
@@ -136,7 +136,7 @@ def test_splits_have_their_sizes_and_streams_of_their_own(plain):
 
 
 def test_no_training_draws_a_gesture_of_a_test_stream(plain):
-    test = set(plain.strip(3000).timeline.movie.parameters["peak"].tolist())
+    test = set(plain.simulate_stream(3000).timeline.movie.parameters["peak"].tolist())
     test |= set(plain.recording("test").parameters["peak"].tolist())
     for seed in range(3):
         budget = set(device(data_seed=seed).recording().parameters["peak"].tolist())
@@ -174,12 +174,14 @@ def test_randomise_gives_every_window_a_device():
     idle = touches.readings[touches.labels[:, 4] == 0]
     assert (idle.std(dim=1) < 1e-6).all()
     assert (idle[:, 0].std(dim=0) > 0.02).all()
-    strip = device(randomise=True, noise=0.0).strip(200)
-    assert torch.equal(strip.whole.touches.readings, device(noise=0.0).strip(200).whole.touches.readings)
+    strip = device(randomise=True, noise=0.0).simulate_stream(200)
+    assert torch.equal(
+        strip.whole.touches.readings, device(noise=0.0).simulate_stream(200).whole.touches.readings
+    )
 
 
 def test_a_short_stream_may_be_all_gap():
-    windows = device().strip(40, gap=[1000, 2000]).cut(torch.arange(10), 30)
+    windows = device().simulate_stream(40, gap=[1000, 2000]).cut(torch.arange(10), 30)
     assert (windows.touches.labels == 0).all()
 
 

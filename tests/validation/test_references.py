@@ -1,4 +1,4 @@
-"""The independent answers are right themselves: against other formulas, and against numerical integration."""
+"""The reference solutions are checked against other formulas and numerical integration."""
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ def test_below_the_middle_of_a_square_boussinesq_is_steinbrenner():
     root = np.sqrt(m**2 + n**2 + 1)
     first = m * n * (m**2 + n**2 + 2) / (root * (m**2 + 1) * (n**2 + 1))
     corner = (first + np.arcsin(m * n / np.sqrt((m**2 + 1) * (n**2 + 1)))) / (2 * np.pi)
-    stress = HalfSpace(1e5, 0.4, 0.01).pressed(np.array([[0, 0, 0.007]]))[1]
+    stress = HalfSpace(1e5, 0.4, 0.01).under_pressure(np.array([[0, 0, 0.007]]))[1]
     assert stress[0, 0] == pytest.approx(-4 * corner, rel=1e-6)
 
 
@@ -92,11 +92,11 @@ def test_love_in_the_middle_of_a_square():
     assert along == pytest.approx(down * (1 - 0.4 / 2) / (1 - 0.4), rel=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["pressed", "dragged"])
+@pytest.mark.parametrize("kind", ["under_pressure", "under_shear"])
 def test_half_spaces_are_in_equilibrium(kind):
     """The stress on a deep wide plane carries the load, and motion and stress obey Hooke's law."""
     space = HalfSpace(1e5, 0.3, 0.01)
-    part = 0 if kind == "pressed" else 1
+    part = 0 if kind == "under_pressure" else 1
     points, weights = np.polynomial.legendre.leggauss(80)
     turn = np.pi / 2 * points
     x = 0.02 * np.tan(turn)  # the whole plane

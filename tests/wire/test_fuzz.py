@@ -101,18 +101,20 @@ def benchmarks():
     """Return the benchmark and the frames that it writes, which are no part of the package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "experiments")
-        return import_module("experiments.benchmarks.fuzz"), import_module("experiments.benchmarks.pieces")
+        return import_module("experiments.benchmarks.fuzz"), import_module(
+            "experiments.benchmarks.protocol_frames"
+        )
 
 
 def test_another_hand_writes_the_same_frames(benchmarks):
-    _, pieces = benchmarks
+    _, frames = benchmarks
     values = [0.0, 512.0, 1023.0, 7.0]
     for check in ("crc16", "xor", "none"):
         fields = [b"12", b"34000", *(b"%d" % value for value in values)]
-        written = pieces.line(fields, b",", check) + b"\n"
+        written = frames.text_line(fields, b",", check) + b"\n"
         assert written == encode_line([int(value) for value in values], 12, 34000, check)
     for kind, name in ((1, "u16"), (2, "i16"), (3, "f32")):
-        assert pieces.binary(12, 34000, values * 40, kind) == encode_frame(values * 40, 12, 34000, name)
+        assert frames.binary_frame(12, 34000, values * 40, kind) == encode_frame(values * 40, 12, 34000, name)
 
 
 @pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])

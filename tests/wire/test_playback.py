@@ -51,7 +51,7 @@ def test_a_recording_of_another_skin_is_refused(recording):
 
 
 def test_the_simulator_is_played(device):
-    strip = device.strip(6000).whole.touches.readings[0].numpy()
+    strip = device.simulate_stream(6000).whole.touches.readings[0].numpy()
     with open_skin("simulated", device.sensors, device=device, realtime=False) as skin:
         frames = skin.read(6001, timeout=60)
     assert np.stack([frame.values for frame in frames[:6000]]) == pytest.approx(strip)

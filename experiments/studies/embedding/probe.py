@@ -10,7 +10,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from experiments.studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
-from experiments.studies.embedding.settings import Probing
+from experiments.studies.embedding.probe_settings import ProbeSettings
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.layout.scattered import Scattered
@@ -46,7 +46,7 @@ class Space(NamedTuple):
     mixed_labels: np.ndarray
 
 
-class Found(NamedTuple):
+class ProbeResult(NamedTuple):
     """What one embedding told with one seed.
 
     Attributes:
@@ -67,7 +67,9 @@ class Found(NamedTuple):
     space: Space
 
 
-def probe(device: AbstractDevice, settings: Probing, learner: AbstractLearner | None) -> Iterator[Found]:
+def probe(
+    device: AbstractDevice, settings: ProbeSettings, learner: AbstractLearner | None
+) -> Iterator[ProbeResult]:
     """Yield what every input tells, seed by seed: graph embeddings, a trained encoder's, plain readings.
 
     A simulated device draws new touches for every seed, of which no training has any; of another device the
@@ -111,7 +113,7 @@ def explained(vectors: np.ndarray, classes: np.ndarray) -> float:
 
 
 def _graph_vectors(
-    sets: Sequence[Touches], attribute: str, settings: Probing, seed: int
+    sets: Sequence[Touches], attribute: str, settings: ProbeSettings, seed: int
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield each graph embedding (B, E) of the strongest frames of touches, one layout per set.
 
@@ -139,7 +141,7 @@ def _graph_vectors(
 
 
 def _inputs(
-    sets: Sequence[Touches], settings: Probing, seed: int, learner: AbstractLearner | None
+    sets: Sequence[Touches], settings: ProbeSettings, seed: int, learner: AbstractLearner | None
 ) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
     for attribute in settings.attributes:
         for name, vectors in _graph_vectors(sets, attribute, settings, seed):
@@ -159,7 +161,7 @@ def _space(vectors: np.ndarray, touches: Sequence[Touches], mixed: Sequence[Touc
     return Space(vectors[:here], known, len(touches[0]), vectors[here:] if mixed else None, layouts, other)
 
 
-def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> Found:
+def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> ProbeResult:
     each = zip(names, space.labels.T, strict=True)
     right = {label: accuracy(space.vectors, classes, space.train) for label, classes in each}
     shares: dict[str, float] = {}
@@ -169,10 +171,10 @@ def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[s
         shares |= {label: explained(space.mixed, classes) for label, classes in each}
         order = np.random.default_rng(seed).permutation(len(space.mixed))
         right["layout"] = accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
-    return Found(attribute, name, seed, right, shares, space)
+    return ProbeResult(attribute, name, seed, right, shares, space)
 
 
-def _touches(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
+def _touches(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list[Touches]:
     """Return the touches of one layout, those to train the SVM on first."""
     count = settings.train + settings.test
     if device.simulation is not None:
@@ -181,7 +183,7 @@ def _touches(device: AbstractDevice, settings: Probing, seed: int) -> list[Touch
     return [device.touches("train")[: settings.train], device.touches("test")[: settings.test]]
 
 
-def _layouts(device: AbstractDevice, settings: Probing, seed: int) -> list[Touches]:
+def _layouts(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list[Touches]:
     """Return as many other touches on each of some scattered layouts; none where that cannot be."""
     simulation = device.simulation
     if simulation is None or settings.layouts < 2:

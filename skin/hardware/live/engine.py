@@ -7,7 +7,7 @@ import torch
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from skin.evaluation.report import Answers
+from skin.evaluation.report import Predictor
 from skin.hardware.live.verdict import Debounce, Patience, Verdict
 from skin.labels import Task
 from skin.recording import Touches
@@ -61,7 +61,7 @@ class Engine:
 
     def __init__(
         self,
-        learner: Answers,
+        learner: Predictor,
         task: Task,
         positions: Tensor,
         frames: int,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from experiments.studies.embedding.probe import FRAME, accuracy, explained, probe, strongest
-from experiments.studies.embedding.settings import Probing
+from experiments.studies.embedding.probe_settings import ProbeSettings
 from skin.build import build_device
 from skin.recording import Touches
 
@@ -16,7 +16,7 @@ SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "lay
 def found(configured):
     """Everything that a small probe of the naive skin finds."""
     device = build_device(configured("simulator=naive"))
-    return {(one.attribute, one.name): one for one in probe(device, Probing(**SMALL), None)}
+    return {(one.attribute, one.name): one for one in probe(device, ProbeSettings(**SMALL), None)}
 
 
 def test_an_svm_reads_what_is_there_and_no_more():
@@ -66,6 +66,6 @@ def test_readings_tell_what_presses_but_one_frame_no_duration(found):
 
 def test_touches_of_another_seed_are_others(configured, found):
     device = build_device(configured("simulator=naive"))
-    other = next(probe(device, Probing(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
+    other = next(probe(device, ProbeSettings(**SMALL | {"seeds": [5], "attributes": ["degree"]}), None))
     assert other.space.labels.shape == (240, 4)
     assert (other.space.labels != found["degree", "Graph2Vec"].space.labels).any()

@@ -1,0 +1,115 @@
+"""Frame to verdict on one core; run in a process of its own.
+
+python experiments/benchmarks/live_latency.py 1000               # the best row, untrained
+python experiments/benchmarks/live_latency.py 1000 --run latest  # what a run has learnt
+"""
+
+import argparse
+import json
+import time
+
+import numpy as np
+import torch
+
+from experiments.benchmarks.harness import training_config
+from skin.build import build_data, build_device, build_learner
+from skin.device.base import AbstractSimulated
+from skin.hardware.live.engine import Detection, Engine
+from skin.learner.network import Network
+from skin.signal.frame import Frame
+from skin.wire.conversion import Newtons
+
+RATE = 100.0  # Hz, of the device
+ROW = "best_fresh"
+_WARM = 50  # verdicts that are not counted
+_TOUCH = 0.3  # N
+
+
+def measure_latency(
+    frames: int = 1000, row: str = ROW, run: str | None = None, uri: str | None = None
+) -> dict[str, float]:
+    """Return the time from a frame at 100 Hz to the verdict on it, ms: median and the 99th percentile.
+
+    One thread, a simulated stream of touches, every frame classified. ``core_ms`` is the 99th percentile of
+    the core's own time: what is beyond it is the machine's other work.
+
+    Args:
+        frames: of the device that are classified.
+        row: of the table, untrained: weights do not matter to speed.
+        run: a finished run instead, by the beginning of its id, or ``latest``.
+        uri: of the store that holds it; None: the project's own.
+    """
+    torch.set_num_threads(1)
+    device, engine = _untrained(row) if run is None else _trained(run, uri)
+    taken = np.array([_seconds(engine, frame) for frame in _stream(device, engine, frames + _WARM)])[_WARM:]
+    wall, core = 1e3 * taken.T
+    return {
+        "p50_ms": float(np.median(wall)),
+        "p99_ms": float(np.percentile(wall, 99)),
+        "core_ms": float(np.percentile(core, 99)),
+        "core_share": float(core.mean() * RATE / 1e3),
+    }
+
+
+def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
+    config = training_config("simulator=naive", f"experiment={row}", "data.gestures=10")
+    device, learner = build_device(config).simulated("the stream is simulated"), build_learner(config)
+    assert isinstance(learner, Network)
+    data = build_data(config, device)
+    learner.build(data)
+    positions = data.touches("train").positions
+    return device, Engine(learner, device.task, positions, device.window, device.rate, Detection(_TOUCH))
+
+
+def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
+    from skin.hardware.live import start
+    from skin.hardware.live.verdict import Patience
+    from skin.reload import changed, find
+    from skin.reload import configuration as stored
+    from skin.tracking import Store
+    from skin.trained import trained
+
+    config = training_config(*([f"tracking.uri={uri}"] if uri else []))
+    store = Store.open(config.tracking)
+    found = find(store, run)
+    known = stored(store, found)
+    of = trained(store, found, changed(known, config, []), known)
+    return of.device.simulated("the stream is simulated"), start.engine(of, Patience(), _TOUCH)
+
+
+def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:
+    """Return frames at 100 Hz after those that fill the window, which the engine has then seen."""
+    held = round(RATE / device.rate)
+    ahead = held * device.window
+    whole = device.simulate_stream((ahead + count) // held + 1).whole.touches
+    values = np.repeat(whole.readings[0].double().numpy(), held, axis=0)[: ahead + count]
+    valid = np.ones(values.shape[1], dtype=bool)
+    frames = [Frame(n, n / RATE, n / RATE, row, valid) for n, row in enumerate(values)]
+    for frame in frames[:ahead]:
+        engine.add(frame)
+    return frames[ahead:]
+
+
+def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
+    """Return how long a verdict takes, by the clock on the wall and by the core's, s."""
+    sensors = engine.window.sensors
+    known = Newtons(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
+    wall, core = time.perf_counter(), time.thread_time()
+    assert engine.push(frame, known) is not None
+    return time.perf_counter() - wall, time.thread_time() - core
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("frames", type=int, nargs="?", default=1000)
+    parser.add_argument("--run", help="the beginning of the id of a finished run, or latest")
+    parser.add_argument("--uri", help="of the store that holds it, as in sqlite:///mlflow.db")
+    given = parser.parse_args()
+    print(json.dumps(measure_latency(given.frames, run=given.run, uri=given.uri)))
+
+
+if __name__ == "__main__":
+    main()

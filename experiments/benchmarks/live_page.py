@@ -1,0 +1,91 @@
+"""How many pictures a second the live page draws, in a headless Chromium; and a picture of an alarm.
+
+skin live web=true                                          # in one terminal
+python experiments/benchmarks/live_page.py http://127.0.0.1:8765 30               # in another
+python experiments/benchmarks/live_page.py http://127.0.0.1:8765 60 --alarm live.png
+"""
+
+import argparse
+import json
+import sys
+from collections import deque
+from pathlib import Path
+from time import monotonic, sleep
+
+from experiments.benchmarks.browser import Browser, installed
+
+_SIZE = 1100, 800  # pixels
+_LOOK = 0.1  # s between two looks at the page
+_LOOKS = 3  # in which a press must be seen
+_HARD = 3.0  # N, from which on a picture shows a press
+
+_COUNT = "window.refreshes = 0; (function count() { refreshes++; requestAnimationFrame(count); })();"
+_STATE = "return [performance.now() / 1000, pictures, refreshes]"
+_ALARM = "return document.body.dataset.state === 'danger' ? Math.max(...latest.values) : 0"
+_LINE = "return document.getElementById('line').textContent"
+
+
+def measure_refresh(address: str, seconds: float, alarm: Path | None = None) -> dict[str, float | str]:
+    """Return how often a page drew the skin, and the browser refreshed it, per second; and its last line.
+
+    Args:
+        address: of a page that is served.
+        seconds: of watching.
+        alarm: where the picture of the hardest press that is said to be dangerous goes.
+    """
+    found = installed()
+    if found is None:
+        sys.exit("needs Chromium and its driver: apt-get install chromium chromium-driver")
+    browser = Browser(*found, _SIZE)
+    try:
+        browser.open(address)
+        browser.run(_COUNT)
+        while not browser.run("return pictures"):
+            sleep(_LOOK)
+        before = browser.run(_STATE)
+        if alarm is None:
+            sleep(seconds)
+        else:
+            _picture(browser, seconds, alarm)
+        passed, pictures, refreshes = (
+            now - then for now, then in zip(browser.run(_STATE), before, strict=True)
+        )
+        line = browser.run(_LINE)
+    finally:
+        browser.close()
+    return {
+        "pictures_per_second": pictures / passed,
+        "refreshes_per_second": refreshes / passed,
+        "line": line,
+    }
+
+
+def _picture(browser: Browser, seconds: float, path: Path) -> None:
+    """Write the picture of the hardest press of some seconds that was said to be dangerous and lasted."""
+    until, hardest = monotonic() + seconds, _HARD
+    looks = deque([0.0] * _LOOKS, maxlen=_LOOKS)
+    while monotonic() < until:
+        looks.append(browser.run(_ALARM))
+        if min(looks) > hardest:
+            picture = browser.picture()
+            # The press may have ended while the picture was taken.
+            if browser.run(_ALARM) > hardest:
+                hardest = min(looks)
+                path.write_bytes(picture)
+        sleep(_LOOK)
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("address")
+    parser.add_argument("seconds", type=float)
+    parser.add_argument("--alarm", type=Path, metavar="PNG", help="take a picture of the hardest alarm")
+    given = parser.parse_args()
+    print(json.dumps(measure_refresh(given.address, given.seconds, given.alarm)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""Ensembles of several rows: votes and averaged probabilities."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from mlflow.entities import Run
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from skin.build import build_data, build_device, build_learner
+from skin.config import fingerprint, plain
+from skin.device.base import AbstractDevice
+from skin.errors import InputError
+from skin.evaluation.operating_point import choose_operating_point, threshold_gestures
+from skin.evaluation.report import columns, evaluate
+from skin.labels import Task
+from skin.recording import Touches, digest
+from skin.reload import restore
+from skin.run import conclude, describe, simulator, tags
+from skin.tracking import Store
+
+Way = Callable[[Tensor, Task], Tensor]
+
+
+class _Known:
+    """Answers to touches that all members saw before."""
+
+    def __init__(self, chances: Mapping[str, Tensor], task: Task, way: Way) -> None:
+        self._chances, self._task, self._way = chances, task, way
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probabilities (B, L) that the members give together."""
+        chances = self._chances.get(digest(touches))
+        if chances is None:
+            raise InputError("no member takes these touches")
+        return self._way(chances, self._task)
+
+
+def decisions(chances: Tensor, task: Task) -> Tensor:
+    """Return what members decide, (M, B, L), 0 or 1, from their probabilities (M, B, L).
+
+    Of a direction, cosines of length 1.
+    """
+    if task.kind == "exclusive":
+        return torch.nn.functional.one_hot(chances.argmax(-1), chances.shape[-1]).float()
+    if task.direction:
+        whole = torch.nn.functional.normalize(chances[..., -2:], dim=-1)
+        return torch.cat([(chances[..., :-2] > 0.5).float(), whole], dim=-1)
+    return (chances > 0.5).float()
+
+
+def vote(chances: Tensor, task: Task) -> Tensor:
+    """Return the share of members (M, B, L) that decide for each label, (B, L): a probability in M steps.
+
+    A tie of an even number of members is a no.
+    """
+    return decisions(chances, task).mean(0)
+
+
+def average(chances: Tensor, task: Task) -> Tensor:
+    """Return the mean probability of members (M, B, L), (B, L)."""
+    return chances.mean(0)
+
+
+def disagreement(chances: Tensor, task: Task) -> dict[str, float]:
+    """Return the shares of touches on which members (M, B, L) differ: per label, and ``any`` of them.
+
+    A direction is left out: no two members say the same.
+    """
+    decided = decisions(chances, task)[..., : len(task.binary)]
+    differs = decided.amax(0) != decided.amin(0)
+    shares = dict(zip(task.binary, differs.float().mean(0).tolist(), strict=True))
+    return shares | {"any": float(differs.any(1).float().mean())}
+
+
+WAYS: dict[str, Way] = {"ensemble_vote": vote, "ensemble_average": average}
+"""Row -> how it makes one answer of the members'."""
+
+
+def combine(
+    store: Store, members: Mapping[str, tuple[DictConfig, Run]], ways: Mapping[str, DictConfig]
+) -> dict[str, Run]:
+    """Evaluate ensembles of finished runs on every column and log each as a run of its own.
+
+    What an ensemble of the same runs found before is not found again. Its run has the fingerprint of its
+    configuration, by which the results table finds it, the tag ``members`` with the ids of their runs, and
+    the tags ``left_out_<column>`` with the members that have no part in a column. The metrics
+    ``same/<label>/disagreement`` and ``same/any/disagreement`` are the shares of test gestures on which the
+    members differ.
+
+    Args:
+        store: of the members' runs and the ensembles'.
+        members: name -> configuration and finished run, of one seed and simulator.
+        ways: name in ``WAYS`` -> configuration of that seed and simulator, with the ensemble's ``row``.
+
+    Raises:
+        InputError: there are fewer than two members.
+    """
+    if len(members) < 2:
+        raise InputError(
+            f"an ensemble needs two finished runs, got {', '.join(members) or 'none'}: skin train makes them"
+        )
+    identity = " ".join(run.info.run_id for _, run in members.values())
+    done = {
+        name: store.find("FINISHED", fingerprint=fingerprint(config), members=identity)
+        for name, config in ways.items()
+    }
+    if all(done.values()):
+        return {name: found[0] for name, found in done.items()}
+    asked = _ask(store, list(members.values()), build_device(next(iter(ways.values()))))
+    return {name: _log(store, config, asked, WAYS[name], identity) for name, config in ways.items()}
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the members answered: digest of touches -> (M, B, L); and column -> who did not, and why."""
+
+    device: AbstractDevice
+    chances: dict[str, Tensor]
+    left_out: dict[str, str]
+
+
+def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: AbstractDevice) -> _Asked:
+    """Bring every member back and ask it about every column, of which it takes all sets or none."""
+    settings = members[0][0].evaluation
+    sets = {column: _drawn(drawn) for column, drawn in columns(device, settings).items()}
+    sets["alarm"] = [threshold_gestures(device, settings)]
+    answers: dict[str, list[Tensor]] = {}
+    left_out: dict[str, str] = {}
+    for config, run in members:
+        learner = build_learner(config)
+        restore(store, run, learner, build_data(config, device))
+        for column, drawn in sets.items():
+            try:
+                given = [(digest(touches), learner.probabilities(touches)) for touches in drawn]
+            except InputError as reason:
+                left_out[column] = "; ".join(filter(None, [left_out.get(column), f"{config.row}: {reason}"]))
+                continue
+            for content, chances in given:
+                answers.setdefault(content, []).append(chances)
+    return _Asked(device, {content: torch.stack(given) for content, given in answers.items()}, left_out)
+
+
+def _drawn(sets: Iterator[Touches]) -> list[Touches]:
+    """Return all sets of a column; none where the sensors make no other layout, which the evaluation says."""
+    try:
+        return list(sets)
+    except InputError:
+        return []
+
+
+def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: str) -> Run:
+    """Evaluate one ensemble, log its run and return it."""
+    device, known = asked.device, _Known(asked.chances, asked.device.task, way)
+    about = {"members": identity} | {f"left_out_{column}": who for column, who in asked.left_out.items()}
+    with store.run(f"{config.row} {simulator(config)} seed {config.seed}", tags(config) | about) as run:
+        groups = ("representation", "model", "fusion", "learner", "optimizer", "trainer", "epochs")
+        kept = {key: value for key, value in plain(config).items() if key not in groups}
+        describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))
+        point = choose_operating_point(known, device, config.evaluation)
+        report = evaluate(known, device, config.evaluation, point)
+        chances = asked.chances[digest(next(columns(device, config.evaluation)["same"]))]
+        differ = disagreement(chances, device.task)
+        conclude(
+            store, run, report, device.task, {f"same/{name}/disagreement": x for name, x in differ.items()}
+        )
+    return store.client.get_run(run.info.run_id)

@@ -1,0 +1,182 @@
+"""A study's tables, its CSV and its figure."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import fmean, stdev
+
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from experiments.studies.comparison import Paired
+from experiments.studies.outcomes import (
+    UNITS,
+    Difference,
+    StatementResult,
+    conclusions,
+    differences,
+    group_trials,
+    values,
+)
+from experiments.studies.study import Study
+from experiments.studies.tables import Page, print_table
+from experiments.studies.tables import publish_page as write_page
+from experiments.studies.trials import Trial
+from skin.plot.figures import COLOURS
+
+_HEADINGS = {
+    "same/dangerous/alarm_recall": "recall",
+    "same/dangerous/false_alarm_rate": "false alarms",
+    "train_accuracy": "training",
+    "seconds_per_epoch": "s/epoch",
+    "self_share": "self",
+    "same/direction/degrees": "degrees",
+    "same/direction/accuracy": "within 45°",
+}
+
+
+def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
+    """Return a line per variant: mean and deviation over its runs; shares in per cent.
+
+    Where there are conditions, each is a column of the first metric.
+    """
+    found = group_trials(trials)
+    variants = list(dict.fromkeys(variant for variant, _ in found))
+    conditions = list(dict.fromkeys(condition for _, condition in found if condition))
+    if conditions:
+        head = ["variant", *conditions]
+        cells = {key: _cell(each, metrics[0]) for key, each in found.items()}
+        return [head, *([one, *(cells.get((one, name), "") for name in conditions)] for one in variants)]
+    head = ["variant", *map(_heading, metrics)]
+    body = []
+    for (variant, _), each in found.items():
+        failed = sum(not one.run for one in each)
+        shown = [_cell(each, metric) for metric in metrics] if failed < len(each) else ["failed"]
+        body.append([variant + (f" ({failed} failed)" if failed else ""), *shown])
+    return [head, *([*line, *[""] * (len(head) - len(line))] for line in body)]
+
+
+def differences_table(found: Sequence[Difference], metric: str) -> list[list[str]]:
+    """Return a line per difference; none without."""
+    head = ["variant", "condition", "difference", "n", "verdict"]
+    unit = UNITS.get(metric, "points")
+    return [
+        head,
+        *(
+            [
+                one.variant,
+                one.condition,
+                _figure(one.found, unit),
+                str(one.found.seeds if one.found else 0),
+                one.verdict,
+            ]
+            for one in found
+        ),
+    ]
+
+
+def statements_table(outcomes: Sequence[StatementResult]) -> list[list[str]]:
+    """Return a line per statement."""
+    body = [
+        [one.statement.section, one.statement.says, comparison_text(one), one.verdict] for one in outcomes
+    ]
+    return [["section", "statement", "measured", "verdict"], *body]
+
+
+def comparison_text(outcome: StatementResult) -> str:
+    """Return every comparison of a statement: the mean over paired seeds ± its standard error."""
+    said, several = outcome.statement, len(outcome.compared) > 1
+    unit = "times" if said.claim == "ratio" else UNITS.get(said.metric, "points")
+    figures: Mapping[str, str] = {name: _figure(found, unit) for name, found in outcome.compared.items()}
+    return "; ".join(text + f" ({name})" if several else text for name, text in figures.items())
+
+
+def publish_study(
+    study: Study, title: str, trials: Sequence[Trial], path: Path, console: Console | None = None
+) -> None:
+    """Write ``path`` with the endings .md, .csv and .png, each whole, and print the tables.
+
+    Args:
+        study: whose trials they are.
+        title: of the page.
+        trials: all of them.
+        path: without an ending.
+        console: where to print; None takes standard output.
+    """
+    console = console or Console()
+    changed = differences(study, trials)
+    tables = {
+        "Variants": variants_table(trials, study.metrics),
+        f"Differences in {_heading(study.metrics[0])}": differences_table(changed, study.metrics[0]),
+        "Statements": statements_table(conclusions(study.statements, trials)),
+    }
+    told = {name: each for name, each in tables.items() if len(each) > 1}
+    drawn = study_figure(trials, study.metrics[0], study.about) if any(one.run for one in trials) else None
+    print(title)
+    for name, each in told.items():
+        print_table(each, name, console, wrapped=("statement", "measured"))
+    print(*write_page(Page("", told, _csv(study, trials), drawn), title, path), sep="\n")
+
+
+def study_figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
+    """Draw a metric of each variant and condition: every trial, the mean, and two standard errors."""
+    found = {key: list(each) for key, each in group_trials(trials).items()}
+    drawn = Figure(figsize=(7, 1.2 + 0.3 * len(found)), layout="constrained")
+    axis = drawn.subplots()
+    unit = UNITS.get(metric, "%")
+    for place, each in enumerate(found.values()):
+        scale = 1 if metric in UNITS else 100
+        every = [scale * one.metrics[metric] for one in each if metric in one.metrics]
+        if not every:
+            continue
+        means = list(values(each, metric, "device" if each[0].device else "seed").values())
+        error = 2 * stdev(means) / math.sqrt(len(means)) if len(means) > 1 else 0.0
+        axis.plot(every, [place] * len(every), "o", color=COLOURS[0], alpha=0.35, ms=4)
+        axis.errorbar(fmean(every), place, xerr=error, fmt="|", color="black", ms=10, capsize=3)
+    axis.set_yticks(range(len(found)), [", ".join(filter(None, key)) for key in found], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel(
+        f"{_heading(metric)}{f', {unit}' if unit else ''}: each run, mean and two standard errors"
+    )
+    axis.set_title(title, fontsize=10)
+    return drawn
+
+
+def _csv(study: Study, trials: Sequence[Trial]) -> list[Sequence[object]]:
+    """Return a line per finished trial."""
+    names = ["variant", "seed", *(["condition", "device"] if study.conditions else [])]
+    head = [*names, "run", *study.metrics]
+    body = [
+        [
+            *(one.variant.name if name == "variant" else getattr(one, name) for name in names),
+            one.run,
+            *(one.metrics.get(metric, "") for metric in study.metrics),
+        ]
+        for one in trials
+        if one.run
+    ]
+    return [head, *body]
+
+
+def _heading(metric: str) -> str:
+    """Return a column's name: ``overall`` of ``same/overall/accuracy``."""
+    plain = metric.removeprefix("same/").removesuffix("/accuracy").replace("/overall", "")
+    return _HEADINGS.get(metric, plain.replace("_", " "))
+
+
+def _cell(trials: Sequence[Trial], metric: str) -> str:
+    """Return mean and deviation over trainings, or over devices where a training was tried on several."""
+    figures = list(values(trials, metric, "device" if trials[0].device else "seed").values())
+    if not figures:
+        return ""
+    if metric in ("seconds_per_epoch", "parameters", "self_share"):
+        return f"{fmean(figures):.{0 if metric == 'parameters' else 2}f}"
+    return f"{fmean(figures):.1f}" + (f" ± {stdev(figures):.1f}" if len(figures) > 1 else "")
+
+
+def _figure(found: Paired | None, unit: str) -> str:
+    if found is None:
+        return "no paired runs"
+    sign, digits = ("" if unit == "times" else "+"), (2 if unit == "s" else 1)
+    error = "" if math.isinf(found.error) else f" ± {found.error:.{digits}f}"
+    return f"{found.mean:{sign}.{digits}f}{error} {unit}".rstrip()

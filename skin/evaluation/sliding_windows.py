@@ -1,0 +1,201 @@
+"""Evaluation on sliding windows over a stream, which show a part of a touch, a whole touch, or none."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics.functional.classification import binary_confusion_matrix
+
+from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.errors import InputError
+from skin.evaluation.alarm import Alarms, count_alarms
+from skin.evaluation.metrics import metrics
+from skin.evaluation.operating_point import LABEL, OperatingPoint
+from skin.evaluation.report import Predictor
+from skin.evaluation.stream_settings import StreamSettings
+from skin.labels import TOUCH_OR_NOT, Task
+from skin.signal.contact_threshold import Gate, Threshold, gates, rise
+
+_CHUNK = 1024
+_EDGES = (0.2, 0.4, 0.6, 0.8)
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Windows that show a similar share of a touch.
+
+    Attributes:
+        name: such as ``0.2-0.4``, upper end included; ``whole`` for windows with a whole touch.
+        count: number of windows.
+        accuracy: of each label.
+        majority: accuracy of always predicting the majority class, of each label.
+    """
+
+    name: str
+    count: int
+    accuracy: dict[str, float]
+    majority: dict[str, float]
+
+
+@dataclass(frozen=True)
+class WindowReport:
+    """Result of an evaluation on sliding windows.
+
+    Attributes:
+        bins: accuracy by the share of the touch in the window.
+        gates: gate -> (2, 2) counts of windows: truth idle and touched down, predicted across.
+        threshold: of the gate by threshold, N.
+        alarms: gate -> alarms on the long stream.
+        hours: length of that stream.
+        lengths: frames of a window -> overall accuracy, or why the learner does not accept such windows.
+        streamed: whether the learner was trained on windows of streams.
+        point: operating point of the alarm.
+    """
+
+    bins: list[Bin]
+    gates: dict[str, Tensor]
+    threshold: float
+    alarms: dict[str, Alarms]
+    hours: float
+    lengths: dict[int, float | str]
+    streamed: bool
+    point: OperatingPoint
+
+    def metrics(self) -> dict[str, float]:
+        """Return all values under names that MLflow accepts."""
+        values: dict[str, float] = {
+            "stream/hours": self.hours,
+            "gate/threshold/least": self.threshold,
+            "alarms/threshold": self.point.threshold,
+        }
+        for one in self.bins:
+            values |= {f"share/{one.name}/{name}/accuracy": value for name, value in one.accuracy.items()}
+        for gate, counts in self.gates.items():
+            values[f"gate/{gate}/accuracy"] = float(counts.diag().sum() / counts.sum())
+        for gate, alarms in self.alarms.items():
+            values[f"alarms/{gate}/false_per_hour"] = alarms.per_hour
+            values[f"alarms/{gate}/found"] = alarms.found / max(alarms.dangerous, 1)
+            values[f"alarms/{gate}/raised_by_safe"] = alarms.raised / max(alarms.safe, 1)
+        for window, value in self.lengths.items():
+            values |= {} if isinstance(value, str) else {f"window/{window}/overall/accuracy": value}
+        return values
+
+
+def evaluate_windows(
+    learner: Predictor,
+    device: AbstractDevice,
+    settings: StreamSettings,
+    point: OperatingPoint,
+    track: Callable[..., Any] = iter,
+) -> WindowReport:
+    """Evaluate a learner on windows of test streams of its device.
+
+    Args:
+        learner: trained learner.
+        device: its device.
+        settings: the streams and windows to test.
+        point: operating point of the alarm.
+        track: wraps the chunks of the long stream to show progress, such as ``rich.progress.track``.
+
+    Raises:
+        InputError: the device has no streams.
+    """
+    device = device.simulated(f"streams are simulated, {type(device).__name__} has none")
+    # One device records the whole stream, and its baseline is known as after a tare.
+    streamed = device.replace(stream=True, randomise=False)
+    threshold = _tuned(streamed)
+    all_gates = gates(threshold, device.task)
+    recording = streamed.recording("test")
+    touches, labels = recording.touches, recording.touches.labels
+    assert labels is not None
+    chances = learner.probabilities(touches)
+    said = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
+    return WindowReport(
+        bins(chances, labels, recording.parameters["share"], device.task),
+        {name: binary_confusion_matrix(answer.long(), labels[:, -1].long()) for name, answer in said.items()},
+        threshold.least,
+        _listen(learner, streamed, device.task, all_gates, settings, point, track),
+        settings.hours,
+        {window: _length(learner, device, window) for window in settings.windows},
+        device.stream,
+        point,
+    )
+
+
+def _tuned(device: AbstractSimulated) -> Threshold:
+    """Return the threshold that separates touched from idle windows, tuned on the validation split."""
+    known, idle = device.touches("validation"), device.idle
+    assert known.labels is not None
+    return Threshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
+
+
+def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:
+    """Return accuracies by the share of the touch in the window, for windows that show a touch.
+
+    Args:
+        chances: (W, L), probabilities of the labels of ``task``.
+        labels: (W, 5), of ``TOUCH_OR_NOT``.
+        share: (W,), fraction of the touch in the window; 0 without touch.
+        task: task of the learner.
+    """
+    names = TOUCH_OR_NOT.gated
+    truth = labels[:, : len(names)] > 0.5
+    right = (chances[:, [task.names.index(name) for name in names]] > 0.5) == truth
+    group = torch.bucketize(share, torch.tensor(_EDGES)).where(share < 1, len(_EDGES) + 1)
+    ends = [0.0, *_EDGES, 1.0]
+    titles = [*(f"{low:g}-{high:g}" for low, high in pairwise(ends)), "whole"]
+    found = []
+    for number, title in enumerate(titles):
+        here = (group == number) & (share > 0)
+        if here.any():
+            yes = truth[here].float().mean(0)
+            shares = right[here].float().mean(0).tolist(), torch.maximum(yes, 1 - yes).tolist()
+            each = (dict(zip(names, values, strict=True)) for values in shares)
+            found.append(Bin(title, int(here.sum()), *each))
+    return found
+
+
+def _listen(
+    learner: Predictor,
+    device: AbstractSimulated,
+    task: Task,
+    all_gates: dict[str, Gate],
+    settings: StreamSettings,
+    point: OperatingPoint,
+    track: Callable[..., Any],
+) -> dict[str, Alarms]:
+    """Return the alarms of each gate on sliding windows over a long stream."""
+    frames = max(round(settings.hours * 3600 * device.rate), device.window)
+    stream = device.simulate_stream(frames, settings.gap)
+    starts = torch.arange(0, frames - device.window + 1, settings.stride)
+    dangerous = task.names.index(LABEL)
+    heard: dict[str, list[Tensor]] = {name: [] for name in all_gates}
+    for part in track(starts.split(_CHUNK)):
+        touches = stream.cut(part, device.window).touches
+        chances = learner.probabilities(touches)
+        for name, gate in all_gates.items():
+            heard[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
+    gesture = stream.timeline.window_content(starts, device.window).gesture
+    truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
+    hours = settings.stride / device.rate / 3600
+    return {name: count_alarms(torch.cat(said), gesture, truth, hours) for name, said in heard.items()}
+
+
+def _length(learner: Predictor, device: AbstractSimulated, window: int) -> float | str:
+    """Return the overall accuracy on test touches in windows of another length, or why there is none.
+
+    All lengths have the same touches with other onsets; windows that are shorter than the longest press have
+    shorter presses.
+    """
+    settings = device.sampler.settings
+    try:
+        press = settings.press[0], min(settings.press[1], window)
+        other = device.replace(touch=replace(settings, window=window, press=press)).touches("test")
+        assert other.labels is not None
+        found = metrics(learner.probabilities(other), other.labels, device.task)
+    except InputError as reason:
+        return str(reason)
+    return found["overall/accuracy"]

@@ -1,0 +1,49 @@
+"""Boosted trees."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.labels import Task
+from skin.learner.boosted_trees import BoostedTrees
+from skin.recording import Touches
+from skin.representation.readings import Readings
+
+
+def test_exclusive_probabilities_sum_to_one(made_up_device):
+    made_up_device.task = Task(("a", "b", "c", "d"), "exclusive")
+    features = BoostedTrees(rounds=5)
+    features.fit(TouchData(made_up_device, Readings))
+    total = features.probabilities(made_up_device.touches("test")).sum(dim=1)
+    torch.testing.assert_close(total, torch.ones(40))
+
+
+def test_validation_chooses_the_number_of_trees(made_up_device):
+    few, many = BoostedTrees(rounds=4), BoostedTrees(rounds=400)
+    for features in (few, many):
+        features.fit(TouchData(made_up_device, Readings))
+    assert few.parameters < many.parameters
+    assert all(model.n_iter_ < 400 for model in many._models)
+
+
+def test_a_label_that_never_changes_is_refused(made_up_device):
+    touches = made_up_device.touches
+
+    def constant(split, epoch=0):
+        one = touches(split)
+        labels = one.labels.clone()
+        labels[:, 2] = 1
+        return Touches(one.readings, one.valid, one.positions, labels, one.rate)
+
+    made_up_device.touches = constant
+    with pytest.raises(InputError, match="the same label press"):
+        BoostedTrees(rounds=2).fit(TouchData(made_up_device, Readings))
+
+
+def test_what_is_stored_needs_no_pickle(made_up_device, tmp_path):
+    features = BoostedTrees(rounds=2)
+    features.fit(TouchData(made_up_device, Readings))
+    with np.load(features.save(tmp_path), allow_pickle=False) as stored:
+        assert stored["train"].shape[0] == 160

@@ -1,0 +1,75 @@
+"""What was found on streams, read back from its files."""
+
+import csv
+
+import pytest
+import torch
+from PIL import Image
+
+from experiments.studies.streams_page import build_streams_page, streams_summary
+from experiments.studies.tables import publish_page
+from skin.evaluation.alarm import Alarms
+from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.sliding_windows import Bin, WindowReport
+
+NAMES = ("big", "dynamic", "press", "dangerous")
+FOUND = WindowReport(
+    bins=[
+        Bin("0-0.2", 40, dict.fromkeys(NAMES, 0.5), dict.fromkeys(NAMES, 0.625)),
+        Bin("whole", 160, dict.fromkeys(NAMES, 0.9), dict.fromkeys(NAMES, 0.5)),
+    ],
+    gates={"threshold": torch.tensor([[90, 10], [20, 180]])},
+    threshold=0.31,
+    alarms={"none": Alarms(0.5, 3, 8, 7, 9, 1), "threshold": Alarms(0.5, 0, 8, 6, 9, 0)},
+    hours=0.6,
+    lengths={20: 0.8125, 60: "made for 30"},
+    streamed=False,
+    point=OperatingPoint(0.5, 0.02, 64, 1, 0),
+)
+
+
+def test_the_line_says_what_matters():
+    assert streams_summary(FOUND) == (
+        "accuracy 50.0 % at share 0-0.2, 90.0 % whole; touch by threshold 90.0 %; false alarms per hour "
+        "6.0 (none), 0.0 (threshold) in 0.50 h without touch; window 20: 81.2, 60: cannot (made for 30)"
+    )
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return publish_page(
+        build_streams_page(FOUND, "rules fem 0"),
+        "rules fem 0",
+        tmp_path_factory.mktemp("results") / "stream_rules",
+    )
+
+
+def test_a_person_reads_the_same(files):
+    text = files[0].read_text()
+    for row in (
+        "| press | 50.0 (62.5) | 90.0 (50.0) |",
+        "| windows | 40 | 160 |",
+        "| threshold | 90 | 10 | 20 | 180 | 90.0 |",
+        "| none | 3 | 6.0 (1.2 to 17.5) | 7 of 8 | 1 of 9 |",
+        "| threshold | 0 | 0.0 (0.0 to 7.4) | 6 of 8 | 0 of 9 |",
+        "| 60 | cannot (made for 30) |",
+    ):
+        assert row in text
+    assert text.startswith("# rules fem 0\n\naccuracy 50.0 %")
+    assert "\n\nTrained on whole touches" in text
+
+
+def test_a_program_reads_the_same(files):
+    with files[1].open(newline="") as file:
+        values = {(one["measure"], one["name"], one["at"]): one["value"] for one in csv.DictReader(file)}
+    assert values["accuracy", "press", "whole"] == "0.9000"
+    assert values["idle said touched", "threshold", ""] == "10"
+    assert values["alarms false", "none", ""] == "3"
+    assert values["window", "overall", "60"] == "made for 30"
+
+
+def test_the_picture_is_whole(files):
+    with Image.open(files[2]) as picture:
+        picture.load()
+        assert picture.width > 600
+    assert sorted(path.name for path in files[2].parent.iterdir()) == sorted(path.name for path in files)

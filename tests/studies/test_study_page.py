@@ -1,0 +1,122 @@
+"""A study's tables say what was found, in files and on a narrow terminal."""
+
+import csv
+import io
+
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from experiments.studies.comparison import Paired
+from experiments.studies.outcomes import StatementResult
+from experiments.studies.study import Statement, Study, Variant
+from experiments.studies.study_page import comparison_text, publish_study, variants_table
+from experiments.studies.trials import Trial
+
+LABELS = ("overall", "big", "dynamic", "press", "dangerous")
+METRICS = [
+    *(f"same/{label}/accuracy" for label in LABELS),
+    "same/dangerous/alarm_recall",
+    "same/dangerous/false_alarm_rate",
+    "seconds_per_epoch",
+    "parameters",
+    "self_share",
+]
+
+
+def trial(name, seed, accuracy, share=None, **more):
+    variant, metrics = Variant(name, {"weight": name}, {}), {}
+    if accuracy is not None:
+        metrics = {f"same/{label}/accuracy": accuracy for label in LABELS}
+        metrics |= {"same/dangerous/alarm_recall": 0.25, "same/dangerous/false_alarm_rate": 0.02}
+        metrics |= {"seconds_per_epoch": 1.5, "parameters": 105621.0}
+        metrics |= {} if share is None else {"self_share": share}
+    return Trial(
+        variant, seed, more.get("condition", ""), more.get("device", ""), "abc" if metrics else "", metrics
+    )
+
+
+FOUND = [
+    trial("weight=exp", "0", 0.8, 0.31),
+    trial("weight=exp", "1", 0.9, 0.31),
+    trial("weight=none", "0", None),
+    trial("weight=none", "1", 0.7),
+    trial("weight=stiffness", "0", None),
+]
+SAID = Statement("x", "one [sic] beats the other", {"weight": "weight=exp"}, METRICS[0], "greater", "3.2.2",
+                 [{"weight": "weight=none"}])  # fmt: skip
+STUDY = Study("edges", "edges", [0, 1], metrics=METRICS, statements=[SAID])
+
+
+def test_a_line_per_variant_with_mean_and_deviation():
+    head, first, second, third = variants_table(FOUND, METRICS)
+    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt 2
+    assert dict(zip(head, first, strict=True)) | {"big": "", "dynamic": "", "press": "", "dangerous": ""} == {
+        "variant": "weight=exp",
+        "overall": "85.0 ± 7.1",
+        "big": "",
+        "dynamic": "",
+        "press": "",
+        "dangerous": "",
+        "recall": "25.0 ± 0.0",
+        "false alarms": "2.0 ± 0.0",
+        "s/epoch": "1.50",
+        "parameters": "105621",
+        "self": "0.31",
+    }
+    assert second[:2] == ["weight=none (1 failed)", "70.0"]
+    assert third[:2] == ["weight=stiffness (1 failed)", "failed"]
+
+
+def test_conditions_are_columns_of_the_first_metric():
+    found = [
+        trial("a", "0", 0.8 + n / 10, condition=name, device=str(n))
+        for name in ("none", "5 dead")
+        for n in (0, 1)
+    ]
+    assert variants_table(found, METRICS) == [
+        ["variant", "none", "5 dead"],
+        ["a", "85.0 ± 7.1", "85.0 ± 7.1"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fields", "compared", "text"),
+    [
+        ({}, {"a": Paired(12.345, 0.678, 3)}, "+12.3 ± 0.7 points"),
+        (
+            {},
+            {"a": Paired(-1.0, 0.5, 3), "b": Paired(2.0, 0.5, 3)},
+            "-1.0 ± 0.5 points (a); +2.0 ± 0.5 points (b)",
+        ),
+        ({}, {"a": Paired(1.0, float("inf"), 1)}, "+1.0 points"),
+        ({}, {"a": None}, "no paired runs"),
+        ({"metric": "seconds_per_epoch", "claim": "less"}, {"a": Paired(-0.12, 0.01, 3)}, "-0.12 ± 0.01 s"),
+        ({"metric": "seconds_per_epoch", "claim": "ratio"}, {"a": Paired(4.44, 0.1, 3)}, "4.4 ± 0.1 times"),
+    ],
+)
+def test_what_was_measured_has_its_unit(fields, compared, text):
+    said = Statement(**vars(SAID) | fields)
+    assert comparison_text(StatementResult(said, compared, "undecided")) == text
+
+
+def test_files_and_terminal_say_the_same(tmp_path):
+    console = Console(width=40, file=io.StringIO())
+    publish_study(STUDY, "edges, little [data]", FOUND, tmp_path / "study_edges", console)
+    page = (tmp_path / "study_edges.md").read_text()
+    assert page.splitlines()[0] == "# edges, little [data]"
+    assert "| 3.2.2 | one [sic] beats the other | +20.0 points | undecided |" in page
+    assert len([line for line in page.splitlines() if line.startswith("| weight=")]) == 3
+    text = console.file.getvalue()
+    assert all(
+        part in text for part in ("85.0 ± 7.1", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
+    )
+    assert "…" not in text  # a narrow terminal cuts no number short
+    read = list(csv.DictReader((tmp_path / "study_edges.csv").read_text().splitlines()))
+    assert [(line["variant"], line["seed"], line["same/overall/accuracy"]) for line in read] == [
+        ("weight=exp", "0", "0.8"),
+        ("weight=exp", "1", "0.9"),
+        ("weight=none", "1", "0.7"),
+    ]
+    with Image.open(tmp_path / "study_edges.png") as picture:
+        assert picture.size[0] > 500

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from experiments.studies.study import SMOKE, Study, given, words
 from skin.command import command
-from skin.config import checked
+from skin.config import validate_config
 from skin.errors import InputError
 from skin.files import results
 
@@ -76,7 +76,7 @@ def _measure_skin(study: Study, folder: Path) -> None:
 
     if study.measure is None:
         raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
-    config = checked(compose("train", [*words(study.test), *given()]))
+    config = validate_config(compose("train", [*words(study.test), *given()]))
     page = study.measure(Subject(config, build_device(config))).page
     print(
         page.about, *publish(page, f"{study.name}: {study.about}", folder / f"study_{study.name}"), sep="\n"

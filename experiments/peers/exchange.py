@@ -18,9 +18,9 @@ from skin.evaluation.report import columns
 from skin.files import whole
 from skin.files import write as write_text
 from skin.labels import Task
-from skin.recording import Recording, Touches, digest
+from skin.recording import Recording, Touches, touches_hash
+from skin.recording_file import write_recording
 from skin.signal.features import measurements
-from skin.storage import write
 
 SETS = "sets.json"
 ABOUT = "about.json"
@@ -29,8 +29,8 @@ ABOUT = "about.json"
 def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
     """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
-    ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``measurements/<set>.parquet`` hold the
-    engineered measurements, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
+    ``touches/<set>.parquet`` are recordings (:mod:`skin.recording_file`), ``measurements/<set>.parquet`` hold
+    the engineered measurements, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
     alarm's threshold is chosen), then ``<column>_<number>`` for the sets of
     :func:`skin.evaluation.report.columns`. ``sets.json``, written last, names the content of each set: set ->
     digest. A folder with other touches is emptied, answers and all.
@@ -42,7 +42,7 @@ def export(device: AbstractSimulated, settings: Evaluation, folder: Path) -> Non
     """
     if (folder / SETS).is_file():
         known = json.loads((folder / SETS).read_text())
-        if known["train"] == digest(device.touches("train")) and "alarm" in known:
+        if known["train"] == touches_hash(device.touches("train")) and "alarm" in known:
             return
         shutil.rmtree(folder)
     learnt = {name: device.touches(name) for name in ("train", "validation")}
@@ -86,7 +86,7 @@ class Foreign:
         Raises:
             LookupError: touches that were not exported.
         """
-        content = digest(touches)
+        content = touches_hash(touches)
         if content not in self._sets:
             raise LookupError(f"{self._folder.parent} holds other touches than these: remove it")
         path = self._folder / f"{self._sets[content]}.parquet"
@@ -98,9 +98,9 @@ class Foreign:
 def _export(touches: Touches, device: AbstractSimulated, folder: Path, name: str) -> str:
     """Write one set and return its digest."""
     recording = Recording(touches, device.task, device.size, device.sensors.footprint)
-    write(recording, folder / "touches" / f"{name}.parquet")
+    write_recording(recording, folder / "touches" / f"{name}.parquet")
     table = {key: values.to(torch.float32).numpy() for key, values in measurements(touches).items()}
     path = folder / "measurements" / f"{name}.parquet"
     with whole(path) as partial:
         pa.parquet.write_table(pa.table(table), partial, compression="zstd")
-    return digest(touches)
+    return touches_hash(touches)

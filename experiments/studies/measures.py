@@ -74,10 +74,10 @@ class Subject:
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm."""
         from skin.evaluation.operating_point import OperatingPoint
-        from skin.reload import operating_point
+        from skin.stored_run import load_operating_point
 
         settings = self.config.evaluation
-        found = operating_point(self.of.run, self.of.learner, self.of.stored, settings)
+        found = load_operating_point(self.of.run, self.of.learner, self.of.stored, settings)
         return found or OperatingPoint.default(settings.false_alarm_rate)
 
 
@@ -187,15 +187,18 @@ class Holds:
         from rich.progress import track
 
         from experiments.studies.tables import Page
-        from skin.hardware.live import start
-        from skin.hardware.live.holds import FIELDS, courses
-        from skin.hardware.live.verdict import Patience
-        from skin.trained import trained
+        from skin.hardware.live import engine_builder
+        from skin.hardware.live.alarm_timing import FIELDS, time_courses
+        from skin.hardware.live.verdict import DebounceSettings
+        from skin.trained import load_trained
 
-        of = trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
-        engine = start.engine(of, Patience(), self.touch, self.drift)
+        of = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
+        engine = engine_builder.make_engine(of, DebounceSettings(), self.touch, self.drift)
         device = of.device.simulated("held touches are simulated").replace(stream=False)
-        table = [FIELDS, *courses(engine, device, self.gestures, self.rate, partial(track, transient=True))]
+        table = [
+            FIELDS,
+            *time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True)),
+        ]
         told = (zip(FIELDS, values, strict=True) for values in table[1:])
         lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
         return Measured({}, Page("\n".join(lines), {"Time to alarm": table}, table))
@@ -229,10 +232,10 @@ class Embeddings(Probing):
 
         from experiments.studies.embedding.probe import probe
         from experiments.studies.embedding_spaces import page
-        from skin.balance import announce
+        from skin.class_balance import report_balance
 
         device, learner = subject.device, subject.finished.learner if subject.finished else None
-        announce(device)
+        report_balance(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)
         found = list(track(steps, "probing", count, console=Console(stderr=True)))

@@ -18,9 +18,9 @@ from experiments.studies.runs import Planned
 from experiments.studies.study import Study, Variant, given, words
 from experiments.studies.tables import publish
 from skin.build import build_data, build_device, build_learner
-from skin.config import checked, fingerprint
+from skin.config import fingerprint, validate_config
 from skin.learner.base import AbstractLearner
-from skin.reload import TAG, changed, configuration, restore
+from skin.stored_run import TAG, apply_overrides, load_configuration, load_learner
 from skin.tracking import Store
 
 
@@ -87,18 +87,18 @@ class _Run:
 
     @cached_property
     def stored(self) -> DictConfig:
-        return configuration(self.store, self.run, self.config.trust)
+        return load_configuration(self.store, self.run, self.config.trust)
 
     @cached_property
     def learner(self) -> AbstractLearner:
-        own = checked(self.stored)
+        own = validate_config(self.stored)
         learner = build_learner(own)
-        restore(self.store, self.run, learner, build_data(own, build_device(own)))
+        load_learner(self.store, self.run, learner, build_data(own, build_device(own)))
         return learner
 
     def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
         """Return the run of MLflow that holds what a study measures on the device that overrides change."""
-        own = changed(self.stored, compose("train", [*base, *line]), line)
+        own = apply_overrides(self.stored, compose("train", [*base, *line]), line)
         what = study.measure or Accuracy()
         asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]
         key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]

@@ -20,26 +20,32 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.evaluation.report import evaluate
     from skin.evaluation.show import report
-    from skin.option import option
+    from skin.option import option_name
     from skin.plot.evaluation_page import publish, verdicts
-    from skin.reload import changed, configuration, find, operating_point, restore
-    from skin.run import conclude
+    from skin.run import log_report
+    from skin.stored_run import (
+        apply_overrides,
+        find_run,
+        load_configuration,
+        load_learner,
+        load_operating_point,
+    )
     from skin.tracking import Store
 
     quiet()
     store, folder = Store.open(config.tracking), results(config.out)
-    run = find(store, config.run)
-    stored, given = configuration(store, run, config.trust), overrides()
-    config = changed(stored, config, given)
+    run = find_run(store, config.run)
+    stored, given = load_configuration(store, run, config.trust), overrides()
+    config = apply_overrides(stored, config, given)
     device, learner = build_device(config), build_learner(config)
-    restore(store, run, learner, build_data(config, device.blank()))
-    point = operating_point(run, learner, stored, config.evaluation)
+    load_learner(store, run, learner, build_data(config, device.blank()))
+    point = load_operating_point(run, learner, stored, config.evaluation)
     touches = device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         # Every evaluation keeps its files.
-        name = f"evaluation_{option(device)}_{evaluation.info.run_id[:8]}"
+        name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
             chances = learner.probabilities(touches)
             said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
@@ -47,7 +53,7 @@ def main(config: DictConfig) -> None:
             print(f"{title}\n{said}\n{path}")
             return
         found = evaluate(learner, device, config.evaluation, point)
-        conclude(store, evaluation, found, device.task, {})
+        log_report(store, evaluation, found, device.task, {})
         about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
         written = publish(folder / f"{name}.md", found, device.task, run.info.run_name, about)
         for path in written:

@@ -52,12 +52,12 @@ class Captures:
         return Captures(**{name: values[index] for name, values in vars(self).items()})
 
 
-def refusal(path: str | Path, wrong: str, mend: str = "download it again") -> InputError:
+def format_error(path: str | Path, wrong: str, mend: str = "download it again") -> InputError:
     """Return the error that says what is wrong with a file and where the right one is."""
     return InputError(f"{path} is not CoST.csv as published: {wrong}; {mend} from {SOURCE}")
 
 
-def read(path: Path, window: int) -> Captures:
+def read_captures(path: Path, window: int) -> Captures:
     """Read a file block by block; no more than a block and the resampled captures are ever held.
 
     A capture begins where ``frame`` is 1. It is resampled by linear interpolation in time over its whole
@@ -78,7 +78,7 @@ def read(path: Path, window: int) -> Captures:
         parts.append(_resampled(path, rows[:last], window, line - len(rows)))
         rest = rows[last:]
     if not len(rest):
-        raise refusal(path, "it has no rows")
+        raise format_error(path, "it has no rows")
     parts.append(_resampled(path, rest, window, line - len(rest)))
     names = [field.name for field in fields(Captures)]
     return Captures(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -113,7 +113,7 @@ def _blocks(path: Path) -> Iterator[np.ndarray]:
                 if batch.num_rows:
                     yield np.column_stack([column.to_numpy() for column in batch.columns])
     except pa.ArrowException as error:
-        raise refusal(path, _words(error)) from error
+        raise format_error(path, _words(error)) from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
 
@@ -136,12 +136,12 @@ def _check_header(path: Path) -> None:
     names = [name.strip() for name in text.split(",")]
     if len(names) != len(COLUMNS):
         wrong = f"its first line has {len(names)} columns, not the {len(COLUMNS)}"
-        raise refusal(path, f"{wrong} subject, variant, gesture, frame, ch1 ... ch64")
+        raise format_error(path, f"{wrong} subject, variant, gesture, frame, ch1 ... ch64")
     for number, (name, needed) in enumerate(zip(names, COLUMNS, strict=True), start=1):
         if name != needed:
-            raise refusal(path, f"column {number} is called {name!r} instead of {needed!r}")
+            raise format_error(path, f"column {number} is called {name!r} instead of {needed!r}")
     if not text.endswith("\n"):
-        raise refusal(path, "it has no rows")
+        raise format_error(path, "it has no rows")
 
 
 def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:
@@ -169,7 +169,7 @@ def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:
 
 def _refuse_first(path: Path, bad: np.ndarray, line: int, wrong: str) -> None:
     if bad.any():
-        raise refusal(path, f"in line {line + int(bad.argmax())} {wrong}")
+        raise format_error(path, f"in line {line + int(bad.argmax())} {wrong}")
 
 
 def _resampled(path: Path, rows: np.ndarray, window: int, line: int) -> Captures:
@@ -178,7 +178,7 @@ def _resampled(path: Path, rows: np.ndarray, window: int, line: int) -> Captures
     lengths = np.diff(starts, append=len(rows))
     if (lengths < 2).any():
         at = line + int(starts[(lengths < 2).argmax()])
-        raise refusal(path, f"the capture in line {at} has one frame, at least 2 make a movement")
+        raise format_error(path, f"the capture in line {at} has one frame, at least 2 make a movement")
     times = np.linspace(0, 1, window) * (lengths[:, None] - 1)
     before = np.minimum(times.astype(int), lengths[:, None] - 2)
     share = (times - before)[..., None].astype(np.float32)

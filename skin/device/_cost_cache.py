@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from skin.device._cost import CHANNELS, SOURCE, Captures, read
+from skin.device._cost import CHANNELS, SOURCE, Captures, read_captures
 from skin.errors import InputError
 from skin.files import whole
-from skin.foreign import arrays
+from skin.safe_loading import load_npz
 from skin.simulator._store import folder
 
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 1
 
 
-def captures(path: Path, window: int) -> Captures:
+def cached_captures(path: Path, window: int) -> Captures:
     """Return the captures of a file from the cache, or read it and keep what was read.
 
     The cache's key is the file's content, so a changed file is read again. A folder that cannot be written to
@@ -42,7 +42,7 @@ def captures(path: Path, window: int) -> Captures:
     known = _load(stored, window)
     if known is not None:
         return known
-    found = read(path, window)
+    found = read_captures(path, window)
     try:
         _save(stored, found)
     except InputError as error:
@@ -53,7 +53,7 @@ def captures(path: Path, window: int) -> Captures:
 def _load(path: Path, window: int) -> Captures | None:
     """Return the captures in a cache file, or None if there is none or anything about it is wrong."""
     try:
-        stored = arrays(path)
+        stored = load_npz(path)
         found = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
     except Exception:  # Whatever a broken archive raises, the answer is the same: read the file anew.
         return None

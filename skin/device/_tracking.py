@@ -27,11 +27,11 @@ class Tracker:
     simulator: AbstractSimulator | None = None
     weights: Tensor | None = None
 
-    def known(self, movie: Movie) -> Tensor | None:
+    def true_motion(self, movie: Movie) -> Tensor | None:
         """Return the true motion, (B, T, S, 3), m, of sensors under gestures."""
         return None if self.simulator is None else _motion(self.simulator, movie)
 
-    def told(self, touches: Touches) -> Touches:
+    def with_estimate(self, touches: Touches) -> Touches:
         """Return touches with the motion that their readings tell."""
         if self.weights is None:
             return touches

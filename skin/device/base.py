@@ -18,9 +18,9 @@ if TYPE_CHECKING:  # only their names are needed here
     from skin.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
     from skin.touch.stream import Strip
-    from skin.wire.conversion import Newtons
-    from skin.wire.listener import Tap
-    from skin.wire.segmentation import AbstractDirector, Take
+    from skin.wire.announcement import AnnouncementListener
+    from skin.wire.conversion import UnitConversion
+    from skin.wire.segmentation import AbstractSegmenter, RecordedGesture
     from skin.wire.skin import Skin
     from skin.wire.source import Source
 
@@ -207,11 +207,11 @@ class AbstractWired(AbstractDevice):
         return self
 
     @abstractmethod
-    def open(self, reconnect: bool = False) -> "tuple[Skin, Tap]":
+    def open(self, reconnect: bool = False) -> "tuple[Skin, AnnouncementListener]":
         """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
 
     @abstractmethod
-    def settle(self, skin: "Skin") -> "tuple[list[Frame], Newtons]":
+    def warm_up(self, skin: "Skin") -> "tuple[list[Frame], UnitConversion]":
         """Read the beginning: is the device fast enough, and what does it say untouched?
 
         Returns:
@@ -222,18 +222,22 @@ class AbstractWired(AbstractDevice):
         """
 
     @abstractmethod
-    def director(
-        self, tap: "Tap", meaning: "Newtons", first: "Sequence[Frame]", done: Collection[int] = ()
-    ) -> "AbstractDirector":
+    def segmenter(
+        self,
+        listener: "AnnouncementListener",
+        conversion: "UnitConversion",
+        first: "Sequence[Frame]",
+        done: Collection[int] = (),
+    ) -> "AbstractSegmenter":
         """Return what finds the gestures of a stream.
 
         Args:
-            tap: hears announcements.
-            meaning: of the values.
+            listener: hears announcements.
+            conversion: of the values.
             first: frames that came before.
             done: numbers of gestures that are there already.
         """
 
     @abstractmethod
-    def stored(self, takes: "Sequence[Take]", meaning: "Newtons") -> Recording:
+    def to_recording(self, gestures: "Sequence[RecordedGesture]", conversion: "UnitConversion") -> Recording:
         """Return gestures as a recording."""

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.device._cost import CAPTURES, FULL, ROWS, SOURCE, refusal
-from skin.device._cost_cache import captures
+from skin.device._cost import CAPTURES, FULL, ROWS, SOURCE, format_error
+from skin.device._cost_cache import cached_captures
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import Task
@@ -131,10 +131,10 @@ class Cost(AbstractDevice):
 
     def _read(self, names: tuple[str, ...]) -> None:
         path = Path(str(self.path)).expanduser()
-        found = captures(path, self.window)
+        found = cached_captures(path, self.window)
         rows = int(found.frames.sum(dtype=np.int64))
         if self.strict and (rows, len(found)) != (ROWS, CAPTURES):
-            raise refusal(
+            raise format_error(
                 path,
                 f"it has {rows} rows in {len(found)} captures, the whole corpus has {ROWS} in {CAPTURES}",
                 "add device.strict=false to use a part of it, or download it again",

@@ -6,12 +6,12 @@ import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.device._blank import Blank
-from skin.device._split import rows
+from skin.device._split import split_rows
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.storage import read
+from skin.recording_file import read_recording
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
@@ -48,7 +48,7 @@ class Recorded(AbstractDevice):
     ) -> None:
         if path is None:
             raise InputError("device=recording needs a file: add device.path=x.parquet")
-        self._recording = read(path)
+        self._recording = read_recording(path)
         if test not in ("holdout", "all"):
             raise InputError(f"device.test must be holdout or all, got {test}")
         self._test = test
@@ -106,4 +106,4 @@ class Recorded(AbstractDevice):
         if split is None or (split == "test" and self._test == "all"):
             return self._recording
         part: Split = "holdout" if split == "test" else split
-        return self._recording[rows(part, len(self._recording), self.split_seed)]
+        return self._recording[split_rows(part, len(self._recording), self.split_seed)]

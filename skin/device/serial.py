@@ -16,20 +16,28 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.signal.calibration import read
+from skin.signal.calibration import read_calibration
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.announcement import Tap
-from skin.wire.conversion import Newtons, newtons
-from skin.wire.detect import Format
+from skin.wire.announcement import AnnouncementListener
+from skin.wire.conversion import UnitConversion, unit_conversion
 from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.open import Settings, open_skin
-from skin.wire.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
+from skin.wire.format_detection import Format
+from skin.wire.open import PortSettings, open_skin
+from skin.wire.segmentation import (
+    AbstractSegmenter,
+    AnnouncedSegmenter,
+    ContinuousSegmenter,
+    PromptedSegmenter,
+    RecordedGesture,
+    label_plan,
+    label_text,
+)
 from skin.wire.skin import Skin
 from skin.wire.source import Source
-from skin.wire.tare import Tare, settle
+from skin.wire.tare import Tare, warm_up
 from skin.wire.text import Header
-from skin.wire.transport import open_wire
+from skin.wire.transport import open_stream
 
 _LABELS = ("announced", "prompted", "none")
 _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
@@ -92,13 +100,13 @@ class Serial(AbstractWired):
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
         self._settings: dict[str, Any] = {name: getattr(self, name) for name in _AS_OPENED}
         self._settings["limits"] = None if self.limits is None else tuple(self.limits)
-        Settings(**self._settings)  # refuses what cannot be used
+        PortSettings(**self._settings)  # refuses what cannot be used
         self.rate = 10.0 if self.rate is None else float(self.rate)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self._known = None if self.calibration is None else read(self.calibration)
+        self._known = None if self.calibration is None else read_calibration(self.calibration)
         if self._known is not None:
             self._known.fits(len(self.sensors))
 
@@ -124,77 +132,87 @@ class Serial(AbstractWired):
         touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)
         return Blank(self.task, self.size, touches)
 
-    def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
+    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
         """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
         if self.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        tap = Tap(partial(open_wire, self.port, self.baudrate))
-        return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **self._settings), tap
+        listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
+        return open_skin(
+            self.port, self.sensors, opener=listener, reconnect=reconnect, **self._settings
+        ), listener
 
     def source(self) -> Source:
         """Open the port, and wait for a skin that is unplugged."""
         skin, _ = self.open(reconnect=True)
         return Source(str(self.port), skin, self.taring(skin))
 
-    def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
+    def warm_up(self, skin: Skin) -> tuple[list[Frame], UnitConversion]:
         """Return the first frames and what values mean: is the device fast enough, what is it untouched?"""
         assert self.rate is not None
         tare = self.taring(skin)
         try:
-            frames = settle(skin, tare, self.rate, self.tare, _say)
+            frames = warm_up(skin, tare, self.rate, self.tare, _say)
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{self.port}: {error}") from error
-        assert tare.newtons is not None
-        return frames, tare.newtons
+        assert tare.conversion is not None
+        return frames, tare.conversion
 
     def taring(self, skin: Skin) -> Tare:
         """Return what finds out what the values of an open skin mean."""
         assert self.rate is not None
-        return Tare(self.meaning, self.tare, self.rate, lambda: skin.header)
+        return Tare(self.conversion, self.tare, self.rate, lambda: skin.header)
 
-    def meaning(self, baseline: np.ndarray | None, header: Header | None) -> Newtons:
+    def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
         """Return what values mean, given a baseline (S,) and what the device tells of itself.
 
         Raises:
             InputError: nobody knows what a count is worth.
         """
-        return newtons(len(self.sensors), baseline, self.scale, self._known, header)
+        return unit_conversion(len(self.sensors), baseline, self.scale, self._known, header)
 
-    def director(
-        self, tap: Tap, meaning: Newtons, first: Sequence[Frame], done: Collection[int] = ()
-    ) -> AbstractDirector:
+    def segmenter(
+        self,
+        listener: AnnouncementListener,
+        conversion: UnitConversion,
+        first: Sequence[Frame],
+        done: Collection[int] = (),
+    ) -> AbstractSegmenter:
         """Return what finds the gestures of a stream, as ``labels`` says."""
         assert self.rate is not None
         window = Window(self.window, self.rate, len(self.sensors))
         for frame in first:
             window.add(frame)
         if self.labels == "announced":
-            return Announced(window, tap, self.task)
+            return AnnouncedSegmenter(window, listener, self.task)
         if self.labels == "none":
             known = np.ones(len(self.sensors), dtype=bool)
-            return Continuous(
+            return ContinuousSegmenter(
                 window,
                 max(done, default=-1) + 1,
-                lambda values: bool((meaning(values, known)[0] > self.trigger).any()),
+                lambda values: bool((conversion(values, known)[0] > self.trigger).any()),
             )
-        wanted = enumerate(plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
-        return Prompted(
+        wanted = enumerate(label_plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
+        return PromptedSegmenter(
             window, (one for one in wanted if one[0] < self.gestures and one[0] not in done), _say
         )
 
-    def stored(self, takes: Sequence[Take], meaning: Newtons) -> Recording:
+    def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
         """Return gestures as a recording."""
-        touches = self._touches([take.seen for take in takes if take.seen is not None], meaning)
-        if takes and takes[0].labels is not None:
-            rows = [[float(value) for value in take.labels.values()] for take in takes if take.labels]
+        touches = self._touches(
+            [gesture.resampled for gesture in gestures if gesture.resampled is not None], conversion
+        )
+        if gestures and gestures[0].labels is not None:
+            rows = [
+                [float(value) for value in gesture.labels.values()] for gesture in gestures if gesture.labels
+            ]
             touches = replace(touches, labels=torch.tensor(rows))
-        about = {"source": "serial", "lost": [take.lost for take in takes]}
+        about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
 
-    def _touches(self, windows: Sequence[Resampled], meaning: Newtons) -> Touches:
+    def _touches(self, windows: Sequence[Resampled], conversion: UnitConversion) -> Touches:
         """Return windows in the device's unit as touches."""
         assert self.rate is not None
-        readings, valid = meaning(
+        readings, valid = conversion(
             np.stack([window.values for window in windows]), np.stack([window.valid for window in windows])
         )
         saturated = valid & np.stack([window.saturated for window in windows])
@@ -203,33 +221,34 @@ class Serial(AbstractWired):
 
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin falls silent, or a person ends it."""
-        takes: list[Take] = []
-        skin, tap = self.open()
+        gestures: list[RecordedGesture] = []
+        skin, listener = self.open()
         with skin:
-            first, meaning = self.settle(skin)
-            director = self.director(tap, meaning, first)
+            first, conversion = self.warm_up(skin)
+            segmenter = self.segmenter(listener, conversion, first)
             _say(f"waiting for {self.gestures} gestures, labels {self.labels}")
-            for take in self._takes(skin, director):
-                takes.append(take)
-                words = "" if take.labels is None else f": {sentence(take.labels)}"
+            for gesture in self._finished_gestures(skin, segmenter):
+                gestures.append(gesture)
+                words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
                 _say(
-                    f"{len(takes)}/{self.gestures}{words}" + (f" ({take.lost} frames lost)" * bool(take.lost))
+                    f"{len(gestures)}/{self.gestures}{words}"
+                    + (f" ({gesture.lost} frames lost)" * bool(gesture.lost))
                 )
-                if len(takes) == self.gestures:
+                if len(gestures) == self.gestures:
                     break
-        if not takes:
+        if not gestures:
             raise InputError("no gesture came: does the emulator announce, does something touch the skin?")
-        return self.stored(takes, meaning)
+        return self.to_recording(gestures, conversion)
 
-    def _takes(self, skin: Skin, director: AbstractDirector) -> Iterator[Take]:
+    def _finished_gestures(self, skin: Skin, segmenter: AbstractSegmenter) -> Iterator[RecordedGesture]:
         try:
             for frame in skin:
-                take = director.show(frame)
-                if take is not None and take.broken:
-                    _say(f"gesture {take.number} broke off: the device started anew")
-                elif take is not None:
-                    yield take
-                if director.over:
+                gesture = segmenter.add(frame)
+                if gesture is not None and gesture.broken:
+                    _say(f"gesture {gesture.number} broke off: the device started anew")
+                elif gesture is not None:
+                    yield gesture
+                if segmenter.over:
                     return
         except (SkinTimeout, SkinDisconnected) as end:
             _say(str(end))

@@ -13,7 +13,7 @@ from skin import __version__
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
-from skin.device._split import parts, rows
+from skin.device._split import split_rows, split_slices
 from skin.device._threads import in_threads
 from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import misplaced, modelled, refuse_relaxation
@@ -21,10 +21,10 @@ from skin.device.base import AbstractSimulated, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
-from skin.recording import Recording, Touches, join
+from skin.recording import Recording, Touches, concatenate
 from skin.rng import Stream, generator
 from skin.sensors import Sensors
-from skin.settings import check
+from skin.settings import check_settings
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.simulator.base import AbstractSimulator
 from skin.summary import summarise
@@ -105,7 +105,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def _refuse(self) -> None:
         """Refuse settings that cannot be used, or not together."""
-        check(type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device")
+        check_settings(
+            type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device"
+        )
         if self.stream and self.direction:
             raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
         if self.stream or self.track != "none":
@@ -158,18 +160,18 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         if split == "test":
             return self._keep("test", complete, Stream.TEST, self.test_gestures)
         if split == "train" and self.fresh:
-            count = parts(self.gestures)["train"].stop
+            count = split_slices(self.gestures)["train"].stop
             return self._draw(complete, Stream.FRESH, count, self.data_seed, epoch)
         if self.stream:
             return self._streams(split, complete)
         budget = self._keep("budget", complete, Stream.BUDGET, self.gestures, self.data_seed)
-        return budget if split is None else budget[rows(split, self.gestures, self.data_seed)]
+        return budget if split is None else budget[split_rows(split, self.gestures, self.data_seed)]
 
     def _streams(self, split: Split | None, complete: bool) -> Recording:
         """Return the windows of a split of the budget: they overlap, so no stream is split."""
-        own = parts(self.gestures)
+        own = split_slices(self.gestures)
         if split is None:
-            return join([self._streams(name, complete) for name in own])
+            return concatenate([self._streams(name, complete) for name in own])
         count = len(range(self.gestures)[own[split]])
         return self._keep(split, complete, Stream.BUDGET, count, self.data_seed, [*own].index(split))
 
@@ -184,10 +186,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         """Draw gestures or windows in batches; ``complete`` adds the displacements."""
         cuts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
         if self.stream:
-            return join(in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts)))
+            return concatenate(
+                in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts))
+            )
         wanted = balanced(count, generator(stream, *key, 0))
         found = in_threads(lambda n: self._batch(wanted[cuts[n]], complete, stream, (*key, 1 + n)), len(cuts))
-        return join(found)
+        return concatenate(found)
 
     @torch.no_grad()
     def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
@@ -223,7 +227,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, float(self.rate), self.tracker.known(movie))
+        touches = Touches(
+            readings, valid, positions, labels, float(self.rate), self.tracker.true_motion(movie)
+        )
         strain = self.model.strain(movie.frames, movie.drag) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # A stream's windows have labels of their own.
@@ -238,7 +244,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         readings, valid, saturated = self.imperfection.apply(force, constants, noise)
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
-        return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
+        return replace(
+            true, touches=self.tracker.with_estimate(touches), parameters=true.parameters | clipped
+        )
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
         about: dict[str, Any] = {"source": "simulated", "simulator": type(self.model).__name__}

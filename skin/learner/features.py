@@ -12,12 +12,12 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.foreign import arrays
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.safe_loading import load_npz
 from skin.signal.features import measurements
-from skin.signal.sliding_direction import bearings
+from skin.signal.sliding_direction import direction_features
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
@@ -89,7 +89,7 @@ class Features(AbstractLearner):
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Grow the trees again from what ``save`` wrote; takes some seconds."""
-        table = arrays(path)
+        table = load_npz(path)
         columns = _matrix(data.touches("train")[:1], data.task).shape[1]
         for split in ("train", "validation"):
             values, labels = table[split], table[f"{split}_labels"]
@@ -144,5 +144,5 @@ def _told(
 def _matrix(touches: Touches, task: Task) -> np.ndarray:
     """Return the measurements as (B, D), float32."""
     here = touches.to("cpu")
-    columns = measurements(here) | (bearings(here) if task.direction else {})
+    columns = measurements(here) | (direction_features(here) if task.direction else {})
     return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration import bench_session, gauge
-from skin.hardware.calibration.bench import Bench, bench
+from skin.hardware.calibration.bench import Bench, simulated_bench
 from skin.plot.figures import COLOURS, save
 from skin.recording import Touches
 from skin.rng import Stream, generator
@@ -106,9 +106,9 @@ def read(
         InputError: files that cannot be used, or that do not fit each other.
     """
     shape = settings["indenter"], settings["radius"]
-    said = bench_session.read(path, *shape, settings["unit"])
-    rows = None if presses is None else gauge.read(presses, *shape, settings["delay"])
-    found = compare(device, bench(device, said, rows), settings["scale"])
+    said = bench_session.read_bench_session(path, *shape, settings["unit"])
+    rows = None if presses is None else gauge.read_gauge(presses, *shape, settings["delay"])
+    found = compare(device, simulated_bench(device, said, rows), settings["scale"])
     if not found.presses:
         raise InputError("no press has frames in the session: check the clocks, see compare.delay")
     return found

@@ -11,8 +11,8 @@ import numpy as np
 
 from skin import files
 from skin.errors import InputError
-from skin.foreign import settings
 from skin.paths import candidates
+from skin.safe_loading import load_yaml
 
 FORMAT = 1
 QUANTITIES = {
@@ -134,8 +134,8 @@ class Calibration:
         return found | {"dead": rank < count, "level": np.zeros(shape)}
 
 
-def read(path: str | Path) -> Calibration:
-    """Read a file that :func:`write` or a person wrote; a single number stands for every sensor.
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a file that :func:`write_calibration` or a person wrote; a single number stands for every sensor.
 
     Args:
         path: a relative one is looked for in the current folder, then beside the package.
@@ -147,7 +147,7 @@ def read(path: str | Path) -> Calibration:
     if found is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
-        stored: Any = settings(found)
+        stored: Any = load_yaml(found)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the calibration {found}: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
@@ -168,7 +168,7 @@ def read(path: str | Path) -> Calibration:
         raise InputError(f"{found} is no calibration: {error}") from error
 
 
-def write(calibration: Calibration, path: str | Path) -> Path:
+def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     """Write a calibration whole, one quantity a line.
 
     Raises:

@@ -8,7 +8,7 @@ DRIFT = 0.2 / 600  # N/s: 0.2 N in ten minutes
 _RELEASE = 0.3  # s below the threshold that end a contact
 
 
-class Contact:
+class ContactDetector:
     """Follows contact over a stream of tared readings.
 
     A contact begins where a reading rises by the threshold above the baseline. It ends where no reading did
@@ -35,9 +35,9 @@ class Contact:
         self._rate, self._threshold, self._drift = rate, threshold, drift
         self._recent = max(1, ceil(_RELEASE * rate - 1e-9))
         self._touched = np.zeros(sensors, dtype=bool)
-        self.tared()
+        self.reset()
 
-    def tared(self) -> None:
+    def reset(self) -> None:
         """Begin anew with a new tare."""
         self.baseline = np.zeros(len(self._touched))
         self._touched[:] = False

@@ -28,7 +28,7 @@ def rise(touches: Touches, idle: Tensor | float = 0.0) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Threshold:
+class ContactThreshold:
     """Says that a window is touched if a reading rises by ``least`` N or more above its baseline.
 
     Attributes:
@@ -40,7 +40,7 @@ class Threshold:
     idle: Tensor | float = 0.0
 
     @classmethod
-    def tuned(cls, rises: Tensor, touched: Tensor, idle: Tensor | float = 0.0) -> "Threshold":
+    def tuned(cls, rises: Tensor, touched: Tensor, idle: Tensor | float = 0.0) -> "ContactThreshold":
         """Return the threshold that tells best, by balanced accuracy.
 
         Args:
@@ -64,7 +64,7 @@ class Threshold:
         return rise(touches, self.idle) >= self.least
 
 
-def gates(threshold: Threshold, task: Task) -> dict[str, Gate]:
+def gates(threshold: ContactThreshold, task: Task) -> dict[str, Gate]:
     """Return the gates by name: ``none`` lets all through; ``learned`` only where the task has a gate."""
     found: dict[str, Gate] = {
         "none": lambda touches, chances: torch.ones(len(touches), dtype=torch.bool),

@@ -10,9 +10,9 @@ from annotated_types import Ge, Gt
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.lag import lagged, rounded, unloading
-from skin.settings import check
-from skin.signal.calibration import Calibration, read
+from skin.sensor_dynamics import apply_hysteresis, first_order_lag, quantize
+from skin.settings import check_settings
+from skin.signal.calibration import Calibration, read_calibration
 
 _IDLE_FRAMES = 30
 
@@ -113,7 +113,7 @@ class Imperfection(ImperfectionSettings):
                 f"device.dead must be a number from 0 up or a range [least, most], got {self.dead}: as in "
                 "device.dead=3 or device.dead=[0,5]"
             )
-        check(ImperfectionSettings, _settings(self), "device")
+        check_settings(ImperfectionSettings, _settings(self), "device")
 
     @property
     def dead_range(self) -> tuple[int, int]:
@@ -125,7 +125,9 @@ class Imperfection(ImperfectionSettings):
     @classmethod
     def of(cls, settings: ImperfectionSettings, calibration: str | None) -> "Imperfection":
         """Return imperfections of these settings, and of a file of ``skin calibrate`` where one is given."""
-        return cls(**_settings(settings), calibration=None if calibration is None else read(calibration))
+        return cls(
+            **_settings(settings), calibration=None if calibration is None else read_calibration(calibration)
+        )
 
     def constants(
         self, sensors: int, generator: np.random.Generator, gestures: int | None = None
@@ -230,16 +232,16 @@ class Imperfection(ImperfectionSettings):
             time = torch.arange(readings.shape[1], device=readings.device) / self.rate
         force = readings
         if constants.hysteresis.any():
-            force = unloading(force, constants.hysteresis)
+            force = apply_hysteresis(force, constants.hysteresis)
         if constants.time_constant.any():
-            force = lagged(force, constants.time_constant, time)
+            force = first_order_lag(force, constants.time_constant, time)
         felt = force * constants.gain
         said, saturated = felt.clamp(-constants.clip, constants.clip), felt.abs() > constants.clip
         said += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
         if constants.drift.any():
             said += constants.drift * time[:, None]
         if constants.quantum.any():
-            said = rounded(said + constants.baseline, constants.quantum) - constants.baseline
+            said = quantize(said + constants.baseline, constants.quantum) - constants.baseline
         return said, saturated
 
 

@@ -10,7 +10,7 @@ SHARES = (0.1, 0.25, 0.5)  # of the touch's own peak: a frame beyond is active
 _FORCE = 0.1  # N, twice the noise: what weighs less is no part of a centre
 
 
-def bearings(touches: Touches) -> dict[str, Tensor]:
+def direction_features(touches: Touches) -> dict[str, Tensor]:
     """Return about 60 named measurements, (B,) each, of touches of any layout.
 
     Each vector stands as it is and with length 1: its cosines are the label itself where it points rightly.

@@ -29,14 +29,14 @@ class Announcement:
     labels: Mapping[str, int] = field(default_factory=dict)
 
 
-def encode(said: Announcement) -> bytes:
+def encode_announcement(said: Announcement) -> bytes:
     """Return ``# gesture number=0 seq=300 frames=300 big=1 ...*HHHH``, LF at its end."""
     pairs = {name: getattr(said, name) for name in _KNOWN} | dict(said.labels)
     body = ("# gesture " + " ".join(f"{name}={value}" for name, value in pairs.items())).encode()
     return body + b"*%04X\n" % crc16(body)
 
 
-def parse(line: bytes) -> Announcement | None:
+def parse_announcement(line: bytes) -> Announcement | None:
     """Return what a line without its end announces; None if it is another or its checksum is wrong."""
     body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
     if not body.startswith(b"# gesture ") or tail != b"%04X" % crc16(body):
@@ -50,24 +50,24 @@ def parse(line: bytes) -> Announcement | None:
         return None
 
 
-class Tap:
+class AnnouncementListener:
     """An opener for ``open_skin`` that hands bytes on as they are and keeps the announcements among them.
 
     Args:
         opener: opens the stream of bytes.
 
     Attributes:
-        heard: announcements that nobody has taken yet.
+        announcements: announcements that nobody has taken yet.
     """
 
     def __init__(self, opener: Callable[[], ByteStream]) -> None:
         self._opener = opener
-        self.heard: deque[Announcement] = deque(maxlen=_KEPT)
+        self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
 
     def __call__(self) -> ByteStream:
         """Open the stream, once more after each unplugging."""
         self._stream, self._rest = self._opener(), b""
-        self.heard.clear()
+        self.announcements.clear()
         return self
 
     def read(self) -> bytes:
@@ -75,7 +75,7 @@ class Tap:
         data = self._stream.read()
         *lines, self._rest = (self._rest + data).split(b"\n")
         self._rest = self._rest[-_LONGEST:]
-        self.heard.extend(said for line in lines if (said := parse(line)))
+        self.announcements.extend(said for line in lines if (said := parse_announcement(line)))
         return data
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ _SHIFTED = 20.0, 10.0  # against the old baseline, because offsets drift
 _SMOOTH = 0.5  # von Neumann's ratio of successive differences to variance: 2 for noise, near 0 for a hand
 
 
-def rest(
+def quiet_baseline(
     values: np.ndarray, valid: np.ndarray, before: np.ndarray | None = None, touch: float = 0.0
 ) -> np.ndarray:
     """Return the median of each channel over frames without touch, (S,).
@@ -30,7 +30,7 @@ def rest(
         InputError: too few frames.
         SkinTouched: the skin was touched.
     """
-    middle = median(values)
+    middle = median_baseline(values)
     asked = np.asarray(valid.any(axis=0))
     steps = np.abs(np.diff(values, axis=0))
     # From differences, because a touch that lasts half the time would pass for noise otherwise.
@@ -48,7 +48,7 @@ def rest(
     return middle
 
 
-def median(values: np.ndarray) -> np.ndarray:
+def median_baseline(values: np.ndarray) -> np.ndarray:
     """Return the median of each channel (S,) over frames (F, S), touched or not.
 
     Raises:

@@ -10,7 +10,7 @@ from skin.wire.text import Header
 
 
 @dataclass(frozen=True)
-class Newtons:
+class UnitConversion:
     """Turns values into N: gain 1, and 0 where nothing touches.
 
     Attributes:
@@ -29,13 +29,13 @@ class Newtons:
         return np.where(valid, (values - self.zero) * self.scale, 0.0).astype(np.float32), valid
 
 
-def newtons(
+def unit_conversion(
     sensors: int,
     baseline: np.ndarray | None,
     scale: float | None,
     calibration: Calibration | None,
     header: Header | None,
-) -> Newtons:
+) -> UnitConversion:
     """Return what values mean.
 
     Args:
@@ -53,7 +53,7 @@ def newtons(
         known = calibration.values()
         per_unit = (calibration.scale if scale is None else scale) / known["gain"]
         offset = calibration.zero + known["offset"] / calibration.scale
-        return Newtons(per_unit, offset if baseline is None else baseline, known["dead"])
+        return UnitConversion(per_unit, offset if baseline is None else baseline, known["dead"])
     if scale is None:
         if header is None or header.unit != "N":
             raise InputError(
@@ -63,4 +63,4 @@ def newtons(
             )
         scale = 1.0
     zero = np.zeros(sensors) if baseline is None else baseline
-    return Newtons(np.full(sensors, scale), zero, np.zeros(sensors, dtype=bool))
+    return UnitConversion(np.full(sensors, scale), zero, np.zeros(sensors, dtype=bool))

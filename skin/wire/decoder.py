@@ -4,8 +4,15 @@ import numpy as np
 
 from skin.errors import InputError
 from skin.signal.frame import After, Counters, Frame, FrameError
-from skin.wire.detect import Format, Found, Raw, Speech, detect, refusal
-from skin.wire.sequence import HostClock, Order
+from skin.wire.format_detection import (
+    DetectionResult,
+    Format,
+    FrameFormat,
+    RawFrame,
+    detect_format,
+    detection_error,
+)
+from skin.wire.sequence import HostClock, SequenceTracker
 from skin.wire.text import Header, parse_header
 
 _LONGEST = 65536  # bytes of a line
@@ -29,7 +36,7 @@ class Decoder:
 
     Attributes:
         counters: what was seen; kept by :meth:`restart`.
-        speech: the format, once it is known.
+        frame_format: the format, once it is known.
         header: what the device tells of itself, if it does.
     """
 
@@ -37,14 +44,14 @@ class Decoder:
         self.sensors, self.format = sensors, format
         self.counters, self.quality = Counters(), _Quality()
         self.header: Header | None = None
-        self._order, self._clock = Order(), HostClock()
+        self._order, self._clock = SequenceTracker(), HostClock()
         self._all_valid = np.ones(sensors or 0, dtype=bool)
         self._begin()
 
     def _begin(self) -> None:
-        self.speech: Speech | None = None
+        self.frame_format: FrameFormat | None = None
         self._buffer = b""
-        self._found = Found(None, None, None)
+        self._found = DetectionResult(None, None, None)
         self._receiving, self._fed_at = 0.0, float("nan")
         self._whole = self._overlong = self._synchronous = False
         self._missing = 0
@@ -62,14 +69,14 @@ class Decoder:
             now: s, the host's monotonic clock at their arrival.
         """
         self.counters.bytes += len(data)
-        if self.speech is None:
+        if self.frame_format is None:
             # Where nothing is recognised for long, only the latest is searched.
             self._buffer = self._buffer[-2 * self._enough :]
         self._buffer += data
-        if self.speech is None and not self._recognise(data, now):
+        if self.frame_format is None and not self._recognise(data, now):
             return []
-        assert self.speech is not None
-        *pieces, self._buffer = self._buffer.split(self.speech.delimiter)
+        assert self.frame_format is not None
+        *pieces, self._buffer = self._buffer.split(self.frame_format.delimiter)
         good, bad = self.counters.frames, sum(self.counters.bad.values())
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
         if len(self._buffer) > _LONGEST:
@@ -77,11 +84,11 @@ class Decoder:
         self.quality.count(now, self.counters.frames - good, sum(self.counters.bad.values()) - bad)
         return frames
 
-    def refusal(self) -> InputError | None:
+    def error(self) -> InputError | None:
         """Return why nothing can be read, once 2 s of receiving or 4 kB (or four frames) show no format."""
-        if self.speech or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
+        if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
             return None
-        return refusal(self._buffer, self._found, self.sensors)
+        return detection_error(self._buffer, self._found, self.sensors)
 
     @property
     def _enough(self) -> int:
@@ -95,28 +102,28 @@ class Decoder:
         self._fed_at = now
         if b"\n" not in data and b"\0" not in data:
             return False
-        self._found = detect(self._buffer, self.sensors, self.format)
-        self.speech = self._found.speech
-        if self.speech is None:
+        self._found = detect_format(self._buffer, self.sensors, self.format)
+        self.frame_format = self._found.frame_format
+        if self.frame_format is None:
             return False
         self.header = self._found.header or self.header
-        self.sensors = self.speech.sensors
+        self.sensors = self.frame_format.sensors
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         return True
 
     def _frame(self, piece: bytes, now: float) -> Frame | None:
-        assert self.speech is not None
+        assert self.frame_format is not None
         first, self._whole = not self._whole, True
         try:
             if self._overlong or len(piece) > _LONGEST:
                 self._overlong = False
                 raise FrameError("long")
-            raw = self.speech.read(piece)
+            raw = self.frame_format.read(piece)
             if raw is None:
                 self._comment(piece)
                 return None
-            if first and self.speech.check != "crc16":
+            if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
             return self._placed(raw, now)
         except FrameError as bad:
@@ -124,8 +131,8 @@ class Decoder:
             return None
 
     def _comment(self, piece: bytes) -> None:
-        assert self.speech is not None
-        if text := self.speech.comment(piece):
+        assert self.frame_format is not None
+        if text := self.frame_format.comment(piece):
             self.header = parse_header(text) or self.header
 
     def _count_bad(self, bad: FrameError) -> None:
@@ -137,7 +144,7 @@ class Decoder:
         self.counters.bad[bad.reason] += 1
         self.quality.note(bad)
 
-    def _placed(self, raw: Raw, now: float) -> Frame:
+    def _placed(self, raw: RawFrame, now: float) -> Frame:
         t_us = now * 1e6 if raw.t_us is None else raw.t_us
         t, segment, lost, after = self._order.place(raw.seq, t_us, self._missing)
         counters = self.counters
@@ -146,7 +153,7 @@ class Decoder:
         counters.lost += lost
         counters.gaps += after == "gap"
         counters.resets += after == "reset"
-        counters.weak += self.speech is not None and self.speech.check != "crc16"
+        counters.weak += self.frame_format is not None and self.frame_format.check != "crc16"
         self._synchronous, self._missing = True, 0
         if after and after != "gap":
             self._clock.restart()

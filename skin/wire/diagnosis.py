@@ -15,7 +15,7 @@ _KEPT = 10_000  # frames of which channels are told
 _SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
 
 
-class Listener:
+class PortMonitor:
     """Listens to an open skin."""
 
     def __init__(self, skin: Skin) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 
 from skin.signal.frame import After, Frame
 from skin.wire.decoder import Decoder
-from skin.wire.detect import clock_stands_still
-from skin.wire.health import Health, Limits, State
+from skin.wire.format_detection import stopped_clock_error
+from skin.wire.health import ChannelHealth, ChannelState, Limits
 from skin.wire.transport import ByteStream
 
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -40,14 +40,14 @@ class Feed(Protocol):
     def poll(self) -> list[Frame]:
         """Return what came within about 0.1 s; OSError once it is unplugged, EOFError at its end."""
 
-    def states(self) -> tuple[State, ...]:
+    def states(self) -> tuple[ChannelState, ...]:
         """Return what is wrong with each channel."""
 
     def close(self) -> None:
         """Let go of it."""
 
 
-class Wire:
+class WireFeed:
     """Frames from bytes, their channels judged; says in the log once a second what was wrong.
 
     Args:
@@ -65,10 +65,10 @@ class Wire:
         decoder: Decoder,
         limits: Limits | None,
         silence: float = inf,
-        health: Health | None = None,
+        health: ChannelHealth | None = None,
     ) -> None:
         self._stream, self._decoder, self._limits = stream, decoder, limits
-        self._health = health or Health()
+        self._health = health or ChannelHealth()
         self._told = False
         self._said = Counter(decoder.counters.bad)
         self._said_at = self._heard_at = monotonic()
@@ -88,13 +88,13 @@ class Wire:
         if frames:
             self._prepare()
             self._check_clock(frames, now)
-        elif data and (refusal := self._decoder.refusal()):
-            raise refusal
+        elif data and (error := self._decoder.error()):
+            raise error
         if now - self._said_at >= 1:
             self._say(now)
         return [self._judged(frame) for frame in frames]
 
-    def states(self) -> tuple[State, ...]:
+    def states(self) -> tuple[ChannelState, ...]:
         """Return what is wrong with each channel."""
         return self._health.states()
 
@@ -104,9 +104,9 @@ class Wire:
 
     def _prepare(self) -> None:
         """Say once what protects the frames; take limits from the header whenever it comes."""
-        speech, header = self._decoder.speech, self._decoder.header
-        if not self._told and speech is not None and speech.check in _WEAK:
-            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[speech.check])
+        frame_format, header = self._decoder.frame_format, self._decoder.header
+        if not self._told and frame_format is not None and frame_format.check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[frame_format.check])
         self._told = True
         if self._limits is not None:
             self._health.limits = self._limits
@@ -120,12 +120,12 @@ class Wire:
         self._clock_frames += len(frames)
         least, few = _STILL
         if now - self._clock_since >= least and self._clock_frames >= few:
-            raise clock_stands_still(self._clock_frames, self._clock * 1e6)
+            raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
 
     def _judged(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
-        valid, saturated = self._health.judge(frame.values, frame.t)
+        valid, saturated = self._health.check(frame.values, frame.t)
         return frame._replace(valid=valid, saturated=saturated)
 
     def _say(self, now: float) -> None:
@@ -137,7 +137,7 @@ class Wire:
             _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, f"; {trouble}" if trouble else "")
 
 
-class Player:
+class PlaybackFeed:
     """Frames from memory, in real time or as fast as they are taken.
 
     Args:
@@ -175,7 +175,7 @@ class Player:
             self._next = self._take()
         return frames
 
-    def states(self) -> tuple[State, ...]:
+    def states(self) -> tuple[ChannelState, ...]:
         """Return nothing: what a file says is valid is in its frames."""
         return ()
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-State = Literal["ok", "saturated", "stuck", "dead"]
+ChannelState = Literal["ok", "saturated", "stuck", "dead"]
 Limits = tuple[float | None, float | None]
 
 _SILENT = 5.0  # s without any change
@@ -12,7 +12,7 @@ _LIVELY = 1.0  # s within which most channels change, if their noise can be seen
 _FAR = 20  # smallest steps of a channel: more than its noise ranges over
 
 
-class Health:
+class ChannelHealth:
     """Judges channels frame by frame.
 
     A value at a limit is saturated, and valid: the force is at least that. A channel that does not change at
@@ -39,7 +39,7 @@ class Health:
         """Forget times: the device started anew. What channels can send stays known."""
         self._begin_time = True
 
-    def judge(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+    def check(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return which values (S,) are valid and which are saturated, (S,), bool each.
 
         Args:
@@ -71,12 +71,12 @@ class Health:
         self._silent &= ~self._saturated
         return ~self._silent, self._saturated
 
-    def states(self) -> tuple[State, ...]:
+    def states(self) -> tuple[ChannelState, ...]:
         """Return what is wrong with each channel as of the last frame; empty before the first."""
         if self._last is None:
             return ()
         dead = self._silent & ~self._ever
-        kinds: list[State] = ["ok", "saturated", "stuck", "dead"]
+        kinds: list[ChannelState] = ["ok", "saturated", "stuck", "dead"]
         worst = np.where(dead, 3, np.where(self._silent, 2, np.where(self._saturated, 1, 0)))
         return tuple(kinds[number] for number in worst)
 

@@ -13,12 +13,12 @@ from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveIn
 from skin.errors import InputError
 from skin.settings import RISING, checked
 from skin.wire.decoder import Decoder
-from skin.wire.detect import Format
-from skin.wire.feed import Feed, Piece, Player, Wire
-from skin.wire.health import Health, Limits
+from skin.wire.feed import Feed, Piece, PlaybackFeed, WireFeed
+from skin.wire.format_detection import Format
+from skin.wire.health import ChannelHealth, Limits
 from skin.wire.reader import Reader
 from skin.wire.skin import Skin
-from skin.wire.transport import ByteStream, open_wire
+from skin.wire.transport import ByteStream, open_stream
 
 if TYPE_CHECKING:
     from skin.recording import Touches
@@ -44,14 +44,14 @@ def _ordered(limits: Limits) -> Limits:
 
 @checked("device")
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class PortSettings:
     """How a skin is read.
 
     Args:
         baudrate: bits per second, for serial ports.
         format: ``auto``, ``text`` or ``binary``.
-        limits: smallest and largest value a channel can send, as in :class:`skin.wire.health.Health`; None:
-            the largest count, where the device tells its bits.
+        limits: smallest and largest value of a channel, as in :class:`skin.wire.health.ChannelHealth`; None:
+            the largest count, if the header gives the bits.
         timeout: s without a frame after which iterating and reading give up.
         queue: frames that are kept for whoever is late.
         reconnect: wait for an unplugged skin; its first frame has ``after="reconnect"``.
@@ -94,24 +94,26 @@ def open_skin(
         opener: opens the stream of bytes instead, and again after each unplugging.
         device: what ``simulated`` plays.
         baseline: (S,), from an earlier tare.
-        settings: as in :class:`Settings`.
+        settings: as in :class:`PortSettings`.
 
     Raises:
         InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
     """
-    chosen, sensors = Settings(**settings), None if layout is None else len(layout)
+    chosen, sensors = PortSettings(**settings), None if layout is None else len(layout)
     decoder = None
     if opener is None and port == "simulated":
         if device is None:
             raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
-        connect = _player(Player(_strips(device), device.rate, chosen.realtime))
+        connect = _player(PlaybackFeed(_strips(device), device.rate, chosen.realtime))
     elif opener is None and port.endswith((".parquet", ".csv")):
         connect = _player(_recorded(port, sensors, chosen.realtime))
     else:
         decoder = Decoder(sensors, chosen.format)
         watched = chosen.reconnect and port.startswith("socket://")
         silence = (chosen.silence if watched else None) or inf
-        connect = _wire(opener or partial(open_wire, port, chosen.baudrate), decoder, chosen.limits, silence)
+        connect = _wire(
+            opener or partial(open_stream, port, chosen.baudrate), decoder, chosen.limits, silence
+        )
     try:
         reader = Reader(connect, chosen.queue, chosen.reconnect, chosen.backoff)
     except OSError as error:
@@ -126,34 +128,34 @@ def _wire(
 
     What channels can send stays known: a cable may come loose under a press that drives them to their limit.
     """
-    connections, health = count(), Health()
+    connections, health = count(), ChannelHealth()
 
     def connect() -> Feed:
         stream = opener()
         if next(connections):
             decoder.restart()
             health.restart()
-        return Wire(stream, decoder, limits, silence, health)
+        return WireFeed(stream, decoder, limits, silence, health)
 
     return connect
 
 
-def _player(player: Player) -> Callable[[], Feed]:
+def _player(player: PlaybackFeed) -> Callable[[], Feed]:
     return lambda: player
 
 
-def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
+def _recorded(path: str, sensors: int | None, realtime: bool) -> PlaybackFeed:
     # Here, because it brings torch, which a wire does not need.
-    from skin.storage import read
+    from skin.recording_file import read_recording
 
-    touches = read(path).touches
+    touches = read_recording(path).touches
     found = touches.readings.shape[2]
     if sensors not in (None, found):
         raise InputError(
             f"{path} has {found} sensors, the layout has {sensors}: give the layout it was recorded with, "
             "as in layout=file layout.path=FILE.csv"
         )
-    return Player(_pieces(touches), touches.rate, realtime)
+    return PlaybackFeed(_pieces(touches), touches.rate, realtime)
 
 
 def _strips(device: "Streamed") -> Iterator[Piece]:

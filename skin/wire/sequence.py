@@ -19,7 +19,7 @@ class Place(NamedTuple):
     after: After
 
 
-def steps(before: int, seq: int) -> int:
+def frames_ahead(before: int, seq: int) -> int:
     """Return by how many frames ``seq`` is ahead of ``before``, u16 or u32 wrapped; 0 if it is not."""
     if seq > before:
         return seq - before
@@ -29,7 +29,7 @@ def steps(before: int, seq: int) -> int:
     return 0
 
 
-class Order:
+class SequenceTracker:
     """Follows seq and the device's clock from frame to frame."""
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class Order:
             return self._begin(t_us)
         if last == (seq, t_us):
             raise FrameError("repeat")
-        ahead, elapsed = steps(last[0], seq), t_us - last[1]
+        ahead, elapsed = frames_ahead(last[0], seq), t_us - last[1]
         if elapsed < 0 and last[1] < _WRAP and elapsed + _WRAP <= _WRAP_GAP:
             elapsed += _WRAP
             self._wrapped += _WRAP

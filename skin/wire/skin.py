@@ -8,10 +8,10 @@ import numpy as np
 
 from skin.errors import InputError
 from skin.signal.frame import Counters, Frame
-from skin.wire.baseline import median, rest
+from skin.wire.baseline import median_baseline, quiet_baseline
 from skin.wire.decoder import Decoder
 from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.health import State
+from skin.wire.health import ChannelState
 from skin.wire.reader import Reader
 from skin.wire.text import Header
 
@@ -140,7 +140,9 @@ class Skin:
         if touch is None:
             touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
-        self.baseline = median(values) if force else rest(values, valid, self.baseline, touch)
+        self.baseline = (
+            median_baseline(values) if force else quiet_baseline(values, valid, self.baseline, touch)
+        )
         return self.baseline
 
     @property
@@ -149,7 +151,7 @@ class Skin:
         return self._decoder.header if self._decoder else None
 
     @property
-    def channels(self) -> tuple[State, ...]:
+    def channels(self) -> tuple[ChannelState, ...]:
         """What is wrong with each channel, as of the last frame that came; empty if nobody judges."""
         return self._reader.feed.states()
 
@@ -159,14 +161,14 @@ class Skin:
         reader, decoder = self._reader, self._decoder
         counters = decoder.counters if decoder else Counters(frames=self._taken)
         known = vars(counters) | {"bad": tuple(sorted(counters.bad.items()))}
-        speech = decoder.speech if decoder else None
+        frame_format = decoder.frame_format if decoder else None
         return Stats(
             bad_frames=counters.bad.total(),
             dropped=reader.dropped,
             reconnects=reader.reconnects,
             rate_hz=reader.rate,
-            format=speech.name if speech else "",
-            check=speech.check if speech else "",
+            format=frame_format.name if frame_format else "",
+            check=frame_format.check if frame_format else "",
             trouble=decoder.quality.trouble if decoder else "",
             **known,
         )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from skin.wire.conversion import newtons
+from skin.wire.conversion import unit_conversion
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare
 
@@ -25,5 +25,5 @@ class Source:
     def of_newtons(cls, name: str, skin: Skin, sensors: int) -> "Source":
         """Return one whose values are N already, of so many sensors."""
         # No baseline is taken: a run that learned from such values expects their offsets.
-        meaning = newtons(sensors, None, 1.0, None, None)
-        return cls(name, skin, Tare(lambda baseline, header: meaning, 0.0, 1.0))
+        conversion = unit_conversion(sensors, None, 1.0, None, None)
+        return cls(name, skin, Tare(lambda baseline, header: conversion, 0.0, 1.0))

@@ -31,7 +31,7 @@ class ByteStream(Protocol):
         """Let go of the port."""
 
 
-def open_wire(port: str, baudrate: int) -> ByteStream:
+def open_stream(port: str, baudrate: int) -> ByteStream:
     """Open a serial port, or ``socket://host:number``.
 
     Raises:

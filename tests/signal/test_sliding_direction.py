@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from skin.recording import Touches
-from skin.signal.sliding_direction import bearings
+from skin.signal.sliding_direction import direction_features
 
 GRID = torch.cartesian_prod(torch.linspace(0.01, 0.15, 8), torch.linspace(0.01, 0.15, 8))
 POSITIONS = torch.cat([GRID, torch.full((64, 1), 0.005)], dim=1)
@@ -25,7 +25,7 @@ def slide(angle: float, order: torch.Tensor | None = None) -> Touches:
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, 2.0, -2.8, -1.2])
 def test_every_vector_points_where_the_touch_goes(angle):
-    found = bearings(slide(angle))
+    found = direction_features(slide(angle))
     pairs = {name[: -len(", cosine with x")] for name in found if name.endswith(", cosine with x")}
     told = pairs - {"lean"}  # nothing pulls here
     assert len(told) == 13
@@ -45,12 +45,12 @@ def test_a_pull_behind_is_a_lean_ahead():
     touches = slide(0.0)
     ahead = slide(0.0).readings.roll(-8, dims=2)
     touches.readings.sub_(0.4 * ahead)
-    assert bearings(touches)["lean, cosine with x"] > 0.9
+    assert direction_features(touches)["lean, cosine with x"] > 0.9
 
 
 def test_numbers_and_order_of_sensors_do_not_matter():
     order = torch.randperm(64, generator=torch.Generator().manual_seed(0))
-    one, other = bearings(slide(0.7)), bearings(slide(0.7, order))
+    one, other = direction_features(slide(0.7)), direction_features(slide(0.7, order))
     for name, values in one.items():
         torch.testing.assert_close(values, other[name], atol=1e-5, rtol=1e-4)
 
@@ -58,4 +58,4 @@ def test_numbers_and_order_of_sensors_do_not_matter():
 def test_a_window_without_touch_tells_nothing():
     touches = slide(0.0)
     touches.readings.zero_()
-    assert all((values == 0).all() for values in bearings(touches).values())
+    assert all((values == 0).all() for values in direction_features(touches).values())

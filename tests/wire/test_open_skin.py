@@ -17,7 +17,7 @@ from skin.wire.binary import encode_frame
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.open import open_skin
 from skin.wire.text import Header, encode_header, encode_line
-from skin.wire.transport import open_wire
+from skin.wire.transport import open_stream
 
 LAYOUT = range(4)
 PATIENT = 60.0  # s: machines are busy at times
@@ -207,7 +207,7 @@ def test_unplugging_is_an_error_after_what_came_before(plug):
 def test_two_hundred_times_unplugged_and_plugged_in_again(new_plug):
     def opener():
         cable = new_plug()
-        stream = open_wire(cable.port, 115200)
+        stream = open_stream(cable.port, 115200)
         cable.send(b"77,5", b"\n", lines(*range(4)))
         cables.append(cable)
         return stream
@@ -226,7 +226,7 @@ def test_two_hundred_times_unplugged_and_plugged_in_again(new_plug):
 def test_while_it_is_away_it_is_tried_again_and_said(plug, new_plug):
     ports = [plug.port]
     with open_skin(
-        "x", LAYOUT, opener=lambda: open_wire(ports[-1], 115200), reconnect=True, backoff=(0.01, 0.02)
+        "x", LAYOUT, opener=lambda: open_stream(ports[-1], 115200), reconnect=True, backoff=(0.01, 0.02)
     ) as skin:
         plug.send(lines(0, 1, 2))
         skin.read(3, timeout=PATIENT)

@@ -8,7 +8,7 @@ import numpy as np
 
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_session import Session
+from skin.hardware.calibration.bench_session import BenchSession
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.hardware.calibration.protocol import true_readings
 
@@ -27,7 +27,7 @@ class Bench:
         each: true readings per N of every press, (P, S).
     """
 
-    session: Session
+    session: BenchSession
     gauge: Gauge
     each: np.ndarray
 
@@ -89,7 +89,7 @@ class Bench:
         return found
 
 
-def bench(device: AbstractSimulated, session: Session, gauge: Gauge | None) -> Bench:
+def simulated_bench(device: AbstractSimulated, session: BenchSession, gauge: Gauge | None) -> Bench:
     """Set a session beside the simulation of its presses on the skin as it is designed.
 
     Raises:

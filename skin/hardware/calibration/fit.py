@@ -10,7 +10,7 @@ from skin.errors import InputError
 from skin.hardware.calibration import _channel
 from skin.hardware.calibration._channel import Idle
 from skin.hardware.calibration.bench import Bench
-from skin.lag import lagged, peaks
+from skin.sensor_dynamics import first_order_lag, running_peak
 from skin.signal.calibration import Calibration
 
 _PRESSED = 0.05  # of the largest true reading: less tells no gain
@@ -33,7 +33,7 @@ class _Channel:
     broken: str | None = None
 
 
-def fit(bench: Bench, presses: Collection[int] | None = None) -> Calibration:
+def fit_calibration(bench: Bench, presses: Collection[int] | None = None) -> Calibration:
     """Fit every channel to the simulated true readings of presses, never to the gauge's force.
 
     Idle frames give offset, drift and noise; the release the time constant; the loading branch the gain and
@@ -110,9 +110,9 @@ def _time_constant(bench: Bench, used: np.ndarray, number: int, channel: _Channe
 def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return true readings behind the lag, and what a hysteresis of 1 would add to them, each (T, S), N."""
     force = torch.from_numpy(true)[None]
-    peak = peaks(force)
+    peak = running_peak(force)
     bend = torch.where(peak > 0, 6 * force * (1 - force.abs() / peak.clamp(min=1e-30)), 0.0)
-    both = lagged(
+    both = first_order_lag(
         torch.cat([force, bend], -1), torch.tensor(constants).double().repeat(2), torch.from_numpy(time)
     )[0].numpy()
     return both[:, : true.shape[1]], both[:, true.shape[1] :]

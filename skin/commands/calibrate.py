@@ -31,7 +31,7 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.hardware.calibration import bench_session, gauge
-    from skin.hardware.calibration.bench import simulated_bench
+    from skin.hardware.calibration.bench_data import build_bench_data
     from skin.hardware.calibration.calibration_report import held_out_summary, print_calibration
     from skin.hardware.calibration.fit import fit_calibration
     from skin.hardware.calibration.held_out import evaluate_held_out
@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
     said = bench_session.read_bench_session(config.session, *shape, settings["unit"])
     rows = None if config.presses is None else gauge.read_gauge(config.presses, *shape, settings["delay"])
     with Console(stderr=True).status("fitting"):
-        found = simulated_bench(device, said, rows)
+        found = build_bench_data(device, said, rows)
         outcome, calibration = evaluate_held_out(found, settings["held_out"]), fit_calibration(found)
     print_calibration(calibration, outcome)
     if not outcome.helps:

@@ -15,7 +15,7 @@ from skin.errors import InputError
 
 SOURCE = "https://doi.org/10.4121/uuid:5ef62345-3b3e-479c-8e1d-c922748c9b29"
 ROWS, CAPTURES = 1_496_855, 7805
-"""How long the published file is."""
+"""Number of rows and captures of the published file."""
 FULL = 1023
 """The largest count: the corpus has 10 bits."""
 CHANNELS = 64
@@ -35,7 +35,7 @@ class Captures:
         subject: (N,), int32, as in the file.
         variant: (N,), int32: 1 gentle, 2 normal, 3 rough.
         gesture: (N,), int32, 1 to 14.
-        frames: (N,), int32: how many frames the file has of each.
+        frames: (N,), int32: number of frames of each in the file.
     """
 
     counts: np.ndarray
@@ -52,19 +52,19 @@ class Captures:
         return Captures(**{name: values[index] for name, values in vars(self).items()})
 
 
-def format_error(path: str | Path, wrong: str, mend: str = "download it again") -> InputError:
-    """Return the error that says what is wrong with a file and where the right one is."""
-    return InputError(f"{path} is not CoST.csv as published: {wrong}; {mend} from {SOURCE}")
+def format_error(path: str | Path, wrong: str, fix: str = "download it again") -> InputError:
+    """Return the error for a file that is not as published, with the address of the corpus."""
+    return InputError(f"{path} is not CoST.csv as published: {wrong}; {fix} from {SOURCE}")
 
 
 def read_captures(path: Path, window: int) -> Captures:
-    """Read a file block by block; no more than a block and the resampled captures are ever held.
+    """Read the captures of a file block by block, in bounded memory.
 
     A capture begins where ``frame`` is 1. It is resampled by linear interpolation in time over its whole
-    length, so its duration is lost to all but ``frames``.
+    length, so its duration is kept only in ``frames``.
 
     Raises:
-        InputError: not in the corpus's format; the sentence names the line.
+        InputError: the file is not in the corpus's format; the message has the number of the line.
     """
     parts: list[Captures] = []
     rest = np.empty((0, len(COLUMNS)), np.int32)
@@ -73,7 +73,7 @@ def read_captures(path: Path, window: int) -> Captures:
         rows = np.concatenate([rest, block])
         _check(path, rows, len(rest), line)
         line += len(block)
-        # The last capture may go on in the next block.
+        # The last capture may continue in the next block.
         last = np.flatnonzero(rows[:, _FRAME] == 1)[-1]
         parts.append(_resampled(path, rows[:last], window, line - len(rows)))
         rest = rows[last:]
@@ -148,10 +148,10 @@ def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:
     """Refuse values out of range, and frames that do not run 1, 2, 3, ... within one capture.
 
     Args:
-        path: for the sentence.
+        path: for the message.
         rows: (R, 68).
-        known: how many of them have been checked before.
-        line: of the first one that has not.
+        known: number of rows that have been checked before.
+        line: number of the first unchecked row's line.
     """
     new = rows[known:]
     for name, largest in _LARGEST.items():

@@ -23,10 +23,10 @@ class Recorded(AbstractDevice):
 
     Args:
         path: ``x.parquet`` or ``x.csv``.
-        body: the sheet, to be compared with the file's.
-        layout: where the sensors are, to be compared with the file's.
-        split_seed: what the split is drawn from.
-        test: ``holdout``, or ``all`` touches, for a run that learnt from others.
+        body: the sheet; it is compared with the file's.
+        layout: positions of the sensors; they are compared with the file's.
+        split_seed: seed of the split.
+        test: ``holdout``, or ``all`` touches, for a run that was trained on others.
 
     Attributes:
         sensors: as ``layout`` gives them.
@@ -55,7 +55,7 @@ class Recorded(AbstractDevice):
         if len(self._recording) < 10 and test == "holdout":
             raise InputError(
                 f"{path} has {len(self._recording)} touches: 80/10/10 needs at least 10, or a "
-                "run that learnt from others and device.test=all"
+                "run that was trained on others and device.test=all"
             )
         self.path, self.split_seed = path, split_seed
         self.sensors = layout.sensors(body)
@@ -86,7 +86,7 @@ class Recorded(AbstractDevice):
             )
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the touches of a split; a file has no fresh ones."""
+        """Return the touches of a split, the same in every epoch."""
         return self.recording(split, epoch).touches
 
     def all_touches(self) -> Touches:
@@ -102,7 +102,7 @@ class Recorded(AbstractDevice):
         return Source.of_newtons(self.path, open_skin(self.path, self.sensors), len(self.sensors))
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return all that the file holds of a split; None takes the whole file."""
+        """Return the recording of a split; None takes the whole file."""
         if split is None or (split == "test" and self._test == "all"):
             return self._recording
         part: Split = "holdout" if split == "test" else split

@@ -45,28 +45,28 @@ _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
 
 @dataclass(kw_only=True, eq=False)
 class Serial(AbstractWired):
-    """Yields the gestures that somebody, or the emulator, does on a skin: its only split is ``test``.
+    """Yields gestures on a real or emulated skin; its only split is ``test``.
 
-    Readings are N without offset: the baseline is taken off, of values that are already reduced, because the
-    maximum of noise is not 0.
+    Readings are in N above the baseline, which is taken from resampled values, because the maximum of noise
+    is not 0.
 
     Args:
         body: the sheet of the model.
-        layout: where its sensors are; the device must send as many values.
+        layout: positions of its sensors; the device must send as many values.
         port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
         labels: ``announced``, ``prompted`` or ``none``.
-        gestures: how many.
+        gestures: number of gestures.
         seed: of the order of prompts.
-        tare: s.
-        trigger: N.
+        tare: duration of the tare, s.
+        trigger: force above which a window begins with ``labels=none``, N.
         scale: N per unit.
-        calibration: file.
+        calibration: calibration file.
         window: T, frames of the model.
         rate: of the model, Hz; None: 10.
-        stream: the labels have ``touch`` too.
+        stream: add the label ``touch``.
 
     Raises:
-        InputError: settings that cannot be used, or a device that does not fit the model.
+        InputError: invalid settings, or a device that does not match the model.
     """
 
     body: AbstractBody
@@ -100,7 +100,7 @@ class Serial(AbstractWired):
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
         self._settings: dict[str, Any] = {name: getattr(self, name) for name in _AS_OPENED}
         self._settings["limits"] = None if self.limits is None else tuple(self.limits)
-        PortSettings(**self._settings)  # refuses what cannot be used
+        PortSettings(**self._settings)  # checks them
         self.rate = 10.0 if self.rate is None else float(self.rate)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
@@ -111,11 +111,11 @@ class Serial(AbstractWired):
             self._known.fits(len(self.sensors))
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the gestures, read when first asked for; labels are None where nobody knows them."""
+        """Return the gestures, read at the first call; labels are None if unknown."""
         return self.recording(split).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the gestures of ``test``, read when first asked for."""
+        """Return the gestures of ``test``, read at the first call."""
         if split != "test":
             raise InputError(
                 f"device=serial has the split test alone, not {split or 'a budget'}: record a session with "
@@ -126,14 +126,14 @@ class Serial(AbstractWired):
         return self._recording
 
     def blank(self) -> AbstractDevice:
-        """Return a device whose touches have the same shape and are 0: a run is restored without a touch."""
+        """Return a device with touches of the same shapes that are 0, so that no touch is read."""
         assert self.rate is not None
         empty = torch.zeros(1, self.window, len(self.sensors))
         touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)
         return Blank(self.task, self.size, touches)
 
     def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
-        """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
+        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
         if self.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
         listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
@@ -142,12 +142,12 @@ class Serial(AbstractWired):
         ), listener
 
     def source(self) -> Source:
-        """Open the port, and wait for a skin that is unplugged."""
+        """Open the port as a stream of frames; wait for an unplugged skin."""
         skin, _ = self.open(reconnect=True)
         return Source(str(self.port), skin, self.taring(skin))
 
     def warm_up(self, skin: Skin) -> tuple[list[Frame], UnitConversion]:
-        """Return the first frames and what values mean: is the device fast enough, what is it untouched?"""
+        """Read the first frames: check the rate and take the baseline."""
         assert self.rate is not None
         tare = self.taring(skin)
         try:
@@ -158,15 +158,15 @@ class Serial(AbstractWired):
         return frames, tare.conversion
 
     def taring(self, skin: Skin) -> Tare:
-        """Return what finds out what the values of an open skin mean."""
+        """Return the tare of an open skin."""
         assert self.rate is not None
         return Tare(self.conversion, self.tare, self.rate, lambda: skin.header)
 
     def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
-        """Return what values mean, given a baseline (S,) and what the device tells of itself.
+        """Return the conversion of values to N, given a baseline (S,) and the header of the device.
 
         Raises:
-            InputError: nobody knows what a count is worth.
+            InputError: the scale is unknown.
         """
         return unit_conversion(len(self.sensors), baseline, self.scale, self._known, header)
 
@@ -177,7 +177,7 @@ class Serial(AbstractWired):
         first: Sequence[Frame],
         done: Collection[int] = (),
     ) -> AbstractSegmenter:
-        """Return what finds the gestures of a stream, as ``labels`` says."""
+        """Return the segmenter that ``labels`` selects."""
         assert self.rate is not None
         window = Window(self.window, self.rate, len(self.sensors))
         for frame in first:
@@ -220,7 +220,7 @@ class Serial(AbstractWired):
         return Touches(known[0], known[1], self._positions, None, self.rate, saturated=known[2])
 
     def _record(self) -> Recording:
-        """Read gestures until there are enough, the skin falls silent, or a person ends it."""
+        """Read gestures until there are enough, the skin stops sending, or the user ends it."""
         gestures: list[RecordedGesture] = []
         skin, listener = self.open()
         with skin:
@@ -237,7 +237,9 @@ class Serial(AbstractWired):
                 if len(gestures) == self.gestures:
                     break
         if not gestures:
-            raise InputError("no gesture came: does the emulator announce, does something touch the skin?")
+            raise InputError(
+                "no gesture was read: does the emulator announce, does something touch the skin?"
+            )
         return self.to_recording(gestures, conversion)
 
     def _finished_gestures(self, skin: Skin, segmenter: AbstractSegmenter) -> Iterator[RecordedGesture]:
@@ -245,7 +247,7 @@ class Serial(AbstractWired):
             for frame in skin:
                 gesture = segmenter.add(frame)
                 if gesture is not None and gesture.broken:
-                    _say(f"gesture {gesture.number} broke off: the device started anew")
+                    _say(f"gesture {gesture.number} was interrupted: the device restarted")
                 elif gesture is not None:
                     yield gesture
                 if segmenter.over:
@@ -255,5 +257,5 @@ class Serial(AbstractWired):
 
 
 def _say(text: str) -> None:
-    """Tell the person at the skin; results go to standard output."""
+    """Print a message for the user; results go to standard output."""
     print(text, file=sys.stderr, flush=True)

@@ -40,33 +40,33 @@ _VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__vers
 
 @dataclass(kw_only=True, eq=False)
 class Simulated(ImperfectionSettings, AbstractSimulated):
-    """Yields gestures sampled from seeds alone, as a device with imperfections feels them.
+    """Yields simulated gestures, measured by a device with imperfections.
 
     Training, validation and holdout are 80/10/10 of one budget of gestures; test gestures come from a stream
-    of randomness that no training seed can draw, and are the same for all of them.
+    of randomness that no training seed can select, and are the same for all seeds.
 
     Args:
-        body, layout: the sheet, and where its sensors are.
+        body, layout: the sheet, and the positions of its sensors.
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
-        contact: ``contact(body, simulator)`` makes pressure of them.
+        contact: ``contact(body, simulator)`` gives the pressure of a gesture.
         touch: difficulty of the gestures (``conf/touch.yaml``).
-        gestures, test_gestures: how many the budget and ``test`` have.
+        gestures, test_gestures: number of gestures of the budget and of ``test``.
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
-        stream: touches are windows of streams of gestures with idle gaps between them: a window shows part
-            of a gesture, a whole one or none, and has the label ``touch`` too. Each split has its own.
+        stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
+            of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
         direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
-        data_seed: what the budget is drawn from.
-        seed: what the device's constants and the noise are drawn from: another number, another device.
+        data_seed: seed of the budget.
+        seed: seed of the device's constants and noise; each seed is another device.
         gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`.
-        calibration: file of skin calibrate, which takes the place of all these but dead, tare and rate.
-        randomise: every gesture is felt by a device of its own.
-        position_error: standard deviation of the true sensors' places about those that touches report, m.
-        track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``oracle`` (what the
-            simulator knows) or ``estimated`` from readings; both need sensors that move along the sheet.
+        calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
+        randomise: measure every gesture with another device.
+        position_error: standard deviation of the true sensor positions from the reported ones, m.
+        track: motion of the sensors in touches (docs/adr/0007): ``none``, ``oracle`` (from the simulator) or
+            ``estimated`` from readings; both need sensors that move along the sheet.
 
     Raises:
-        InputError: settings that cannot be used.
+        InputError: invalid settings.
     """
 
     body: AbstractBody
@@ -104,7 +104,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self._kept: dict[str, Recording] = {}
 
     def _refuse(self) -> None:
-        """Refuse settings that cannot be used, or not together."""
+        """Check the settings, and combinations that are not possible."""
         check_settings(
             type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device"
         )
@@ -118,12 +118,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return TouchSampler(body, body.footprints(sensors), contact, self.touch, self.padded)
 
     def _tracker(self) -> Tracker:
-        """Return what tells how far sensors have moved."""
+        """Return the tracker that ``track`` selects."""
         if self.track == "none":
             return Tracker()
         if self.track == "oracle":
             return oracle(self.model, self.body.shape)
-        # As for a real skin: nobody knows where its sensors truly are or how its layers vary.
+        # As for a real skin, whose true sensor positions and layer variations are unknown.
         body = replace(self.body, variation=0.0)
         model = self.simulator(body, self.sensors)
         sampler = self._sampler(body, self.sensors, model)
@@ -140,7 +140,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return replace(self, **changes)
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the touches of a split; fixed ones are drawn once and kept."""
+        """Return the touches of a split; those that do not depend on the epoch are cached."""
         return self._split(split, epoch, complete=False).touches
 
     def fresh_touches(self, count: int) -> Touches:
@@ -213,7 +213,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     @torch.no_grad()
     def strip(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Strip:
-        """Return a test stream in one piece; without ``gap``, [least, most], as ``touch.gap`` says."""
+        """Return a continuous test stream; ``gap`` [least, most] defaults to ``touch.gap``."""
         if self.randomise:
             return self.replace(randomise=False).strip(frames, gap, number)
         key = Stream.TEST, 1, number
@@ -222,7 +222,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return Strip(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
 
     def _true(self, movie: Movie, complete: bool) -> Recording:
-        """Return gestures as perfect sensors read them; ``complete`` adds displacements and strains."""
+        """Return the true readings of gestures; ``complete`` adds displacements and strains."""
         readings, displacement = self.model.respond(movie, displacement=complete)
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
@@ -237,7 +237,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return Recording(touches, *about, movie.force, displacement, movie.parameters | known)
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
-        """Return true readings as the device tells them."""
+        """Return true readings with the imperfections of the device."""
         force, constants = true.touches.readings, self.constants
         if self.randomise:
             constants = self.imperfection.constants(len(self.sensors), noise, len(true))

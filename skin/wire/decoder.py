@@ -1,4 +1,4 @@
-"""From bytes to frames, without input or output."""
+"""Decode bytes into frames, without input or output."""
 
 import numpy as np
 
@@ -18,26 +18,26 @@ from skin.wire.text import Header, parse_header
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
-_PAUSE = 0.2  # s: what a silence counts for, because a board may take seconds to start
+_PAUSE = 0.2  # s that a silence counts for at most, because a board may take seconds to start
 _PER_FIELD = 12  # bytes
 _SPAN = 2.0  # s over which good frames are compared with bad ones
-_FEW = 3  # bad frames that say nothing yet
+_FEW = 3  # bad frames, too few for a conclusion
 
 
 class Decoder:
-    """Turns bytes into frames; resynchronises at the next delimiter and never raises for what it is fed.
+    """Decodes bytes into frames; resynchronises at the next delimiter and never raises for its input.
 
-    The format is found by itself (two binary frames with a right CRC, or three lines of one field count)
-    and kept. Without a CRC, what comes before the first delimiter is left out, for it may look whole.
+    The format is detected (two binary frames with a correct CRC, or three lines with equal numbers of fields)
+    and then kept. Without a CRC, the bytes before the first delimiter are skipped: they may be half a frame.
 
     Args:
-        sensors: S; None learns it from the header or from eight lines.
+        sensors: S; None: taken from the header or from eight lines.
         format: ``auto``, ``text`` or ``binary``.
 
     Attributes:
-        counters: what was seen; kept by :meth:`restart`.
+        counters: numbers of frames and errors; kept by :meth:`restart`.
         frame_format: the format, once it is known.
-        header: what the device tells of itself, if it does.
+        header: of the device; None until it sends one.
     """
 
     def __init__(self, sensors: int | None = None, format: Format = "auto") -> None:
@@ -57,7 +57,7 @@ class Decoder:
         self._missing = 0
 
     def restart(self, after: After = "reconnect") -> None:
-        """Begin with another connection: find the format anew, demand the same number of sensors."""
+        """Start another connection: detect the format again, with the same number of sensors."""
         self._begin()
         self._order.cut(after)
 
@@ -70,7 +70,7 @@ class Decoder:
         """
         self.counters.bytes += len(data)
         if self.frame_format is None:
-            # Where nothing is recognised for long, only the latest is searched.
+            # Bounds the search while no format is recognised.
             self._buffer = self._buffer[-2 * self._enough :]
         self._buffer += data
         if self.frame_format is None and not self._recognise(data, now):
@@ -85,7 +85,7 @@ class Decoder:
         return frames
 
     def error(self) -> InputError | None:
-        """Return why nothing can be read, once 2 s of receiving or 4 kB (or four frames) show no format."""
+        """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None."""
         if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
             return None
         return detection_error(self._buffer, self._found, self.sensors)
@@ -96,7 +96,7 @@ class Decoder:
         return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
 
     def _recognise(self, data: bytes, now: float) -> bool:
-        """Keep the beginning until it shows its format; it is decoded again from its first byte then."""
+        """Buffer the first bytes until they show the format; they are then decoded from the first one on."""
         passed = now - self._fed_at
         self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
         self._fed_at = now
@@ -164,7 +164,7 @@ class _Quality:
     """Compares good with bad frames over two seconds at a time.
 
     Attributes:
-        trouble: the sentence for a person; empty while most frames are good.
+        trouble: a message; empty while most frames are good.
     """
 
     def __init__(self) -> None:
@@ -174,11 +174,11 @@ class _Quality:
         self._latest = FrameError("")
 
     def note(self, bad: FrameError) -> None:
-        """Keep what the latest bad frame was like."""
+        """Remember the latest bad frame."""
         self._latest = bad
 
     def count(self, now: float, good: int, bad: int) -> None:
-        """Add what came by ``now``, s."""
+        """Add the numbers of frames received by ``now``, s."""
         self._since = now if self._since is None else self._since
         self._good += good
         self._bad += bad

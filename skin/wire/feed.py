@@ -1,4 +1,4 @@
-"""Sources of frames for the reader thread: a byte stream or a recording."""
+"""Feeds of frames for the reader thread: a byte stream or a recording."""
 
 import logging
 from collections import Counter
@@ -29,26 +29,26 @@ _WEAK = {
 
 
 class Feed(Protocol):
-    """Frames one after another.
+    """A sequence of frames.
 
     Attributes:
-        patient: it can wait, so that no frame needs to be dropped.
+        patient: the feed can wait, so no frame needs to be dropped.
     """
 
     patient: bool
 
     def poll(self) -> list[Frame]:
-        """Return what came within about 0.1 s; OSError once it is unplugged, EOFError at its end."""
+        """Return the frames of about 0.1 s; OSError once it is unplugged, EOFError at its end."""
 
     def states(self) -> tuple[ChannelState, ...]:
-        """Return what is wrong with each channel."""
+        """Return the state of each channel."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the feed."""
 
 
 class WireFeed:
-    """Frames from bytes, their channels judged; says in the log once a second what was wrong.
+    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
 
     Args:
         stream: of bytes.
@@ -76,14 +76,17 @@ class WireFeed:
         self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
 
     def poll(self) -> list[Frame]:
-        """Return the frames that ended in what came; InputError if nothing can be read at all, OSError if
-        nothing came for too long.
+        """Return the frames received since the last call.
+
+        Raises:
+            InputError: no format is detected, or the device's clock stands still.
+            OSError: the stream is closed, or silent for too long.
         """
         data, now = self._stream.read(), monotonic()
         if data:
             self._heard_at = now
         elif now - self._heard_at >= self._silence:
-            raise TimeoutError(f"nothing came for {self._silence:g} s")
+            raise TimeoutError(f"nothing received for {self._silence:g} s")
         frames = self._decoder.feed(data, now) if data else []
         if frames:
             self._prepare()
@@ -95,7 +98,7 @@ class WireFeed:
         return [self._judged(frame) for frame in frames]
 
     def states(self) -> tuple[ChannelState, ...]:
-        """Return what is wrong with each channel."""
+        """Return the state of each channel."""
         return self._health.states()
 
     def close(self) -> None:
@@ -103,7 +106,7 @@ class WireFeed:
         self._stream.close()
 
     def _prepare(self) -> None:
-        """Say once what protects the frames; take limits from the header whenever it comes."""
+        """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
         frame_format, header = self._decoder.frame_format, self._decoder.header
         if not self._told and frame_format is not None and frame_format.check in _WEAK:
             _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[frame_format.check])
@@ -114,7 +117,7 @@ class WireFeed:
             self._health.limits = (None, 2**header.bits - 1)
 
     def _check_clock(self, frames: list[Frame], now: float) -> None:
-        """Raise InputError where frames come and the device's clock does not move."""
+        """Raise InputError if frames arrive but the device's clock stands still."""
         if frames[-1].t != self._clock:
             self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
         self._clock_frames += len(frames)
@@ -138,12 +141,12 @@ class WireFeed:
 
 
 class PlaybackFeed:
-    """Frames from memory, in real time or as fast as they are taken.
+    """Frames from memory, in real time or as fast as they are read.
 
     Args:
         pieces: values, valid and saturated, (F, S) each, of each piece; a window should not span two of them.
         rate: frames per second, Hz.
-        realtime: False: as fast as they are taken.
+        realtime: False: as fast as they are read.
     """
 
     def __init__(self, pieces: Iterable[Piece], rate: float, realtime: bool = True) -> None:
@@ -176,7 +179,7 @@ class PlaybackFeed:
         return frames
 
     def states(self) -> tuple[ChannelState, ...]:
-        """Return nothing: what a file says is valid is in its frames."""
+        """Return nothing: the frames of a file already have masks of valid values."""
         return ()
 
     def close(self) -> None:

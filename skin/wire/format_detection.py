@@ -1,4 +1,4 @@
-"""Detect the protocol of a device: two binary frames or three lines of one field count decide."""
+"""Detect the format of a device from two binary frames or three lines with equal numbers of fields."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,12 +17,12 @@ from skin.wire.text import Header, Line, parse_header, parse_line
 Format = Literal["auto", "text", "binary"]
 
 _LINES, _FRAMES = 3, 2
-_LINES_UNKNOWN = 8  # noise counts upwards in three lines by chance, hardly in eight
-_STEP = 1000  # frames that may be missing between two lines that still count
+_LINES_UNKNOWN = 8  # three lines of noise may count upwards by chance, eight hardly
+_STEP = 1000  # frames that may be missing between two consecutive lines
 
 
 class RawFrame(NamedTuple):
-    """What one frame says: seq (or None), the device's clock (microseconds, or None), values (S,)."""
+    """Content of one frame: seq (or None), the device's clock (microseconds, or None), values (S,)."""
 
     seq: int | None
     t_us: float | None
@@ -30,12 +30,12 @@ class RawFrame(NamedTuple):
 
 
 class FrameFormat(Protocol):
-    """A format with all that had to be learnt of it.
+    """A detected format.
 
     Attributes:
         name: ``text`` or ``binary``.
-        delimiter: what ends a frame.
-        check: what protects it.
+        delimiter: the end of a frame.
+        check: kind of its checksum.
         sensors: S.
     """
 
@@ -48,10 +48,10 @@ class FrameFormat(Protocol):
     @property
     def sensors(self) -> int: ...
     def read(self, piece: bytes) -> RawFrame | None:
-        """Return what a piece between two delimiters says, None for a comment or nothing; or FrameError."""
+        """Return the frame between two delimiters; None for a comment or an empty piece; or FrameError."""
 
     def comment(self, piece: bytes) -> bytes | None:
-        """Return a piece as a comment line; None if it is none."""
+        """Return a piece as a comment line; None if it is not a comment."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class TextFormat:
     delimiter: ClassVar[bytes] = b"\n"
 
     def read(self, piece: bytes) -> RawFrame | None:
-        """Return what a line says."""
+        """Return the frame in a line."""
         line = piece.removesuffix(b"\r")
         if not line or line.startswith(b"#"):
             return None
@@ -82,7 +82,7 @@ class TextFormat:
         return RawFrame(int(seq), t_us, np.array(fields[2:]))
 
     def comment(self, piece: bytes) -> bytes | None:
-        """Return a comment line."""
+        """Return the comment line; None if it is not a comment."""
         return piece.removesuffix(b"\r") if piece.startswith(b"#") else None
 
 
@@ -96,7 +96,7 @@ class BinaryFormat:
     check: ClassVar[Check] = "crc16"
 
     def read(self, piece: bytes) -> RawFrame | None:
-        """Return what stands between two zeros."""
+        """Return the frame between two zeros."""
         if not piece or self.comment(piece) is not None:
             return None
         seq, t_us, values = decode_frame(piece)
@@ -105,18 +105,18 @@ class BinaryFormat:
         return RawFrame(seq, t_us, values)
 
     def comment(self, piece: bytes) -> bytes | None:
-        """Return the text of a comment."""
+        """Return the text of a comment; None if it is not a comment."""
         return decode_comment(piece)
 
 
 @dataclass(frozen=True)
 class DetectionResult:
-    """What a beginning tells.
+    """Result of :func:`detect_format`.
 
     Attributes:
-        frame_format: the format, or None if it cannot be told yet.
-        sensors: how many values frames hold that read well but do not fit; or None.
-        header: the last one.
+        frame_format: the format, or None if it is not known yet.
+        sensors: number of values in readable frames that do not match the layout; or None.
+        header: the last one received.
     """
 
     frame_format: FrameFormat | None
@@ -125,11 +125,11 @@ class DetectionResult:
 
 
 def detect_format(data: bytes, sensors: int | None, wanted: Format) -> DetectionResult:
-    """Return what the first bytes of a connection tell.
+    """Detect the format from the first bytes of a connection.
 
     Args:
-        data: from the first byte on; a piece without its end is left out.
-        sensors: S, or None to learn it.
+        data: from the first byte on; an incomplete piece at the end is ignored.
+        sensors: S, or None to detect it.
         wanted: only this format, or ``auto``.
     """
     other = None
@@ -145,7 +145,7 @@ def detect_format(data: bytes, sensors: int | None, wanted: Format) -> Detection
 
 
 def detection_error(data: bytes, found: DetectionResult, sensors: int | None) -> InputError:
-    """Return why nothing can be read, and what to change."""
+    """Return the error for data in which no format was detected."""
     if _still(run := _lines(data)):
         return stopped_clock_error(len(run), run[0].fields[1])
     if found.sensors is not None and sensors is not None:
@@ -160,7 +160,7 @@ def detection_error(data: bytes, found: DetectionResult, sensors: int | None) ->
 
 
 def stopped_clock_error(frames: int, t_us: float) -> InputError:
-    """Return why frames cannot be used whose clock does not move: no window would ever fill."""
+    """Return the error for frames whose clock does not move: no window would ever fill."""
     return InputError(
         f"the device's clock stands still: t_us was {t_us:.0f} in all of {frames} frames; let the firmware "
         "send micros(), or lines of values alone"
@@ -168,7 +168,7 @@ def stopped_clock_error(frames: int, t_us: float) -> InputError:
 
 
 def _still(run: Sequence[Line]) -> bool:
-    """Return whether the first column counts while the next one, which should tell the time, is constant."""
+    """Return whether the first column counts while the next one, the time, is constant."""
     run = [line for line in run if len(line.fields) > 2]
     if len(run) < _LINES_UNKNOWN or len({line.fields[1] for line in run}) > 1:
         return False
@@ -216,7 +216,7 @@ def _detect_text(data: bytes, sensors: int | None, other: int | None) -> Detecti
 
 
 def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:
-    """Return the format of lines of one kind, if they tell it."""
+    """Return the format of similar lines, or None if they do not determine it."""
     if len(run) < _LINES:
         return None
     count, check = len(run[-1].fields), run[-1].check
@@ -232,7 +232,7 @@ def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat 
 
 
 def _all_count(run: Sequence[Line]) -> bool:
-    """Return whether two columns before the values count frames and tell the time."""
+    """Return whether the two columns before the values are a frame number and a time."""
     return len(run) > 1 and all(_counts(before.fields, line.fields) for before, line in pairwise(run))
 
 

@@ -1,4 +1,4 @@
-"""Which channels are usable: neither stuck nor dead; one at its limit is valid and saturated."""
+"""State of each channel: ok, saturated (valid, at its limit), stuck or dead."""
 
 from typing import Literal
 
@@ -13,20 +13,20 @@ _FAR = 20  # smallest steps of a channel: more than its noise ranges over
 
 
 class ChannelHealth:
-    """Judges channels frame by frame.
+    """Checks channels frame by frame.
 
-    A value at a limit is saturated, and valid: the force is at least that. A channel that does not change at
-    all for five seconds in which most others kept changing is stuck, or dead if it never changed. Where the
-    noise of an untouched skin is below one count, neither can be told, and neither is. One change, and the
-    channel counts again. A channel that stays at the largest value that it ever sent, far above its smallest,
-    has a limit that nobody told: it is saturated, not stuck, because a held press must not be masked.
+    A value at a limit is saturated and valid: the force is at least that. A channel that does not change for
+    five seconds while most others do is stuck, or dead if it has never changed. Neither state is detected if
+    the noise of the untouched skin is below one count. A single change makes the channel valid again. A
+    channel that stays at the largest value it has ever sent, far above its smallest, is saturated at an
+    unknown limit rather than stuck, because a held press must not be masked.
 
     Args:
-        limits: smallest and largest value a channel can send; None where a value at rest may lie there, as
-            at 0 of a resistor that conducts only under load.
+        limits: smallest and largest value of a channel; None where an untouched channel may have this value,
+            such as 0 of a resistor that conducts only under load.
 
     Attributes:
-        limits: as given; another value holds from the next frame on.
+        limits: as given; a new value applies from the next frame on.
     """
 
     def __init__(self, limits: Limits = (None, None)) -> None:
@@ -36,7 +36,7 @@ class ChannelHealth:
         self._ever, self._smallest = np.zeros(0, dtype=bool), np.zeros(0)
 
     def restart(self) -> None:
-        """Forget times: the device started anew. What channels can send stays known."""
+        """Reset the times after a restart of the device; the known range of each channel is kept."""
         self._begin_time = True
 
     def check(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -72,7 +72,7 @@ class ChannelHealth:
         return ~self._silent, self._saturated
 
     def states(self) -> tuple[ChannelState, ...]:
-        """Return what is wrong with each channel as of the last frame; empty before the first."""
+        """Return the state of each channel at the last frame; empty before the first."""
         if self._last is None:
             return ()
         dead = self._silent & ~self._ever

@@ -1,4 +1,4 @@
-"""Open a skin: a serial port, a socket, a recording or the simulator."""
+"""Open a skin at a serial port or socket, a recording, or the simulator."""
 
 from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ _STRIP = 600.0  # s of simulated touches in one piece
 
 
 class Streamed(Protocol):
-    """A device whose touches come in streams, such as :class:`skin.device.simulated.Simulated`."""
+    """A device that simulates streams of touches, such as :class:`skin.device.simulated.Simulated`."""
 
     rate: float
 
@@ -45,24 +45,24 @@ def _ordered(limits: Limits) -> Limits:
 @checked("device")
 @dataclass(frozen=True, kw_only=True)
 class PortSettings:
-    """How a skin is read.
+    """Settings of :func:`open_skin`.
 
     Args:
         baudrate: bits per second, for serial ports.
         format: ``auto``, ``text`` or ``binary``.
         limits: smallest and largest value of a channel, as in :class:`skin.wire.health.ChannelHealth`; None:
             the largest count, if the header gives the bits.
-        timeout: s without a frame after which iterating and reading give up.
-        queue: frames that are kept for whoever is late.
-        reconnect: wait for an unplugged skin; its first frame has ``after="reconnect"``.
+        timeout: s without a frame after which iterating and reading raise ``SkinTimeout``.
+        queue: number of frames that are buffered.
+        reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
         backoff: s before the first attempt to reconnect, and the longest between two.
         silence: s without a byte after which a socket is closed and opened again, if ``reconnect``; None or
-            0: never. A computer that lost its power cannot say that it is gone. Serial ports are left open:
-            the system tells when one is unplugged, and opening one restarts many boards.
-        realtime: False plays a recording or the simulator as fast as frames are taken.
+            0: never. A computer that lost its power closes no connection. Serial ports are left open: the
+            system reports when one is unplugged, and opening one restarts many boards.
+        realtime: False plays a recording or the simulator as fast as frames are read.
 
     Raises:
-        InputError: a setting that cannot be used.
+        InputError: a setting is invalid.
     """
 
     baudrate: PositiveInt = 115200
@@ -90,9 +90,9 @@ def open_skin(
     Args:
         port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:number``, a recording (``x.parquet``, ``x.csv``) or
             ``simulated``.
-        layout: the sensors (anything with a length); None learns their number.
-        opener: opens the stream of bytes instead, and again after each unplugging.
-        device: what ``simulated`` plays.
+        layout: the sensors (anything with a length); None: their number is detected.
+        opener: opens the stream of bytes instead of ``port``, and again after each disconnection.
+        device: the device that ``simulated`` plays.
         baseline: (S,), from an earlier tare.
         settings: as in :class:`PortSettings`.
 
@@ -124,9 +124,9 @@ def open_skin(
 def _wire(
     opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float
 ) -> Callable[[], Feed]:
-    """Return what connects; from the second time on the decoder begins anew.
+    """Return a function that connects; from the second call on it restarts the decoder.
 
-    What channels can send stays known: a cable may come loose under a press that drives them to their limit.
+    The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
     """
     connections, health = count(), ChannelHealth()
 
@@ -145,7 +145,7 @@ def _player(player: PlaybackFeed) -> Callable[[], Feed]:
 
 
 def _recorded(path: str, sensors: int | None, realtime: bool) -> PlaybackFeed:
-    # Here, because it brings torch, which a wire does not need.
+    # Imported here because it imports torch, which reading a port does not need.
     from skin.recording_file import read_recording
 
     touches = read_recording(path).touches

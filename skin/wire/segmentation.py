@@ -28,13 +28,13 @@ class RecordedGesture:
 
     Attributes:
         number: of the gesture.
-        labels: name -> 0 or 1; None where nobody knows.
-        begin: of the window, s, the device's clock.
+        labels: name -> 0 or 1; None if unknown.
+        begin: start of the window, s, by the device's clock.
         segment: of the device's clock.
         frames: of the window.
-        lost: frames that are known to be missing in it.
-        broken: the device started anew within it: it cannot be used.
-        resampled: the window at the model's rate, in the device's unit; None until it is over.
+        lost: number of frames known to be missing.
+        broken: the device restarted within the window, so it cannot be used.
+        resampled: the window at the model's rate, in the device's unit; None until it is complete.
     """
 
     number: int
@@ -61,24 +61,24 @@ def label_text(labels: Labels) -> str:
 
 
 def typed_lines(file: int) -> Iterator[str]:
-    """Yield the lines that a person types into an open file."""
+    """Yield the lines typed into an open file."""
     rest = b""
-    # Not from sys.stdin: a thread that waits there cannot be left when the program ends.
+    # Not sys.stdin: a thread that blocks there would keep the program from ending.
     while data := os.read(file, 1024):
         *lines, rest = (rest + data).split(b"\n")
         yield from (line.decode(errors="replace") for line in lines)
 
 
 class AbstractSegmenter(ABC):
-    """Is shown every frame and says which make a gesture.
+    """Segments a stream of frames into gestures.
 
     Args:
-        window: of the model; frames that came before the first one shown may have been added to it.
+        window: of the model; it may already contain earlier frames.
 
     Attributes:
         window: as given.
-        gesture: the window that is being filled; None between two.
-        over: nothing more will come.
+        gesture: the gesture that is being recorded; None between two.
+        over: no more gestures follow.
     """
 
     def __init__(self, window: Window) -> None:
@@ -87,7 +87,7 @@ class AbstractSegmenter(ABC):
         self.over = False
 
     def add(self, frame: Frame) -> RecordedGesture | None:
-        """Take a frame; return the gesture whose window ended before it, or one that broke off."""
+        """Add a frame; return the gesture whose window ended before it, complete or broken; else None."""
         done = self._close(frame)
         if done is not None and not done.broken:
             done.resampled = self.window.since(done.begin)
@@ -112,19 +112,19 @@ class AbstractSegmenter(ABC):
 
     @abstractmethod
     def _begin(self, frame: Frame) -> RecordedGesture | None:
-        """Return a window that begins with this frame, if one does."""
+        """Return the gesture that begins with this frame, or None."""
 
 
 class AnnouncedSegmenter(AbstractSegmenter):
-    """Takes the windows and labels that an emulated skin announces.
+    """Segments by the windows and labels that an emulated skin announces.
 
     Args:
         window: as in :class:`AbstractSegmenter`.
-        listener: what hears the announcements.
-        task: the labels that are wanted; ``touch`` is always true.
+        listener: collects the announcements.
+        task: the required labels; ``touch`` is always 1.
 
     Raises:
-        InputError: on a frame without a number, or an announcement without a label.
+        InputError: a frame without a number, or an announcement without a required label.
     """
 
     def __init__(self, window: Window, listener: AnnouncementListener, task: Task) -> None:
@@ -135,30 +135,31 @@ class AnnouncedSegmenter(AbstractSegmenter):
         if frame.seq is None:
             raise InputError("announcements need frames with numbers: give device.labels=prompted")
         while self._announcements:
-            said = self._announcements[0]
-            if frame.seq < said.seq:
+            announced = self._announcements[0]
+            if frame.seq < announced.seq:
                 return None
             self._announcements.popleft()
-            # Of one that began long before somebody listened the rest is no gesture.
-            if frame.seq <= said.seq + _LATE * said.frames:
-                begin = frame.t - (frame.seq - said.seq) * self._length / said.frames
-                labels = {"touch": 1} | dict(said.labels)
+            # Most of a gesture that began long before the port was opened is missing.
+            if frame.seq <= announced.seq + _LATE * announced.frames:
+                late = frame.seq - announced.seq
+                begin = frame.t - late * self._length / announced.frames
+                labels = {"touch": 1} | dict(announced.labels)
                 if missing := [name for name in self._task.names if name not in labels]:
                     raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
                 known = {name: labels[name] for name in self._task.names}
-                return RecordedGesture(said.number, known, begin, frame.segment, lost=frame.seq - said.seq)
+                return RecordedGesture(announced.number, known, begin, frame.segment, lost=late)
         return None
 
 
 class PromptedSegmenter(AbstractSegmenter):
-    """Asks a person for each gesture and begins when Enter is pressed: s skips one, q ends.
+    """Prompts for each gesture, which begins when Enter is pressed: s skips one, q ends.
 
     Args:
         window: as in :class:`AbstractSegmenter`.
         wanted: (number, labels) of the gestures.
-        notify: says a sentence to the person.
-        lines: what the person types; None: standard input. What is typed before it is asked for counts,
-            unless it comes from a keyboard.
+        notify: called with each message for the user.
+        lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
+            keyboard.
     """
 
     def __init__(
@@ -174,7 +175,7 @@ class PromptedSegmenter(AbstractSegmenter):
         self._asked: tuple[int, Labels] | None = None
         self._over_now = False
         self._hasty = lines is None and sys.stdin.isatty()
-        # A thread, because frames come while a person thinks.
+        # A thread, because frames arrive while the program waits for a line.
         Thread(target=self._listen, args=(lines or typed_lines(sys.stdin.fileno()),), daemon=True).start()
 
     def _listen(self, lines: Iterator[str]) -> None:
@@ -185,15 +186,15 @@ class PromptedSegmenter(AbstractSegmenter):
 
     def _close(self, frame: Frame) -> RecordedGesture | None:
         done = super()._close(frame)
-        # The next one is asked for a frame later, so that what is said of this one is said before.
+        # Prompt one frame later, so that the message about this gesture is printed first.
         self._over_now = done is not None
         return done
 
     def add(self, frame: Frame) -> RecordedGesture | None:
-        """As above; a gesture that broke off is asked for again."""
+        """As in the base class; prompts again for a broken gesture."""
         done = super().add(frame)
         if done is not None and done.broken and done.labels is not None:
-            self._notify("that one broke off: the skin was unplugged or started anew")
+            self._notify("the gesture was interrupted: the skin was unplugged or restarted")
             self._ask((done.number, done.labels))
         return done
 
@@ -207,32 +208,32 @@ class PromptedSegmenter(AbstractSegmenter):
                 return None
             self._ask(following)
         try:
-            said = self._typed.get_nowait()
+            line = self._typed.get_nowait()
         except Empty:
             return None
         number, labels = self._asked or (0, {})
         self._asked = None
-        self.over = said == "q"
-        if said in ("q", "s"):
+        self.over = line == "q"
+        if line in ("q", "s"):
             return None
         self._notify(f"  now: {self._length:g} s")
         return RecordedGesture(number, labels, frame.t, frame.segment)
 
-    def _ask(self, asked: tuple[int, Labels]) -> None:
-        self._asked = asked
-        # Enter pressed twice is no second gesture.
+    def _ask(self, gesture: tuple[int, Labels]) -> None:
+        self._asked = gesture
+        # Pressing Enter twice must not start the next gesture.
         while self._hasty and not self._typed.empty():
             self._typed.get_nowait()
-        self._notify(f"next: {label_text(asked[1])} - press Enter, then touch; s skips it, q ends")
+        self._notify(f"next: {label_text(gesture[1])} - press Enter, then touch; s skips it, q ends")
 
 
 class ContinuousSegmenter(AbstractSegmenter):
-    """Takes windows one after the other, without labels.
+    """Segments into consecutive windows without labels.
 
     Args:
         window: as in :class:`AbstractSegmenter`.
         first: number of the first.
-        wanted: asked of every frame that could begin a window; None: each does.
+        wanted: whether a frame's values may begin a window; None: any frame may.
     """
 
     def __init__(

@@ -167,7 +167,7 @@ def test_a_half_open_socket_is_opened_anew(record, tmp_path):
     with skin({"frames": 400}, {}) as port:
         done = record(*FREE, port, "seconds=8", "device.silence=0.5")
     assert done.returncode == 0, done.stderr
-    assert "the skin was unplugged (nothing came for 0.5 s); trying again" in done.stderr
+    assert "the skin was unplugged (nothing received for 0.5 s); trying again" in done.stderr
     text = (tmp_path / "s.csv").read_text()
     assert text.count('"event": "gap", "after": "reconnect"') == 1
     whole = len(read_recording(tmp_path / "s.parquet"))
@@ -177,7 +177,7 @@ def test_a_half_open_socket_is_opened_anew(record, tmp_path):
 @pytest.mark.parametrize(
     ("lives", "reason"),
     [
-        ([{"frames": 0}], r"^socket://\S+: 0 of 1 frames came within 1 s: port open, nothing received"),
+        ([{"frames": 0}], r"^socket://\S+: 0 of 1 frames arrived within 1 s: port open, nothing received"),
         ([{"period": 0}], "the device's clock stands still: t_us was 0 in all of"),
         ([{"frames": 400}, {"sensors": 3}], "sends 3 values per frame, the layout has 4 sensors"),
     ],

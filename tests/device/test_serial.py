@@ -52,7 +52,7 @@ def emulate():
         emulator.stop()
         thread.join(20)
         assert not thread.is_alive()
-        emulator.outlet.unplug()
+        emulator.port.unplug()
 
 
 def serial(port, layout=LAYOUT, **settings):

@@ -37,7 +37,9 @@ def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
             check=False,
         )
     assert done.returncode == 2
-    assert done.stderr == f"{plug.port} is in use: close the serial monitor, or whatever else reads it\n"
+    assert (
+        done.stderr == f"{plug.port} is in use: close the serial monitor or any other program that reads it\n"
+    )
     assert not list(tmp_path.glob("s.csv*"))
 
 

@@ -45,7 +45,7 @@ def test_a_hand_that_rests_is_seen_against_the_old_baseline():
     values, before = idle(), np.linspace(400, 600, 6)
     values[:, 1] += 40
     quiet_baseline(values, VALID)
-    with pytest.raises(InputError, match="channel 1 rests away"):
+    with pytest.raises(InputError, match="channel 1 differs from"):
         quiet_baseline(values, VALID, before)
     quiet_baseline(values, VALID, before, touch=50)
 

@@ -88,7 +88,7 @@ def test_a_device_may_tell_its_unit_a_little_late():
     )
     watch = Watch(tare)
     assert watch(frames(noisy(1))[0]) is None
-    assert watch.status == "waiting for the device to tell its unit"
+    assert watch.status == "waiting for the header of the device"
     told.append(Header(unit="N"))
     assert watch(frames(noisy(1), start=0.5)[0]) is not None
 

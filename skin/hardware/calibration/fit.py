@@ -9,7 +9,7 @@ import torch
 from skin.errors import InputError
 from skin.hardware.calibration import _channel
 from skin.hardware.calibration._channel import Idle
-from skin.hardware.calibration.bench import Bench
+from skin.hardware.calibration.bench_data import BenchData
 from skin.sensor_dynamics import first_order_lag, running_peak
 from skin.signal.calibration import Calibration
 
@@ -33,7 +33,7 @@ class _Channel:
     broken: str | None = None
 
 
-def fit_calibration(bench: Bench, presses: Collection[int] | None = None) -> Calibration:
+def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
     """Fit every channel to the simulated true readings of presses, never to the gauge's force.
 
     Idle frames give offset, drift and noise; the release the time constant; the loading branch the gain and
@@ -66,7 +66,7 @@ def fit_calibration(bench: Bench, presses: Collection[int] | None = None) -> Cal
     return _calibration(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
 
 
-def _at_rest(bench: Bench, number: int) -> _Channel:
+def _at_rest(bench: BenchData, number: int) -> _Channel:
     """Describe a channel's idle frames; one that never moves is broken."""
     raw = bench.session.raw
     said = raw[:, number]
@@ -86,11 +86,11 @@ def _at_rest(bench: Bench, number: int) -> _Channel:
     return _Channel(_channel.idle(bench.session.time[quiet], said[quiet], step), step)
 
 
-def _rest_taken(bench: Bench, number: int, channel: _Channel) -> np.ndarray:
+def _rest_taken(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
     return bench.session.raw[:, number] - channel.idle.offset - channel.idle.drift * bench.session.time
 
 
-def _time_constant(bench: Bench, used: np.ndarray, number: int, channel: _Channel) -> float:
+def _time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
     """Return the weighted mean over releases of presses that reach the channel, s."""
     said, time = _rest_taken(bench, number, channel), bench.session.time
     # Until it has come down from its plateau a reading says nothing of the lag.
@@ -119,7 +119,7 @@ def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> t
 
 
 def _answer(
-    bench: Bench, used: np.ndarray, number: int, channel: _Channel, felt: np.ndarray, bend: np.ndarray
+    bench: BenchData, used: np.ndarray, number: int, channel: _Channel, felt: np.ndarray, bend: np.ndarray
 ) -> None:
     """Fit gain and clip on the loading branch, hysteresis on the way back."""
     said = _rest_taken(bench, number, channel)
@@ -142,7 +142,7 @@ def _answer(
     channel.hysteresis = share if share > 2 * error else 0.0
 
 
-def _calibration(bench: Bench, channels: list[_Channel], scale: float) -> Calibration:
+def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Calibration:
     """Bring channels to N, and span ranges over those that live."""
     alive = [channel.broken is None for channel in channels]
     # Counts have a zero of their own, common to all; in N a zero has been agreed on.

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from skin.errors import InputError
-from skin.hardware.calibration.bench import Bench
+from skin.hardware.calibration.bench_data import BenchData
 from skin.hardware.calibration.fit import fit_calibration
 from skin.sensor_dynamics import first_order_lag
 from skin.signal.calibration import Calibration
@@ -43,7 +43,7 @@ class HeldOutErrors:
         return self.calibrated < min(self.simulated, self.tared)
 
 
-def hold_out(bench: Bench, share: float) -> list[int]:
+def hold_out(bench: BenchData, share: float) -> list[int]:
     """Return presses to judge by: the last of those that have the same strongest sensor, a share of all.
 
     Raises:
@@ -57,7 +57,7 @@ def hold_out(bench: Bench, share: float) -> list[int]:
     return [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
 
 
-def evaluate_held_out(bench: Bench, share: float) -> HeldOutErrors:
+def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
     """Fit without some presses, and compare the simulation of these with what was read.
 
     Args:
@@ -85,7 +85,7 @@ def evaluate_held_out(bench: Bench, share: float) -> HeldOutErrors:
     )
 
 
-def predict_session(bench: Bench, calibration: Calibration) -> np.ndarray:
+def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
     """Return what a device of this calibration would say to the presses without noise, (T, S), N."""
     imperfection = Imperfection(calibration=calibration)
     randomness = np.random.default_rng(0)
@@ -116,7 +116,7 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
         return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
 
 
-def _forces(bench: Bench, presses: Sequence[int], calibration: Calibration) -> np.ndarray:
+def _forces(bench: BenchData, presses: Sequence[int], calibration: Calibration) -> np.ndarray:
     """Return the estimated force over the gauge's, which sensors feel behind their lag, of each press."""
     force, press = bench.applied
     lag = torch.tensor([float(np.median(calibration.known("time_constant")))]).double()

@@ -7,7 +7,7 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench import Bench, simulated_bench
+from skin.hardware.calibration.bench_data import BenchData, build_bench_data
 from skin.hardware.calibration.fit import fit_calibration
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.hardware.calibration.held_out import estimate_force, evaluate_held_out
@@ -29,17 +29,17 @@ def device(**hidden) -> Simulated:
     return Simulated(body=BODY, layout=Grid(2, 3), simulator=PlatesAndBeams, gain_spread=0.2, **hidden)
 
 
-def session_of(skin: Simulated, bits: int | None = None) -> Bench:
+def session_of(skin: Simulated, bits: int | None = None) -> BenchData:
     randomness = np.random.default_rng(0)
     rows = PROTOCOL.gauge(PROTOCOL.places(skin, randomness))
-    return simulated_bench(skin, emulate_session(skin, rows, PROTOCOL, randomness, bits), None)
+    return build_bench_data(skin, emulate_session(skin, rows, PROTOCOL, randomness, bits), None)
 
 
 SLOW = {"hysteresis": 0.05, "time_constant": 0.08, "drift": 0.002, "quantum": 0.01}
 
 
 @pytest.fixture(scope="module", params=[{}, SLOW], ids=["plain", "slow"])
-def known(request) -> tuple[Simulated, Bench, Calibration]:
+def known(request) -> tuple[Simulated, BenchData, Calibration]:
     skin = device(**request.param)
     found = session_of(skin)
     return skin, found, fit_calibration(found)
@@ -146,8 +146,8 @@ def test_what_cannot_be_calibrated_is_refused():
     skin = device()
     found = session_of(skin)
     with pytest.raises(InputError, match=r"6 channels, the layout 4 sensors"):
-        simulated_bench(skin.replace(layout=Grid(2, 2)), found.session, None)
-    silent = Bench(found.session, found.gauge, found.each)
+        build_bench_data(skin.replace(layout=Grid(2, 2)), found.session, None)
+    silent = BenchData(found.session, found.gauge, found.each)
     silent.session.raw[:] = 0.05 * np.random.default_rng(0).standard_normal(silent.session.raw.shape)
     with pytest.raises(InputError, match=r"no channel answers to a press|strongest"):
         fit_calibration(silent)

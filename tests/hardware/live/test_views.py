@@ -168,7 +168,7 @@ def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
 def test_an_alarm_outlives_silence_in_every_view():
     subject = display()
     subject.set_verdict(PRESSED)
-    subject.set_verdict(None, "the device has fallen silent", alarm=True)
+    subject.set_verdict(None, "the device has stopped sending", alarm=True)
     state = subject.state()
     assert (state.verdict, state.alarm) == (None, True)
     assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0))["alarm"] is True
@@ -177,7 +177,7 @@ def test_an_alarm_outlives_silence_in_every_view():
         console.print(terminal.screen(subject, state, SkinPicture(PLACES, SIZE, 24, 4.0)))
     text = console.export_text()
     assert "DANGEROUS" in text
-    assert "fallen silent" in text
+    assert "stopped sending" in text
 
 
 def test_the_views_say_since_when_something_touches():

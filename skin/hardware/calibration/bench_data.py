@@ -18,7 +18,7 @@ _SUDDEN = 2  # frames that a release may take
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchData:
     """What was said and what presses it, frame by frame.
 
     Attributes:
@@ -89,7 +89,7 @@ class Bench:
         return found
 
 
-def simulated_bench(device: AbstractSimulated, session: BenchSession, gauge: Gauge | None) -> Bench:
+def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
     """Set a session beside the simulation of its presses on the skin as it is designed.
 
     Raises:
@@ -105,7 +105,7 @@ def simulated_bench(device: AbstractSimulated, session: BenchSession, gauge: Gau
             "recorded with, as in layout=file layout.path=FILE.csv"
         )
     model = device.simulator(device.body, device.sensors)
-    found = Bench(session, rows, per_newton(model, device.body, rows))
+    found = BenchData(session, rows, per_newton(model, device.body, rows))
     if not found.loading.any():
         raise InputError("no frame of the session falls into a press: check the clocks, see calibrate.delay")
     if found.idle.sum() < _FEWEST:

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from skin.errors import InputError as InputError
     from skin.layout.file import File as LayoutFile
     from skin.layout.grid import Grid as Grid
+    from skin.recording_file import read_recording as read_recording
     from skin.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.simulator.solid import Solid as Solid
-    from skin.storage import read as read_recording
     from skin.trained import load_run as load_run
     from skin.wire.open import open_skin as open_skin
 
@@ -32,7 +32,7 @@ _PLACES = {
     "Solid": "skin.simulator.solid",
     "load_run": "skin.trained",
     "open_skin": "skin.wire.open",
-    "read_recording": "skin.storage:read",
+    "read_recording": "skin.recording_file:read",
 }
 
 

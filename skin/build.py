@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from skin.config import plain
 from skin.device.base import AbstractDevice
 from skin.learner.base import AbstractLearner
-from skin.plausible import check, warn_of_surface
+from skin.plausibility import check_plausibility, warn_of_surface
 from skin.settings import check_groups, configured
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ def build_device(config: DictConfig) -> AbstractDevice:
     """Return the source of touches, with its body, layout and, where it has one, its simulator."""
     groups = plain(config)
     check_groups({name: groups[name] for name in ("body", "layout", "device")})
-    check(groups)
+    check_plausibility(groups)
     body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
     # Not as arguments of instantiate: it would take the dataclass of the body for a configuration.
     device: AbstractDevice = instantiate(groups["device"], _partial_=True)(body=body, layout=layout)

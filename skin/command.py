@@ -17,9 +17,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import checked
+from skin.config import validate_config
+from skin.error_messages import JobInputError, to_input_error
 from skin.paths import CONF
-from skin.refusal import Refused, refusal
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
 
@@ -41,13 +41,13 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         def job(config: DictConfig) -> Any:
             started.append(True)
             try:
-                return task(checked(config))
+                return task(validate_config(config))
             except Exception as error:
-                refused = refusal(error)
+                refused = to_input_error(error)
                 if refused is None:
                     raise
                 if HydraConfig.get().mode == RunMode.MULTIRUN:
-                    raise Refused(str(refused)) from error
+                    raise JobInputError(str(refused)) from error
                 print(refused, file=sys.stderr)
                 sys.exit(2)
 
@@ -55,7 +55,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             try:
                 _run(job, name, sys.argv[1:] if words is None else words)
             except Exception as error:
-                refused = refusal(error)
+                refused = to_input_error(error)
                 if refused is None or "HYDRA_FULL_ERROR" in os.environ:
                     raise
                 print(refused, file=sys.stderr)

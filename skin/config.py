@@ -13,9 +13,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from skin.error_messages import one_line
 from skin.errors import InputError
-from skin.identity import digest
-from skin.refusal import sentence
+from skin.fingerprint import config_hash
 
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
@@ -114,7 +114,7 @@ class Config:
     peers: dict[str, Any] | None = None
 
 
-def checked(config: DictConfig) -> DictConfig:
+def validate_config(config: DictConfig) -> DictConfig:
     """Return a configuration that fits the schema, read-only.
 
     Raises:
@@ -123,7 +123,7 @@ def checked(config: DictConfig) -> DictConfig:
     try:
         whole = OmegaConf.merge(OmegaConf.structured(Config), config)
     except OmegaConfBaseException as error:
-        raise InputError(sentence(error)) from error
+        raise InputError(one_line(error)) from error
     assert isinstance(whole, DictConfig)
     # It would pass every comparison that is not written for it.
     for name in _not_numbers(OmegaConf.to_container(whole)):
@@ -150,7 +150,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
     try:
         return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
-        raise InputError(sentence(error)) from error
+        raise InputError(one_line(error)) from error
 
 
 def fingerprint(config: DictConfig) -> str:
@@ -158,7 +158,7 @@ def fingerprint(config: DictConfig) -> str:
     # What is not set belongs to other commands; a new command must not make every finished run look unknown.
     groups = plain(config).items()
     content = {key: value for key, value in groups if key not in _STEERING and value is not None}
-    return digest(content)
+    return config_hash(content)
 
 
 def overrides() -> list[str]:

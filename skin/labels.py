@@ -147,7 +147,7 @@ class Measures(NamedTuple):
         return torch.stack([big, dynamic, press, dangerous], dim=1).float()
 
 
-def measure(
+def measure_gestures(
     frames: Tensor,
     index: Tensor,
     scale: Tensor,
@@ -224,5 +224,5 @@ def movie_labels(
     batch, time = pressure.shape[:2]
     index = torch.arange(batch * time, device=pressure.device).view(batch, time)
     scale = torch.ones(batch, time).to(pressure)
-    measures = measure(pressure.flatten(0, 1), index, scale, footprints, cell, thresholds.contact)
+    measures = measure_gestures(pressure.flatten(0, 1), index, scale, footprints, cell, thresholds.contact)
     return measures.labels(thresholds)

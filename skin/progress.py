@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from skin.tracking import Store
 
 
-class Progress:
+class SweepProgress:
     """Counts jobs and estimates what is left.
 
     Args:
@@ -41,7 +41,7 @@ class Progress:
         return sum(self._expected) * self._spent / self._done
 
 
-def seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]) -> float | None:
+def expected_seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]) -> float | None:
     """Return how long the last finished run of the same row and simulator took, s.
 
     Where there is none, the published table tells: its seconds per epoch times the epochs, and a third more
@@ -61,7 +61,7 @@ def seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]) -> floa
     return None
 
 
-def clock(duration: float) -> str:
+def format_duration(duration: float) -> str:
     """Return a duration in s for a person."""
     minutes = math.ceil(duration / 60)
     return f"{duration:.0f} s" if duration < 90 else f"{minutes} min"

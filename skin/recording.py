@@ -89,7 +89,7 @@ class Touches:
 
 @dataclass(frozen=True)
 class Recording:
-    """Touches with all that is known about them, as :mod:`skin.storage` keeps them in a file.
+    """Touches with all that is known about them, as :mod:`skin.recording_file` keeps them in a file.
 
     Attributes:
         touches: B touches of T frames; their positions are common to all, (S, 3).
@@ -144,7 +144,7 @@ def _expect(values: Tensor | None, name: str, *shapes: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must be {' or '.join(map(str, shapes))}, got {tuple(values.shape)}")
 
 
-def join(parts: Sequence[Recording]) -> Recording:
+def concatenate(parts: Sequence[Recording]) -> Recording:
     """Return one recording of all touches of ``parts``, which agree on the rest; the first one's metadata."""
     first = parts[0]
 
@@ -169,7 +169,7 @@ def join(parts: Sequence[Recording]) -> Recording:
     )
 
 
-def digest(touches: Touches) -> str:
+def touches_hash(touches: Touches) -> str:
     """Return a hash of readings and labels."""
     content = hashlib.sha256(touches.readings.contiguous().numpy().tobytes())
     if touches.labels is not None:

@@ -19,8 +19,8 @@ from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
-from skin.balance import announce
 from skin.build import build_data, build_device, build_learner
+from skin.class_balance import report_balance
 from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
 from skin.errors import InputError
@@ -30,11 +30,11 @@ from skin.evaluation.operating_point import check_evaluation, choose_operating_p
 from skin.evaluation.report import Report, evaluate
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
-from skin.option import option
+from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
-from skin.recording import Touches, digest
-from skin.reload import TAG
-from skin.settings import imported
+from skin.recording import Touches, touches_hash
+from skin.settings import import_target
+from skin.stored_run import TAG
 from skin.tracking import Store
 
 SWEPT = "SKIN_SWEPT"
@@ -77,7 +77,7 @@ def train(config: DictConfig) -> bool:
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
-    announce(device, shown=PARENT not in os.environ)
+    report_balance(device, shown=PARENT not in os.environ)
     name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
     with store.run(name, identity, os.environ.get(PARENT)) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
@@ -87,7 +87,7 @@ def train(config: DictConfig) -> bool:
         report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
         _keep(store, run, learner)
-        conclude(store, run, report, device.task, values)
+        log_report(store, run, report, device.task, values)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
@@ -134,7 +134,7 @@ def simulator(config: DictConfig) -> str:
 
 def _option(part: DictConfig, name: str) -> str:
     """Return the name of the option that a part of a configuration builds."""
-    return option(imported(part["_target_"], name))
+    return option_name(import_target(part["_target_"], name))
 
 
 def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
@@ -147,7 +147,7 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
         touches: that it learns from.
     """
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(plain(config))), "config.yaml")
-    store.client.set_tag(run, "data_hash", digest(touches))
+    store.client.set_tag(run, "data_hash", touches_hash(touches))
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)
     used = [group for group in groups if group in config and group not in unused]
@@ -162,19 +162,19 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
         }
     else:
         choices.pop("simulator", None)
-    params = changed(config) | choices | scalars
+    params = relevant_overrides(config) | choices | scalars
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
 
 
 def _differences(config: DictConfig) -> list[str]:
     """Return what tells this run from others with its row, simulator and seed: in a sweep, what is swept."""
-    found = {key: value for key, value in changed(config).items() if key not in _NAMED}
+    found = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
     if SWEPT in os.environ:
         found = {key: value for key, value in found.items() if key in os.environ[SWEPT].split()}
     return [f"{key.split('.')[-1]}={value}" for key, value in found.items()]
 
 
-def changed(config: DictConfig) -> dict[str, str]:
+def relevant_overrides(config: DictConfig) -> dict[str, str]:
     """Return the overrides of the running command that its result may depend on; else none."""
     if not HydraConfig.initialized():
         return {}
@@ -198,10 +198,10 @@ def _holds(value: Any, name: str) -> bool:
     return isinstance(value, dict) and (name in value or any(_holds(one, name) for one in value.values()))
 
 
-def conclude(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
+def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
     """Log what an evaluation found, with its predictions and confusion matrices, and further values.
 
-    The operating point is stored as the tag ``TAG``, from which :func:`skin.reload.operating_point` takes it.
+    The operating point is stored as the tag ``TAG``; :func:`skin.stored_run.load_operating_point` reads it.
     """
     point = report.point
     if point is not None:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
 from skin.errors import InputError
-from skin.trust import resolved
+from skin.trust import import_name
 
 _Made = TypeVar("_Made")
 
@@ -47,7 +47,9 @@ ONCE = AfterValidator(_once)
 """Makes a list one of different names."""
 
 
-def check(target: Callable[..., Any], settings: Mapping[str, Any], name: str, whole: bool = False) -> None:
+def check_settings(
+    target: Callable[..., Any], settings: Mapping[str, Any], name: str, whole: bool = False
+) -> None:
     """Refuse settings that a class or function does not have, or does not take.
 
     Args:
@@ -90,12 +92,12 @@ def configured(target: Callable[..., _Made], settings: Mapping[str, Any], name: 
     Args:
         target: what they configure; it takes nothing else.
         settings: in plain containers.
-        name: as in :func:`check`.
+        name: as in :func:`check_settings`.
 
     Raises:
-        InputError: as :func:`check`, and where a setting is missing.
+        InputError: as :func:`check_settings`, and where a setting is missing.
     """
-    check(target, settings, name, whole=True)
+    check_settings(target, settings, name, whole=True)
     return target(**settings)
 
 
@@ -103,7 +105,7 @@ def checked(name: str) -> Callable[[type[_Made]], type[_Made]]:
     """Let a class check its arguments, so that a script is refused what a configuration is refused.
 
     Args:
-        name: as in :func:`check`.
+        name: as in :func:`check_settings`.
     """
 
     def decorate(made: type[_Made]) -> type[_Made]:
@@ -111,7 +113,7 @@ def checked(name: str) -> Callable[[type[_Made]], type[_Made]]:
 
         @wraps(init)
         def checking(self: Any, *args: Any, **kwargs: Any) -> None:
-            check(made, expected.bind(*args, **kwargs).arguments, name)
+            check_settings(made, expected.bind(*args, **kwargs).arguments, name)
             init(self, *args, **kwargs)
 
         made.__init__ = checking  # type: ignore[method-assign]
@@ -127,16 +129,16 @@ def check_groups(config: Mapping[str, Any]) -> None:
         config: in plain containers.
 
     Raises:
-        InputError: as :func:`check`, or a class that cannot be imported.
+        InputError: as :func:`check_settings`, or a class that cannot be imported.
     """
     for name, part in _parts(config, ""):
         # A learner holds its model: people set it by the name of the group.
         inner = name.split(".")[-1]
         shown = inner if inner in _INNER else name
-        check(imported(part["_target_"], shown), part, shown)
+        check_settings(import_target(part["_target_"], shown), part, shown)
 
 
-def imported(target: str, name: str) -> Callable[..., Any]:
+def import_target(target: str, name: str) -> Callable[..., Any]:
     """Return a class or function by its dotted name.
 
     Args:
@@ -147,7 +149,7 @@ def imported(target: str, name: str) -> Callable[..., Any]:
         InputError: it cannot be imported.
     """
     try:
-        return resolved(target)
+        return import_name(target)
     except ImportError as error:
         raise InputError(
             f"{name}._target_={target} cannot be imported: {error}: correct the name, or add the folder of "

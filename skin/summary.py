@@ -42,7 +42,7 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
     return summary
 
 
-def line(summary: dict[str, Any]) -> str:
+def summary_line(summary: dict[str, Any]) -> str:
     """Return a summary in one line."""
     force = summary["force"]
     strain = "strain" if summary.get("strain_solved") else "pressure by modulus"

@@ -16,10 +16,10 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import checked, plain
+from skin.config import plain, validate_config
+from skin.error_messages import to_input_error
 from skin.errors import InputError
-from skin.progress import Progress, clock, seconds
-from skin.refusal import refusal
+from skin.progress import SweepProgress, expected_seconds, format_duration
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from skin.tracking import Store
 
 
-def jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
+def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
     """Return what Hydra's sweeper will choose in each job of a multirun, in its order.
 
     Args:
@@ -82,7 +82,7 @@ class Sweep(Callback):
         self._jobs: list[dict[str, str]] = []
         self._fingerprints: list[str] = []
         self._swept: list[str] = []
-        self._progress = Progress([])
+        self._progress = SweepProgress([])
         self._began = 0.0
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -92,7 +92,7 @@ class Sweep(Callback):
         try:
             self._open(config)
         except Exception as error:
-            refused = refusal(error)
+            refused = to_input_error(error)
             if refused is None:
                 raise
             # What no job could accept is refused once, before any of them; Hydra lets only exits pass here.
@@ -101,19 +101,19 @@ class Sweep(Callback):
 
     def _open(self, config: DictConfig) -> None:
         """Make the folder that Hydra writes to, and the parent run."""
-        settings = checked(_without_hydra(config)).tracking
+        settings = validate_config(_without_hydra(config)).tracking
         # Swept or not, Hydra lists only what belongs to jobs here.
-        self._jobs = jobs(_words(config), config.hydra.sweeper.params or {})
+        self._jobs = sweep_jobs(_words(config), config.hydra.sweeper.params or {})
         self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
         from skin.run import PARENT, SWEPT, tags
         from skin.tracking import Store
-        from skin.variants import title
+        from skin.variants import sweep_title
 
         self._store = store = Store.open(settings)
-        name = config.hydra.runtime.choices.get("sweep") or title(self._jobs, self._swept) or "sweep"
+        name = config.hydra.runtime.choices.get("sweep") or sweep_title(self._jobs, self._swept) or "sweep"
         self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
         atexit.register(self._close)
         os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
@@ -121,14 +121,16 @@ class Sweep(Callback):
         identities = [tags(job) if job else {} for job in composed]
         self._fingerprints = [one.get("fingerprint", "") for one in identities]
         told = zip(composed, identities, strict=True)
-        self._progress = Progress([seconds(store, job, one) if job else None for job, one in told])
+        self._progress = SweepProgress(
+            [expected_seconds(store, job, one) if job else None for job, one in told]
+        )
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
         self._began = time.monotonic()
         if self._parent:
             left = self._progress.left()
-            rest = "" if left is None else f" about {clock(left)} left"
+            rest = "" if left is None else f" about {format_duration(left)} left"
             print(f"{self._label(config)} …{rest}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
@@ -141,7 +143,7 @@ class Sweep(Callback):
         elif skipped:
             print(f"{self._label(config)} was finished before", flush=True)
         else:
-            print(f"{self._label(config)} took {clock(took)}", flush=True)
+            print(f"{self._label(config)} took {format_duration(took)}", flush=True)
         self._progress.finish(self._jobs.index(_chosen(_words(config))), took, skipped)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -161,7 +163,7 @@ class Sweep(Callback):
         """Log what the jobs found, whenever they were finished; delete a parent without children."""
         from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
-        from skin.variants import log
+        from skin.variants import log_variants
 
         own = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
         keys = [key for key in self._swept if key != "seed"]
@@ -176,7 +178,7 @@ class Sweep(Callback):
         if not store.find(**own):
             store.client.delete_run(parent.info.run_id)
         elif done := {values: runs for values, runs in found.items() if runs}:
-            log(store, parent, keys, done)
+            log_variants(store, parent, keys, done)
 
     def _label(self, config: DictConfig) -> str:
         job = _chosen(_words(config))
@@ -193,7 +195,7 @@ def _composed(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
     words = [f"{key}={value}" for key, value in job.items()]
     whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
     try:
-        made = checked(_without_hydra(whole))
+        made = validate_config(_without_hydra(whole))
         plain(made)
     except InputError:
         return None

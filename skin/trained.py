@@ -7,12 +7,12 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import Tracking, checked
+from skin.config import Tracking, validate_config
 from skin.device.base import AbstractDevice
 from skin.evaluation.operating_point import OperatingPoint
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
-from skin.reload import configuration, find, operating_point, restore
+from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
 
@@ -62,18 +62,18 @@ def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) 
         InputError: there is no such run, or it cannot be loaded.
     """
     store = Store.open(Tracking(uri, None, "skin", True, None))
-    run = find(store, name)
-    stored = configuration(store, run, trust)
-    return trained(store, run, checked(stored), stored)
+    run = find_run(store, name)
+    stored = load_configuration(store, run, trust)
+    return load_trained(store, run, validate_config(stored), stored)
 
 
-def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
+def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
     """Return a run with what it learned.
 
     Args:
         store: where it is.
         run: a finished training.
-        config: its configuration, changed as :func:`skin.reload.changed` does.
+        config: its configuration, changed as :func:`skin.stored_run.apply_overrides` does.
         stored: its configuration as it was.
 
     Raises:
@@ -81,7 +81,7 @@ def trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> T
     """
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device.blank())
-    restore(store, run, learner, data)
+    load_learner(store, run, learner, data)
     known = data.touches("train")
-    point = operating_point(run, learner, stored, config.evaluation)
+    point = load_operating_point(run, learner, stored, config.evaluation)
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)

@@ -34,7 +34,7 @@ _BASES = {"skin": tuple((f"skin.{group}.base", f"Abstract{group.capitalize()}") 
 _BASES |= _LIBRARIES
 
 
-def vet(config: Any, where: str) -> None:
+def check_targets(config: Any, where: str) -> None:
     """Check that a stored configuration builds nothing but parts of this package and of its libraries.
 
     Allowed are subclasses of a group's base class that ``skin`` defines, optimizers of ``torch.optim``, and
@@ -89,7 +89,7 @@ def _allowed(name: Any) -> bool:
     if package is None:
         return False
     try:
-        found = resolved(name)
+        found = import_name(name)
     except Exception:  # whatever resolving raises, there is no such class
         return False
     if not inspect.isclass(found) or inspect.isabstract(found):
@@ -98,7 +98,7 @@ def _allowed(name: Any) -> bool:
     return issubclass(found, bases) and f"{found.__module__}.".startswith(f"{package}.")
 
 
-def resolved(name: str) -> Any:
+def import_name(name: str) -> Any:
     """Return what a dotted name stands for, as Hydra would; its own function logs what it does not find.
 
     Raises:

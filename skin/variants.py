@@ -14,14 +14,14 @@ _MAIN = ("/overall/accuracy", "/alarm_recall", "/false_alarm_rate", "/degrees")
 _LEGAL = re.compile(r"[\w.\- ]+")  # part of the name of a metric in MLflow
 
 
-def title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
+def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
     """Return what is swept, such as ``model.norm=none,layer × seed=0,1``, for the name of a run."""
     values = {key: dict.fromkeys(job[key] for job in jobs) for key in swept}
     text = " × ".join(f"{key.lstrip('+')}={','.join(one)}" for key, one in values.items())
     return text if len(text) <= 250 else f"{text[:249]}…"
 
 
-def log(
+def log_variants(
     store: Store, parent: Run, keys: Sequence[str], runs: Mapping[tuple[str, ...], Sequence[Run]]
 ) -> None:
     """Log the main metrics of a sweep to its parent run: as metrics, and as a table with a row per variant.

@@ -12,21 +12,21 @@ LAYERS = """
 errors interrupt paths option
 trust
 settings
-refusal identity labels rng material model lag sensors
+error_messages fingerprint labels rng material model sensor_dynamics sensors
 config recording body
 command
-files foreign description layout summary plausible
-storage touch tracking
+files safe_loading recording_metadata layout summary plausibility
+recording_file touch tracking
 simulator
 contact
 signal
 wire representation
 device fusion
-classifier balance
+classifier class_balance
 datamodule
 learner
 evaluation build
-reload
+stored_run
 trained
 hardware
 plot

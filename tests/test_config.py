@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import ReadonlyConfigError
 
 from skin.build import build_device, build_learner
-from skin.config import checked, fingerprint, plain
+from skin.config import fingerprint, plain, validate_config
 from skin.errors import InputError
 from skin.paths import CONF, ROOT
 
@@ -53,14 +53,14 @@ def test_groups_of_values_build_nothing(group):
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes(configured, group, option):
-    config = plain(checked(configured(f"{group}={option}")))
+    config = plain(validate_config(configured(f"{group}={option}")))
     assert config[group]["_target_"].split(".")[:-1] == ["skin", group, option]
 
 
 @pytest.mark.parametrize("simulator", ["naive", "fem"])
 @pytest.mark.parametrize("row", ROWS)
 def test_every_row_composes_and_is_built(configured, row, simulator):
-    config = checked(configured(f"experiment={row}", f"simulator={simulator}"))
+    config = validate_config(configured(f"experiment={row}", f"simulator={simulator}"))
     build_learner(config)
     assert (config.row, config.data.name) == (row, simulator)
     assert config.trainer.max_epochs == config.epochs[simulator]
@@ -68,7 +68,7 @@ def test_every_row_composes_and_is_built(configured, row, simulator):
 
 @pytest.mark.parametrize("simulator", ["naive", "fem"])
 def test_the_device_carries_the_groups_that_were_chosen(configured, simulator):
-    config = checked(configured(f"simulator={simulator}", "seed=3", "layout=grid", "layout.rows=3"))
+    config = validate_config(configured(f"simulator={simulator}", "seed=3", "layout=grid", "layout.rows=3"))
     device = build_device(config)
     assert (len(device.sensors), device.data_seed, device.seed) == (15, 3, 0)
     assert device.padded == (simulator == "fem")
@@ -77,7 +77,7 @@ def test_the_device_carries_the_groups_that_were_chosen(configured, simulator):
 
 def test_a_checked_configuration_cannot_be_changed(configured):
     with pytest.raises(ReadonlyConfigError):
-        checked(configured()).seed = 1
+        validate_config(configured()).seed = 1
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_checked_configuration_cannot_be_changed(configured):
 )
 def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
     with pytest.raises(InputError, match=reason):
-        checked(configured(override))
+        validate_config(configured(override))
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
 )
 def test_what_is_no_number_is_refused_by_name(configured, name):
     with pytest.raises(InputError, match=f"^{name} is nan: give a number$"):
-        checked(configured(f"{name}=nan"))
+        validate_config(configured(f"{name}=nan"))
 
 
 def test_keys_that_only_steer_leave_the_fingerprint(configured):
@@ -103,7 +103,7 @@ def test_keys_that_only_steer_leave_the_fingerprint(configured):
 
 
 def test_keys_of_other_commands_leave_the_fingerprint(configured):
-    assert fingerprint(checked(configured())) == fingerprint(configured())
+    assert fingerprint(validate_config(configured())) == fingerprint(configured())
 
 
 @pytest.mark.parametrize(

@@ -9,18 +9,18 @@ import pytest
 import torch
 
 from skin.config import Tracking
+from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.files import write
-from skin.hardware.calibration.bench_session import Session
-from skin.hardware.calibration.bench_session import write as write_session
+from skin.hardware.calibration.bench_session import BenchSession
+from skin.hardware.calibration.bench_session import write_bench_session as write_session
 from skin.labels import TOUCH
 from skin.plot import animation, evaluation_page, figures
 from skin.plot.touches import simulated
 from skin.recording import Recording
-from skin.refusal import refusal
+from skin.recording_file import write_recording as write_recording
 from skin.signal import calibration
 from skin.simulator import _elastic, _store
-from skin.storage import write as write_recording
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -43,7 +43,7 @@ def recorded(path, device):
 
 
 def sessions(path, device):
-    write_session(Session(np.arange(99.0), np.ones((99, 3)), "N"), path)
+    write_session(BenchSession(np.arange(99.0), np.ones((99, 3)), "N"), path)
 
 
 WRITERS = {
@@ -55,7 +55,9 @@ WRITERS = {
     "figure.png": lambda path, device: figures.save_figure(
         figures.traces({"a": torch.ones(9, 3)}, 10.0), path
     ),
-    "gains.yaml": lambda path, device: calibration.write(calibration.Calibration({"gain": 99 * [1.0]}), path),
+    "gains.yaml": lambda path, device: calibration.write_calibration(
+        calibration.Calibration({"gain": 99 * [1.0]}), path
+    ),
     "verdicts.csv": lambda path, device: evaluation_page.verdicts(torch.ones(9, 4), TOUCH, None, path),
 }
 
@@ -119,7 +121,7 @@ def test_a_database_on_a_full_disk_is_told_of_and_goes_on(tmp_path):
     store = Store.open(settings)
     with full(), pytest.raises(Exception, match="disk") as caught:  # MLflow's own
         store.client.create_run(store.experiment)
-    assert "the database of runs refuses" in str(refusal(caught.value))
+    assert "the database of runs refuses" in str(to_input_error(caught.value))
     with store.run("later", {}):
         pass
 
@@ -141,9 +143,9 @@ def test_garbage_is_no_database(content, tmp_path):
 
 
 def test_errors_of_ours_keep_their_traceback():
-    assert refusal(FileNotFoundError(2, "No such file", "x")) is None
-    assert refusal(ZeroDivisionError()) is None
-    assert "x.csv: Read-only" in str(refusal(OSError(30, "Read-only file system", "x.csv")))
+    assert to_input_error(FileNotFoundError(2, "No such file", "x")) is None
+    assert to_input_error(ZeroDivisionError()) is None
+    assert "x.csv: Read-only" in str(to_input_error(OSError(30, "Read-only file system", "x.csv")))
 
 
 def test_a_file_has_reached_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):

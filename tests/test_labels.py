@@ -4,7 +4,16 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task, Thresholds, measure, movie_labels, sliding
+from skin.labels import (
+    TOUCH,
+    TOUCH_OR_NOT,
+    TOUCH_SLIDING,
+    Task,
+    Thresholds,
+    measure_gestures,
+    movie_labels,
+    sliding,
+)
 
 CELL = (0.01, 0.02)
 # Two sensors on a sheet of 10 x 10 cells: one over a whole cell, one over four quarters.
@@ -87,10 +96,10 @@ def test_a_factorised_movie_measures_as_its_dense_one():
     )
     index = torch.tensor([[0, 0, 1, 1, 0], [2, 2, 2, 2, 2]])
     scale = torch.tensor([[0, 0.5, 1, 0.01, 0], [0.2, 1, 0, 1, 0.3]])
-    short = measure(frames, index, scale, FOOTPRINTS.flatten(1), CELL)
+    short = measure_gestures(frames, index, scale, FOOTPRINTS.flatten(1), CELL)
     dense = (frames[index] * scale[..., None, None]).flatten(0, 1)
     every = torch.arange(10).view(2, 5)
-    full = measure(dense, every, torch.ones(2, 5), FOOTPRINTS.flatten(1), CELL)
+    full = measure_gestures(dense, every, torch.ones(2, 5), FOOTPRINTS.flatten(1), CELL)
     for one, other in zip(short, full, strict=True):
         torch.testing.assert_close(one, other)
 

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from skin.device._blank import Blank
-from skin.option import option
+from skin.option import option_name
 from skin.simulator.fem import PlatesAndBeams
 
 
@@ -14,4 +14,4 @@ from skin.simulator.fem import PlatesAndBeams
     [(PlatesAndBeams, "fem"), (Blank(None, (1.0, 1.0), None), "_blank"), (partial, "functools")],
 )
 def test_an_option_is_named_after_its_module(made, name):
-    assert option(made) == name
+    assert option_name(made) == name

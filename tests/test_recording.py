@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.labels import TOUCH
-from skin.recording import Recording, Touches, join
+from skin.recording import Recording, Touches, concatenate
 
 
 def touches(count: int = 4, moving: bool = False) -> Touches:
@@ -68,7 +68,7 @@ def test_recordings_that_disagree_are_refused(wrong):
 
 def test_parts_join_to_the_whole():
     whole = recording()
-    again = join([whole[:1], whole[1:]])
+    again = concatenate([whole[:1], whole[1:]])
     assert torch.equal(again.touches.readings, whole.touches.readings)
     assert torch.equal(again.touches.valid, whole.touches.valid)
     assert torch.equal(again.displacement, whole.displacement)

@@ -6,7 +6,7 @@ import sqlite3
 import pytest
 
 import skin.run
-from skin.config import checked
+from skin.config import validate_config
 from skin.errors import InputError
 from skin.paths import ROOT
 from skin.tracking import Store
@@ -30,7 +30,7 @@ SMALL = (
 @pytest.fixture
 def config(configured, tmp_path):
     """Return a small training that logs to a folder of its own."""
-    return checked(
+    return validate_config(
         configured(
             *SMALL, f"tracking.uri=sqlite:///{tmp_path}/runs.db", f"tracking.artifacts={tmp_path}/artifacts"
         )
@@ -77,7 +77,7 @@ def test_a_device_without_simulator_stands_in_its_place(device, configured):
 
 def test_no_threads_are_refused(configured):
     with pytest.raises(InputError, match=r"tracking\.threads=0 must be at least 1, or null"):
-        skin.run.train(checked(configured("tracking.threads=0")))
+        skin.run.train(validate_config(configured("tracking.threads=0")))
 
 
 def logged(folder):

@@ -8,8 +8,8 @@ from annotated_types import Ge, Gt
 
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
-from skin.hardware.live.settings import Settings
-from skin.settings import ONCE, RISING, check, check_groups, checked, configured
+from skin.hardware.live.live_settings import LiveSettings
+from skin.settings import ONCE, RISING, check_groups, check_settings, checked, configured
 
 
 class Thing:
@@ -34,8 +34,8 @@ FIT = {"count": 2, "share": 1, "width": None, "kind": "b", "widths": [1, 2], "na
 
 
 def test_what_fits_is_taken():
-    check(Thing, {**FIT, "_partial_": True, "made": {"_target_": "anything"}}, "thing")
-    check(lambda **settings: None, {"anything": 1}, "thing")
+    check_settings(Thing, {**FIT, "_partial_": True, "made": {"_target_": "anything"}}, "thing")
+    check_settings(lambda **settings: None, {"anything": 1}, "thing")
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_what_fits_is_taken():
 )
 def test_what_does_not_fit_is_refused_by_name(wrong, said):
     with pytest.raises(InputError, match=f"^{said}"):
-        check(Thing, FIT | wrong, "thing")
+        check_settings(Thing, FIT | wrong, "thing")
 
 
 @pytest.mark.parametrize(
@@ -181,9 +181,9 @@ LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "patience": {
     ],
 )
 def test_the_live_view_refuses_a_setting_by_name(wrong, said):
-    assert Settings.of(LIVE).patience.label == 0.15
+    assert LiveSettings.of(LIVE).patience.label == 0.15
     with pytest.raises(InputError, match=said):
-        Settings.of(LIVE | wrong)
+        LiveSettings.of(LIVE | wrong)
 
 
 def test_a_command_ends_with_code_2_and_logs_nothing(run, tmp_path):

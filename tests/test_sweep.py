@@ -13,7 +13,7 @@ from hydra import initialize_config_dir
 from skin.config import Tracking
 from skin.errors import InputError
 from skin.paths import CONF, ROOT
-from skin.sweep import jobs
+from skin.sweep import sweep_jobs
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -32,7 +32,7 @@ SMALL = [
 
 
 def test_jobs_come_in_hydras_order():
-    found = jobs(["seed=0,1", "row=x"], {"simulator": "naive,fem"})
+    found = sweep_jobs(["seed=0,1", "row=x"], {"simulator": "naive,fem"})
     assert [(job["simulator"], job["seed"], job["row"]) for job in found] == [
         ("naive", "0", "x"),
         ("naive", "1", "x"),
@@ -42,7 +42,7 @@ def test_jobs_come_in_hydras_order():
 
 
 def test_the_command_line_wins_over_the_sweeps_file():
-    found = jobs(["simulator=fem"], {"simulator": "naive,fem", "experiment": "rules,features"})
+    found = sweep_jobs(["simulator=fem"], {"simulator": "naive,fem", "experiment": "rules,features"})
     assert [job["experiment"] for job in found] == ["rules", "features"]
     assert {job["simulator"] for job in found} == {"fem"}
 
@@ -58,17 +58,19 @@ def test_the_command_line_wins_over_the_sweeps_file():
     ],
 )
 def test_every_way_to_write_values_is_hydras(override, values):
-    assert [list(job.values()) for job in jobs([override], {})] == [[value] for value in values]
+    assert [list(job.values()) for job in sweep_jobs([override], {})] == [[value] for value in values]
 
 
 def test_an_interval_is_refused():
     with pytest.raises(InputError, match=r"^optimizer.lr=interval\(0.1,1\) names no values to try: give opt"):
-        jobs(["optimizer.lr=interval(0.1,1)"], {})
+        sweep_jobs(["optimizer.lr=interval(0.1,1)"], {})
 
 
 def test_a_glob_means_the_options_of_its_group():
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        assert jobs(["simulator=glob(*)"], {}) == [{"simulator": name} for name in ("fem", "naive", "solid")]
+        assert sweep_jobs(["simulator=glob(*)"], {}) == [
+            {"simulator": name} for name in ("fem", "naive", "solid")
+        ]
 
 
 def sweep(folder, *overrides):

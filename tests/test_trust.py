@@ -2,22 +2,22 @@
 
 import pytest
 
-from skin.config import checked, plain
+from skin.config import plain, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
-from skin.trust import GROUPS, vet
+from skin.trust import GROUPS, check_targets
 
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 
 
 def refuse(name):
     with pytest.raises(InputError, match=r"a run: learner\._target_ names .*trust=true"):
-        vet({"learner": {"_target_": name}}, "a run")
+        check_targets({"learner": {"_target_": name}}, "a run")
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_may_be_built(configured, group, option):
-    vet(plain(checked(configured(f"{group}={option}"))), "a run")
+    check_targets(plain(validate_config(configured(f"{group}={option}"))), "a run")
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_every_option_may_be_built(configured, group, option):
 )
 @pytest.mark.filterwarnings("ignore:`torch.jit")  # of PyTorch Geometric's import
 def test_parts_of_libraries_may_be_built(name):
-    vet({"model": [{"_target_": name, "_partial_": True}]}, "a run")
+    check_targets({"model": [{"_target_": name, "_partial_": True}]}, "a run")
 
 
 @pytest.mark.parametrize(
@@ -51,14 +51,14 @@ def test_parts_of_libraries_may_be_built(name):
         "skin.",
         "skin..learner",
         "skin.x.os.system",
-        "skin.storage.read",
-        "skin.storage.os.system",
-        "skin.storage.Path",
+        "skin.recording_file.read_recording",
+        "skin.recording_file.os.system",
+        "skin.recording_file.Path",
         "skin.learner.network.torch.load",
         "skin.learner.network.torch.optim.Adam",
         "skin.learner.base.AbstractLearner",
         "skin.learner.rules.Rules.load",
-        "skin.hardware.emulator.outlet.AbstractOutlet",
+        "skin.hardware.emulator.port.AbstractPort",
         "skinny.Learner",
         None,
         ["skin.learner.rules.Rules"],
@@ -79,4 +79,4 @@ def test_names_are_resolved_only_inside_the_package(tmp_path, monkeypatch):
 @pytest.mark.parametrize("place", [lambda value: {"a": [{"b": value}]}, lambda value: {"a": {value: 1}}])
 def test_values_are_final(place, value):
     with pytest.raises(InputError, match="interpolation"):
-        vet(place(value), "a run")
+        check_targets(place(value), "a run")

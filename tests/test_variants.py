@@ -7,7 +7,7 @@ import pytest
 
 from skin.config import Tracking
 from skin.tracking import Store
-from skin.variants import log, title
+from skin.variants import log_variants, sweep_title
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -15,12 +15,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
 def test_a_title_tells_what_is_swept():
     jobs = [{"row": "x", "+model.norm": norm, "seed": seed} for norm in ("none", "layer") for seed in "01"]
-    assert title(jobs, ["+model.norm", "seed"]) == "model.norm=none,layer × seed=0,1"
-    assert title(jobs, []) == ""
+    assert sweep_title(jobs, ["+model.norm", "seed"]) == "model.norm=none,layer × seed=0,1"
+    assert sweep_title(jobs, []) == ""
 
 
 def test_a_title_fits_into_the_database():
-    found = title([{"seed": str(seed)} for seed in range(1000)], ["seed"])
+    found = sweep_title([{"seed": str(seed)} for seed in range(1000)], ["seed"])
     assert len(found) == 250
     assert found.endswith("…")
 
@@ -37,7 +37,7 @@ def test_each_variant_has_its_metrics_and_its_row(tmp_path):
             store.log_metrics(run, {"same/overall/accuracy": accuracy, "same/big/accuracy": 0.1} | others)
         runs.append(store.client.get_run(run.info.run_id))
     parent = store.create("parent", {})
-    log(store, parent, ["model.norm"], {("layer",): runs[:2], ("[8]",): runs[2:]})
+    log_variants(store, parent, ["model.norm"], {("layer",): runs[:2], ("[8]",): runs[2:]})
     place = "model.norm layer"
     found = store.client.get_run(parent.info.run_id).data
     assert "variants.json" in found.tags["mlflow.loggedArtifacts"]  # by which the UI shows a table

@@ -38,7 +38,7 @@ _LONG = 70_000  # bytes: longer than any line may be
 
 
 def fuzz(
-    count: int, spoken: WireFormat, sensors: int, seed: int, told: Callable[[int], object] = id
+    count: int, spoken: WireFormat, sensors: int, seed: int, on_event: Callable[[int], object] = id
 ) -> dict[str, int]:
     """Feed a decoder with ``count`` chunks of a stream of good, damaged and senseless frames, and noise.
 
@@ -47,7 +47,7 @@ def fuzz(
         spoken: the checksum of the lines, or ``binary``.
         sensors: S.
         seed: of everything.
-        told: is given the number of chunks now and then.
+        on_event: is given the number of chunks now and then.
 
     Returns:
         ``chunks`` and ``bytes``; ``pieces``: frames and fragments in them; ``good``: those sent intact behind
@@ -67,7 +67,7 @@ def fuzz(
         for frame in decoder.feed(chunk, number * 1e-3):
             oracle.take(frame)
         if number % 1000 == 0:
-            told(number)
+            on_event(number)
     for frame in decoder.feed(stream.rest(), count * 1e-3):
         oracle.take(frame)
     missed = oracle.missed + len(stream.expected)

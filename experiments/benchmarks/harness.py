@@ -14,14 +14,14 @@ from statistics import median
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from skin.config import checked
+from skin.config import validate_config
 from skin.paths import CONF
 
 
 def training_config(*overrides: str) -> DictConfig:
     """Return the configuration of a training with overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return checked(compose("train", list(overrides)))
+        return validate_config(compose("train", list(overrides)))
 
 
 def median_seconds(task: Callable[[], object], repeats: int) -> float:

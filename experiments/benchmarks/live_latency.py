@@ -17,7 +17,7 @@ from skin.device.base import AbstractSimulated
 from skin.hardware.live.engine import Detection, Engine
 from skin.learner.network import Network
 from skin.signal.frame import Frame
-from skin.wire.conversion import Newtons
+from skin.wire.conversion import UnitConversion
 
 RATE = 100.0  # Hz, of the device
 ROW = "best_fresh"
@@ -62,19 +62,21 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
 
 
 def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
-    from skin.hardware.live import start
-    from skin.hardware.live.verdict import Patience
-    from skin.reload import changed, find
-    from skin.reload import configuration as stored
+    from skin.hardware.live import engine_builder
+    from skin.hardware.live.verdict import DebounceSettings
+    from skin.stored_run import apply_overrides, find_run
+    from skin.stored_run import load_configuration as stored
     from skin.tracking import Store
-    from skin.trained import trained
+    from skin.trained import load_trained
 
     config = training_config(*([f"tracking.uri={uri}"] if uri else []))
     store = Store.open(config.tracking)
-    found = find(store, run)
+    found = find_run(store, run)
     known = stored(store, found)
-    of = trained(store, found, changed(known, config, []), known)
-    return of.device.simulated("the stream is simulated"), start.engine(of, Patience(), _TOUCH)
+    of = load_trained(store, found, apply_overrides(known, config, []), known)
+    return of.device.simulated("the stream is simulated"), engine_builder.make_engine(
+        of, DebounceSettings(), _TOUCH
+    )
 
 
 def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:
@@ -93,7 +95,7 @@ def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame
 def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
     """Return how long a verdict takes, by the clock on the wall and by the core's, s."""
     sensors = engine.window.sensors
-    known = Newtons(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
+    known = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
     wall, core = time.perf_counter(), time.thread_time()
     assert engine.push(frame, known) is not None
     return time.perf_counter() - wall, time.thread_time() - core

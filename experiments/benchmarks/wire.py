@@ -69,13 +69,13 @@ def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[st
             sender.stdin.flush()
             tally.watch(skin, sender)
             stats = skin.stats
-        told = json.loads(sender.stdout.read())
+        on_event = json.loads(sender.stdout.read())
     finally:
         sender.kill()
         sender.communicate()
         os.close(master)
         os.close(slave)
-    return tally.figures(stats, check) | told
+    return tally.figures(stats, check) | on_event
 
 
 @dataclass

@@ -18,7 +18,7 @@ from skin.command import command
 from skin.config import plain
 from skin.files import results
 from skin.paths import ROOT
-from skin.settings import check
+from skin.settings import check_settings
 
 HERE = ROOT / "experiments"
 SIMULATORS = ("naive", "fem", "solid")
@@ -29,7 +29,7 @@ PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "
 def main(config: DictConfig) -> None:
     """Take every figure and write the file whole; progress goes to standard error."""
     settings = plain(config)["bench"]
-    check(figures, settings, "bench")
+    check_settings(figures, settings, "bench")
 
     from skin.files import write
 

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from experiments.peers import PEERS
 from skin.command import command
-from skin.config import checked, plain
+from skin.config import plain, validate_config
 from skin.errors import InputError
 from skin.paths import ROOT
 
@@ -32,7 +32,7 @@ def main(config: DictConfig) -> bool:
     if not python.is_file():
         raise InputError(f"there is no {python}: make peers builds it")
     # Where it is done has no part in its identity.
-    own = checked(OmegaConf.masked_copy(config, [str(key) for key in config if key != "peers"]))
+    own = validate_config(OmegaConf.masked_copy(config, [str(key) for key in config if key != "peers"]))
 
     from rich.console import Console
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from experiments.studies.study import SMOKE, Study, as_overrides, passed_overrides
 from skin.command import command
-from skin.config import checked
+from skin.config import validate_config
 from skin.errors import InputError
 from skin.files import results
 
@@ -76,7 +76,7 @@ def _measure_skin(study: Study, folder: Path) -> None:
 
     if study.measure is None:
         raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
-    config = checked(compose("train", [*as_overrides(study.test), *passed_overrides()]))
+    config = validate_config(compose("train", [*as_overrides(study.test), *passed_overrides()]))
     page = study.measure(Subject(config, build_device(config))).page
     print(
         page.about,

@@ -19,7 +19,7 @@ from skin.command import command
 from skin.config import overrides, plain
 from skin.files import results
 from skin.paths import ROOT
-from skin.settings import check
+from skin.settings import check_settings
 
 _TITLE = "Accuracy on the test gestures in per cent (the report's in brackets)"
 _SMOKE = "SMOKE, one epoch on little data, ignore the scores: "
@@ -29,7 +29,7 @@ _SMOKE = "SMOKE, one epoch on little data, ignore the scores: "
 def main(config: DictConfig) -> None:
     """Run the sweep, then write what finished runs say; exit code 1 if one is missing."""
     settings = plain(config)["table"]
-    check(sweep, settings, "table")
+    check_settings(sweep, settings, "table")
     words = sweep(**settings)
     words += [one for one in overrides() if not one.startswith(("table.", "out="))]
 

@@ -18,9 +18,9 @@ from skin.evaluation.report import columns
 from skin.files import whole
 from skin.files import write as write_text
 from skin.labels import Task
-from skin.recording import Recording, Touches, digest
+from skin.recording import Recording, Touches, touches_hash
+from skin.recording_file import write_recording
 from skin.signal.features import engineered_features
-from skin.storage import write
 
 SETS = "sets.json"
 ABOUT = "about.json"
@@ -29,7 +29,7 @@ ABOUT = "about.json"
 def export_touches(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
     """Write every set of touches that learning and evaluating needs, unless they lie there already.
 
-    ``touches/<set>.parquet`` are recordings (:mod:`skin.storage`), ``features/<set>.parquet`` hold the
+    ``touches/<set>.parquet`` are recordings (:mod:`skin.recording_file`), ``features/<set>.parquet`` hold the
     engineered features, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
     alarm's threshold is chosen), then ``<column>_<number>`` for the sets of
     :func:`skin.evaluation.report.columns`. ``sets.json``, written last, names the content of each set: set ->
@@ -43,7 +43,7 @@ def export_touches(device: AbstractSimulated, settings: Evaluation, folder: Path
     if (folder / SETS).is_file():
         known = json.loads((folder / SETS).read_text())
         complete = "alarm" in known and (folder / "features").is_dir()
-        if complete and known["train"] == digest(device.touches("train")):
+        if complete and known["train"] == touches_hash(device.touches("train")):
             return
         shutil.rmtree(folder)
     learnt = {name: device.touches(name) for name in ("train", "validation")}
@@ -87,7 +87,7 @@ class PeerPredictions:
         Raises:
             LookupError: touches that were not exported.
         """
-        content = digest(touches)
+        content = touches_hash(touches)
         if content not in self._sets:
             raise LookupError(f"{self._folder.parent} holds other touches than these: remove it")
         path = self._folder / f"{self._sets[content]}.parquet"
@@ -99,9 +99,9 @@ class PeerPredictions:
 def _export(touches: Touches, device: AbstractSimulated, folder: Path, name: str) -> str:
     """Write one set and return its digest."""
     recording = Recording(touches, device.task, device.size, device.sensors.footprint)
-    write(recording, folder / "touches" / f"{name}.parquet")
+    write_recording(recording, folder / "touches" / f"{name}.parquet")
     table = {key: values.to(torch.float32).numpy() for key, values in engineered_features(touches).items()}
     path = folder / "features" / f"{name}.parquet"
     with whole(path) as partial:
         pa.parquet.write_table(pa.table(table), partial, compression="zstd")
-    return digest(touches)
+    return touches_hash(touches)

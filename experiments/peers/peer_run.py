@@ -8,12 +8,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.peers.exchange import ABOUT, PeerPredictions, export_touches
-from skin.balance import announce
 from skin.build import build_device
+from skin.class_balance import report_balance
 from skin.config import fingerprint, plain
 from skin.evaluation.operating_point import choose_operating_point
 from skin.evaluation.report import evaluate
-from skin.run import conclude, describe, tags
+from skin.run import describe, log_report, tags
 from skin.tracking import Store
 
 _SOURCES = ("seed", "touch", "body", "layout", "simulator", "device", "data", "evaluation")
@@ -37,7 +37,7 @@ def learn(
     """
     source, identity = _source(config), tags(config)
     device = build_device(config).simulated("peers are compared on simulated touches")
-    announce(device)
+    report_balance(device)
     where = folder / f"{identity['simulator']}-{config.seed}-{fingerprint(source)}"
     with store.run(f"{config.row} {identity['simulator']} {config.seed}", identity) as run:
         describe(
@@ -53,7 +53,7 @@ def learn(
         point = choose_operating_point(peer, device, config.evaluation)
         report = evaluate(peer, device, config.evaluation, point)
         values = {"seconds_per_epoch": peer.about["seconds"], "parameters": peer.about["parameters"]}
-        conclude(store, run, report, device.task, values)
+        log_report(store, run, report, device.task, values)
         store.client.log_dict(run.info.run_id, peer.about, ABOUT)
     suffix = "/overall/accuracy"
     return {name.removesuffix(suffix): x for name, x in report.metrics.items() if name.endswith(suffix)}

@@ -190,15 +190,18 @@ class Holds:
         from rich.progress import track
 
         from experiments.studies.tables import Page
-        from skin.hardware.live import start
-        from skin.hardware.live.holds import FIELDS, courses
-        from skin.hardware.live.verdict import Patience
-        from skin.trained import trained
+        from skin.hardware.live import engine_builder
+        from skin.hardware.live.alarm_timing import FIELDS, time_courses
+        from skin.hardware.live.verdict import DebounceSettings
+        from skin.trained import load_trained
 
-        of = trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
-        engine = start.engine(of, Patience(), self.touch, self.drift)
+        of = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
+        engine = engine_builder.make_engine(of, DebounceSettings(), self.touch, self.drift)
         device = of.device.simulated("held touches are simulated").replace(stream=False)
-        table = [FIELDS, *courses(engine, device, self.gestures, self.rate, partial(track, transient=True))]
+        table = [
+            FIELDS,
+            *time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True)),
+        ]
         told = (zip(FIELDS, values, strict=True) for values in table[1:])
         lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
         return Measurement({}, Page("\n".join(lines), {"Time to alarm": table}, table))
@@ -232,10 +235,10 @@ class Embeddings(ProbeSettings):
 
         from experiments.studies.embedding.probe import probe
         from experiments.studies.embedding_spaces import build_embeddings_page
-        from skin.balance import announce
+        from skin.class_balance import report_balance
 
         device, learner = subject.device, subject.learner if subject.finished else None
-        announce(device)
+        report_balance(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)
         found = list(track(steps, "probing", count, console=Console(stderr=True)))

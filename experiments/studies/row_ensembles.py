@@ -15,9 +15,9 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import choose_operating_point, threshold_gestures
 from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
-from skin.recording import Touches, digest
-from skin.reload import restore
-from skin.run import conclude, describe, simulator, tags
+from skin.recording import Touches, touches_hash
+from skin.run import describe, log_report, simulator, tags
+from skin.stored_run import load_learner
 from skin.tracking import Store
 
 Way = Callable[[Tensor, Task], Tensor]
@@ -31,7 +31,7 @@ class _Known:
 
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the probabilities (B, L) that the members give together."""
-        chances = self._chances.get(digest(touches))
+        chances = self._chances.get(touches_hash(touches))
         if chances is None:
             raise InputError("no member takes these touches")
         return self._way(chances, self._task)
@@ -130,10 +130,10 @@ def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: Abstra
     left_out: dict[str, str] = {}
     for config, run in members:
         learner = build_learner(config)
-        restore(store, run, learner, build_data(config, device))
+        load_learner(store, run, learner, build_data(config, device))
         for column, drawn in sets.items():
             try:
-                given = [(digest(touches), learner.probabilities(touches)) for touches in drawn]
+                given = [(touches_hash(touches), learner.probabilities(touches)) for touches in drawn]
             except InputError as reason:
                 left_out[column] = "; ".join(filter(None, [left_out.get(column), f"{config.row}: {reason}"]))
                 continue
@@ -160,9 +160,9 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
         describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))
         point = choose_operating_point(known, device, config.evaluation)
         report = evaluate(known, device, config.evaluation, point)
-        chances = asked.chances[digest(next(columns(device, config.evaluation)["same"]))]
+        chances = asked.chances[touches_hash(next(columns(device, config.evaluation)["same"]))]
         differ = disagreement(chances, device.task)
-        conclude(
+        log_report(
             store, run, report, device.task, {f"same/{name}/disagreement": x for name, x in differ.items()}
         )
     return store.client.get_run(run.info.run_id)

@@ -16,10 +16,10 @@ from omegaconf import DictConfig
 from experiments.studies.row_ensembles import combine
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides, sweeps, variants
 from skin.commands import train
-from skin.config import checked, fingerprint
+from skin.config import fingerprint, validate_config
 from skin.errors import InputError
-from skin.reload import find
 from skin.run import simulator
+from skin.stored_run import find_run
 from skin.tracking import Store
 
 
@@ -59,7 +59,7 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     """
     if study.rows is None:
         assert study.run is not None
-        run = find(store, study.run)
+        run = find_run(store, study.run)
         return [Planned(Variant(_name(run), {}, {}), run.data.tags.get("seed", ""), run)]
     found: dict[tuple[str, str], Planned] = {}
     data = simulator(config)
@@ -125,7 +125,7 @@ def _ensembles(study: Study, store: Store, members: Sequence[Planned]) -> list[P
     for seed in dict.fromkeys(one.seed for one in members) if ways else ():
         for way, variant in ways.items():
             line = [*as_overrides(study.common), *passed_overrides(), f"seed={seed}", f"row={way}{suffix}"]
-            variant.configs[seed] = checked(compose("train", line))
+            variant.configs[seed] = validate_config(compose("train", line))
         present = {
             one.variant.name: (one.variant.configs[seed], one.run)
             for one in members

@@ -10,11 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
-from skin.config import checked, overrides, plain
+from skin.config import overrides, plain, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
-from skin.settings import check
-from skin.sweep import jobs
+from skin.settings import check_settings
+from skin.sweep import sweep_jobs
 
 SMOKE = (
     "data.gestures=80",
@@ -99,10 +99,10 @@ class Study:
             known = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
             raise InputError(f"which study? choose one of {known}, as in study=norm")
         settings = {"name": name} | plain(config)["study"]
-        check(cls, settings, "study")
+        check_settings(cls, settings, "study")
         if settings["measure"]:
             part = settings["measure"]
-            check(get_object(part["_target_"]), part, "study.measure")
+            check_settings(get_object(part["_target_"]), part, "study.measure")
             settings["measure"] = instantiate(part)
         return cls(**settings | {"statements": [Statement(**one) for one in settings["statements"]]})
 
@@ -149,14 +149,14 @@ def variants(study: Study, smoke: bool = False) -> list[Variant]:
 def _variants(block: Mapping[str, Any], line: Sequence[str]) -> list[tuple[dict[str, str], Variant]]:
     """Return each variant of a sweep, with what may name it."""
     name, found = block.get("name"), dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
-    for job in jobs(list(line), {}):
+    for job in sweep_jobs(list(line), {}):
         chosen = {key: job[key] for key in block if key != "name"}
         named = {
             key: value
             for key, value in chosen.items()
             if isinstance(block[key], list) or (not name and key in _NAMED)
         }
-        config = checked(compose("train", [f"{key}={value}" for key, value in job.items()]))
+        config = validate_config(compose("train", [f"{key}={value}" for key, value in job.items()]))
         start = {"name": name} if name else {}
         _, variant = found.setdefault(
             tuple(chosen.values()), (start | named, Variant("", start | chosen, {}))

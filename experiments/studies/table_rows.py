@@ -8,10 +8,10 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.peers import PEERS
 from experiments.studies.row_ensembles import WAYS, combine
 from experiments.studies.runs import newest_finished
-from skin.config import checked
+from skin.config import validate_config
 from skin.paths import CONF
 from skin.run import simulator
-from skin.sweep import jobs
+from skin.sweep import sweep_jobs
 from skin.tracking import Store
 
 # They stand in the table as soon as a run of theirs has finished.
@@ -32,7 +32,9 @@ class Entries:
 
     def __init__(self, overrides: Sequence[str]) -> None:
         parameters = OmegaConf.load(CONF / "sweep" / "table.yaml").hydra.sweeper.params
-        trained = [[f"{key}={value}" for key, value in job.items()] for job in jobs([*overrides], parameters)]
+        trained = [
+            [f"{key}={value}" for key, value in job.items()] for job in sweep_jobs([*overrides], parameters)
+        ]
         self.rows = [_composed(*job) for job in trained]
         # Every simulator and seed once, in order: the same touches whatever learns from them.
         touches = (tuple(word for word in job if not word.startswith("experiment=")) for job in trained)
@@ -54,4 +56,4 @@ class Entries:
 
 
 def _composed(*words: str) -> DictConfig:
-    return checked(compose("train", list(words)))
+    return validate_config(compose("train", list(words)))

@@ -18,10 +18,10 @@ from experiments.studies.runs import Planned
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
 from experiments.studies.tables import publish_page
 from skin.build import build_device
-from skin.config import checked, fingerprint
-from skin.reload import TAG, changed, configuration
+from skin.config import fingerprint, validate_config
+from skin.stored_run import TAG, apply_overrides, load_configuration
 from skin.tracking import Store
-from skin.trained import Trained, trained
+from skin.trained import Trained, load_trained
 
 
 @dataclass(frozen=True)
@@ -91,15 +91,15 @@ class _Run:
 
     @cached_property
     def stored(self) -> DictConfig:
-        return configuration(self.store, self.run, self.config.trust)
+        return load_configuration(self.store, self.run, self.config.trust)
 
     @cached_property
     def trained(self) -> Trained:
-        return trained(self.store, self.run, checked(self.stored), self.stored)
+        return load_trained(self.store, self.run, validate_config(self.stored), self.stored)
 
     def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
         """Return the run of MLflow that holds what a study measures on the device that overrides change."""
-        own = changed(self.stored, compose("train", [*base, *line]), line)
+        own = apply_overrides(self.stored, compose("train", [*base, *line]), line)
         what = study.measure or Accuracy()
         asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]
         key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]

@@ -31,29 +31,29 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.hardware.calibration import bench_session, gauge
-    from skin.hardware.calibration.bench import bench
-    from skin.hardware.calibration.fit import fit
-    from skin.hardware.calibration.outcome import judge
-    from skin.hardware.calibration.protocol import demo
-    from skin.hardware.calibration.show import about, show
-    from skin.signal.calibration import write
+    from skin.hardware.calibration.bench_data import build_bench_data
+    from skin.hardware.calibration.calibration_report import held_out_summary, print_calibration
+    from skin.hardware.calibration.fit import fit_calibration
+    from skin.hardware.calibration.held_out import evaluate_held_out
+    from skin.hardware.calibration.protocol import write_demo_session
+    from skin.signal.calibration import write_calibration
 
     settings = plain(config)["calibrate"]
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
     if settings["demo"]:
-        print(demo(device, settings, config.session))
+        print(write_demo_session(device, settings, config.session))
     shape = settings["indenter"], settings["radius"]
-    said = bench_session.read(config.session, *shape, settings["unit"])
-    rows = None if config.presses is None else gauge.read(config.presses, *shape, settings["delay"])
+    said = bench_session.read_bench_session(config.session, *shape, settings["unit"])
+    rows = None if config.presses is None else gauge.read_gauge(config.presses, *shape, settings["delay"])
     with Console(stderr=True).status("fitting"):
-        found = bench(device, said, rows)
-        outcome, calibration = judge(found, settings["held_out"]), fit(found)
-    show(calibration, outcome)
+        found = build_bench_data(device, said, rows)
+        outcome, calibration = evaluate_held_out(found, settings["held_out"]), fit_calibration(found)
+    print_calibration(calibration, outcome)
     if not outcome.helps:
         print(
             f"It does not help, so {config.out} was not written: is the layout, the body or the clock wrong?"
         )
         sys.exit(1)
-    known = {**calibration.about, **about(outcome)}
+    known = {**calibration.about, **held_out_summary(outcome)}
     known |= {"session": config.session, "presses_file": config.presses}
-    print(write(replace(calibration, about=known), config.out))
+    print(write_calibration(replace(calibration, about=known), config.out))

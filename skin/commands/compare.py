@@ -72,13 +72,13 @@ def _verdicts(
     from skin.build import build_data, build_learner
     from skin.device._blank import Blank
     from skin.plot.press_comparison import Verdicts
-    from skin.reload import configuration, find, restore
+    from skin.stored_run import find_run, load_configuration, load_learner
     from skin.tracking import Store
 
     store = Store.open(config.tracking)
-    run = find(store, config.run)
-    trained = configuration(store, run, config.trust)
+    run = find_run(store, config.run)
+    trained = load_configuration(store, run, config.trust)
     learner = build_learner(trained)
-    restore(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
+    load_learner(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
     simulated, recorded = ((learner.probabilities(side) > 0.5).numpy() for side in both)
     return Verdicts(device.task.names, simulated, recorded, None if truth is None else np.array(truth))

@@ -25,19 +25,19 @@ def main(config: DictConfig) -> None:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
 
     from skin.build import build_device
-    from skin.hardware.emulator.emulator import Emulator, Settings
+    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
     from skin.hardware.emulator.faults import Faults
-    from skin.hardware.emulator.outlet import outlet
+    from skin.hardware.emulator.port import open_port
     from skin.settings import configured
 
     groups = plain(config)
-    settings = configured(Settings, groups["emulate"], "emulate")
+    settings = configured(EmulatorSettings, groups["emulate"], "emulate")
     faults = configured(Faults, groups["faults"], "faults")
     device = build_device(config).simulated("only simulated gestures can be emulated")
     signal.signal(signal.SIGTERM, _leave)
-    port = outlet(config.port, config.link)
+    port = open_port(config.port, config.link)
     try:
-        emulator = Emulator(device, port, settings, faults, config.format == "binary", _tell)
+        emulator = Emulator(device, port, settings, faults, config.format == "binary", _notify)
         # From the first line on, because whoever reads it may stop this at once.
         with suppress(KeyboardInterrupt):
             print(port.address, flush=True)
@@ -53,5 +53,5 @@ def _leave(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _tell(t: float, text: str) -> None:
+def _notify(t: float, text: str) -> None:
     print(f"{t:8.2f} s  {text}", flush=True)

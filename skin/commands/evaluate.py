@@ -19,26 +19,26 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.evaluation.metrics_table import print_report
     from skin.evaluation.report import evaluate
-    from skin.option import option
+    from skin.option import option_name
     from skin.plot.evaluation_page import publish_evaluation, verdicts
-    from skin.reload import changed, configuration, find
-    from skin.run import conclude
+    from skin.run import log_report
+    from skin.stored_run import apply_overrides, find_run, load_configuration
     from skin.tracking import Store
-    from skin.trained import trained
+    from skin.trained import load_trained
 
     quiet()
     store, folder = Store.open(config.tracking), results(config.out)
-    run = find(store, config.run)
-    stored, given = configuration(store, run, config.trust), overrides()
-    config = changed(stored, config, given)
-    of = trained(store, run, config, stored)
+    run = find_run(store, config.run)
+    stored, given = load_configuration(store, run, config.trust), overrides()
+    config = apply_overrides(stored, config, given)
+    of = load_trained(store, run, config, stored)
     device, learner, point = of.device, of.learner, of.point
     touches = device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         # Every evaluation keeps its files.
-        name = f"evaluation_{option(device)}_{evaluation.info.run_id[:8]}"
+        name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
             chances = learner.probabilities(touches)
             said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
             print(f"{title}\n{said}\n{path}")
             return
         found = evaluate(learner, device, config.evaluation, point)
-        conclude(store, evaluation, found, device.task, {})
+        log_report(store, evaluation, found, device.task, {})
         about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
         written = publish_evaluation(folder / f"{name}.md", found, device.task, run.info.run_name, about)
         for path in written:

@@ -24,19 +24,19 @@ def main(config: DictConfig) -> None:
 
     from omegaconf import OmegaConf
 
-    from skin.balance import announce
     from skin.build import build_device
-    from skin.storage import write
-    from skin.summary import line
+    from skin.class_balance import report_balance
+    from skin.recording_file import write_recording
+    from skin.summary import summary_line
 
     device = build_device(config)
     recording = device.recording()
-    announce(device, recording)
+    report_balance(device, recording)
     # Where the touches go does not change them.
     source = OmegaConf.masked_copy(config, [str(key) for key in config if key != "out"])
     about = {"config_hash": fingerprint(source), "config": plain(source)}
-    path = write(replace(recording, metadata=recording.metadata | about), config.out)
+    path = write_recording(replace(recording, metadata=recording.metadata | about), config.out)
     # What a file says of itself may be anything.
     known = device.simulation is not None
-    said = line(recording.metadata["summary"]) if known else f"{len(recording)} gestures"
+    said = summary_line(recording.metadata["summary"]) if known else f"{len(recording)} gestures"
     print(f"{path}: {said}")

@@ -25,7 +25,7 @@ def main(config: DictConfig) -> None:
         raise InputError("which port? add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER")
 
     from skin.settings import check_groups
-    from skin.wire.diagnosis import Listener
+    from skin.wire.diagnosis import PortMonitor
     from skin.wire.errors import SkinDisconnected, SkinTimeout
     from skin.wire.open import open_skin
 
@@ -33,7 +33,7 @@ def main(config: DictConfig) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sensors = None if config.n is None else range(config.n)
     with open_skin(device["port"], sensors, **{key: device[key] for key in _KEYS}) as skin:
-        listener = Listener(skin)
+        listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):
                 for line in listener.lines(config.seconds):

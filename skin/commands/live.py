@@ -17,15 +17,15 @@ from skin.command import command
 from skin.config import overrides, plain
 
 if TYPE_CHECKING:
-    from skin.hardware.live.settings import Settings
+    from skin.hardware.live.live_settings import LiveSettings
 
 
 @command("live")
 def main(config: DictConfig) -> None:
     """Bring a finished run back, open what is watched, and show verdicts until somebody ends it."""
-    from skin.hardware.live.settings import Settings
+    from skin.hardware.live.live_settings import LiveSettings
 
-    live = Settings.of(plain(config)["live"])
+    live = LiveSettings.of(plain(config)["live"])
 
     import torch
 
@@ -39,28 +39,30 @@ def main(config: DictConfig) -> None:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: "Settings") -> None:
+def _watch(config: DictConfig, live: "LiveSettings") -> None:
     from rich.console import Console
 
     from skin.build import build_device
-    from skin.hardware.live import start, terminal, web
-    from skin.hardware.live.board import Board, Facts
-    from skin.hardware.live.loop import Session
-    from skin.reload import changed, configuration, find
+    from skin.hardware.live import engine_builder, terminal, web
+    from skin.hardware.live.display import Display, DisplayInfo
+    from skin.hardware.live.loop import LiveLoop
+    from skin.stored_run import apply_overrides, find_run, load_configuration
     from skin.tracking import Store, ends_on_signal
-    from skin.trained import trained
+    from skin.trained import load_trained
 
     store, said = Store.open(config.tracking), Console(stderr=True)
-    run = find(store, config.run)
-    stored, given = configuration(store, run, config.trust), overrides()
-    device = build_device(changed(stored, config, given))
+    run = find_run(store, config.run)
+    stored, given = load_configuration(store, run, config.trust), overrides()
+    device = build_device(apply_overrides(stored, config, given))
     # What it learned from stays, whatever is watched.
-    learnt = changed(stored, config, [one for one in given if not one.startswith(("device=", "device."))])
+    learnt = apply_overrides(
+        stored, config, [one for one in given if not one.startswith(("device=", "device."))]
+    )
     said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
-    if advice := start.advice(stored, device):
+    if advice := engine_builder.simulator_warning(stored, device):
         said.print(advice, highlight=False)
-    of = trained(store, run, learnt, stored)
-    engine = start.engine(of, live.patience, live.touch, live.drift)
+    of = load_trained(store, run, learnt, stored)
+    engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)
     if of.point is not None:
         above = live.patience.above
         said.print(of.point.sentence() if above is None else f"alarm above {above:g}", highlight=False)
@@ -70,10 +72,12 @@ def _watch(config: DictConfig, live: "Settings") -> None:
         source = device.source()
         skin = open_.enter_context(source.skin)
         places, span = of.positions.numpy(), of.window / of.rate
-        board = Board(Facts(run.info.run_name, source.name, places, of.device.size, live.top, span))
+        display = Display(DisplayInfo(run.info.run_name, source.name, places, of.device.size, live.top, span))
         if config.web:
-            said.print(f"page: {open_.enter_context(web.served(board, live.web_port))}", highlight=False)
-        session = Session(skin, source.tare, engine, board)
+            said.print(
+                f"page: {open_.enter_context(web.serve_page(display, live.web_port))}", highlight=False
+            )
+        session = LiveLoop(skin, source.tare, engine, display)
         open_.callback(lambda: said.print(f"{session.verdicts} verdicts, {session.line}", highlight=False))
-        open_.enter_context(terminal.shown(board, Console()))
+        open_.enter_context(terminal.show_in_terminal(display, Console()))
         session.run(config.seconds)

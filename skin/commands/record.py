@@ -26,7 +26,7 @@ def main(config: DictConfig) -> None:
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
     from skin.build import build_device
-    from skin.hardware.record.recorder import finish, record
+    from skin.hardware.record.recorder import convert_session, record_session
 
     device = build_device(config).wired
     if device is None:
@@ -34,10 +34,10 @@ def main(config: DictConfig) -> None:
     path = Path(config.out).expanduser()
     if not settings["finish"]:
         with suppress(KeyboardInterrupt):
-            record(device, path, config.seconds, settings["free"], _tell)
-    written, count = finish(device, path)
+            record_session(device, path, config.seconds, settings["free"], _notify)
+    written, count = convert_session(device, path)
     print(f"{written}: {count} gestures")
 
 
-def _tell(text: str) -> None:
+def _notify(text: str) -> None:
     print(text, file=sys.stderr, flush=True)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from skin.contact._unilateral import Equilibrium
-from skin.labels import measure
+from skin.labels import measure_gestures
 from skin.touch.problem import ContactProblem
 
 # Relative tolerance of the peak. The tolerance at an end of its range, where a search fails, is tighter, so
@@ -157,7 +157,7 @@ def _classes(pressure: torch.Tensor, problem: ContactProblem) -> tuple[np.ndarra
     body, thresholds = problem.shapes.body, problem.settings.thresholds
     frames = pressure.float().view(-1, *body.shape)
     index, once = torch.arange(len(frames))[:, None], torch.ones(len(frames), 1)
-    measures = measure(frames, index, once, problem.footprints, body.cell, thresholds.contact)
+    measures = measure_gestures(frames, index, once, problem.footprints, body.cell, thresholds.contact)
     labels = measures.labels(thresholds)[:, [0, 3]].bool()
     return frames.flatten(1).amax(1).double().numpy(), labels.numpy()
 

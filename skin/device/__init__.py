@@ -1,1 +1,1 @@
-"""Where touches come from: each module is one choice of ``device=``."""
+"""Sources of touches: each module is one option of ``device=``."""

@@ -1,4 +1,4 @@
-"""A device of which only the shapes are known."""
+"""A device that yields placeholder touches of the right shapes."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from skin.recording import Touches
 
 @dataclass
 class Blank(AbstractDevice):
-    """Yields the same touches for every split: enough to bring a run back, of no use to learn from."""
+    """Yields the same example for every split: enough to restore a trained run, not to train one."""
 
     task: Task
     size: tuple[float, float]
@@ -19,7 +19,7 @@ class Blank(AbstractDevice):
 
     @classmethod
     def of(cls, task: Task, size: tuple[float, float], touches: Touches) -> "Blank":
-        """Return one whose example is the first of some touches, labelled 0."""
+        """Return a device whose example is the first of the touches, with labels 0."""
         return cls(task, size, replace(touches[:1], labels=torch.zeros(1, len(task))))
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:

@@ -15,7 +15,7 @@ from skin.errors import InputError
 
 SOURCE = "https://doi.org/10.4121/uuid:5ef62345-3b3e-479c-8e1d-c922748c9b29"
 ROWS, CAPTURES = 1_496_855, 7805
-"""How long the published file is."""
+"""Number of rows and captures of the published file."""
 FULL = 1023
 """The largest count: the corpus has 10 bits."""
 CHANNELS = 64
@@ -35,7 +35,7 @@ class Captures:
         subject: (N,), int32, as in the file.
         variant: (N,), int32: 1 gentle, 2 normal, 3 rough.
         gesture: (N,), int32, 1 to 14.
-        frames: (N,), int32: how many frames the file has of each.
+        frames: (N,), int32: number of frames of each in the file.
     """
 
     counts: np.ndarray
@@ -52,19 +52,19 @@ class Captures:
         return Captures(**{name: values[index] for name, values in vars(self).items()})
 
 
-def refusal(path: str | Path, wrong: str, mend: str = "download it again") -> InputError:
-    """Return the error that says what is wrong with a file and where the right one is."""
-    return InputError(f"{path} is not CoST.csv as published: {wrong}; {mend} from {SOURCE}")
+def format_error(path: str | Path, wrong: str, fix: str = "download it again") -> InputError:
+    """Return the error for a file that is not as published, with the address of the corpus."""
+    return InputError(f"{path} is not CoST.csv as published: {wrong}; {fix} from {SOURCE}")
 
 
-def read(path: Path, window: int) -> Captures:
-    """Read a file block by block; no more than a block and the resampled captures are ever held.
+def read_captures(path: Path, window: int) -> Captures:
+    """Read the captures of a file block by block, in bounded memory.
 
     A capture begins where ``frame`` is 1. It is resampled by linear interpolation in time over its whole
-    length, so its duration is lost to all but ``frames``.
+    length, so its duration is kept only in ``frames``.
 
     Raises:
-        InputError: not in the corpus's format; the sentence names the line.
+        InputError: the file is not in the corpus's format; the message has the number of the line.
     """
     parts: list[Captures] = []
     rest = np.empty((0, len(COLUMNS)), np.int32)
@@ -73,12 +73,12 @@ def read(path: Path, window: int) -> Captures:
         rows = np.concatenate([rest, block])
         _check(path, rows, len(rest), line)
         line += len(block)
-        # The last capture may go on in the next block.
+        # The last capture may continue in the next block.
         last = np.flatnonzero(rows[:, _FRAME] == 1)[-1]
         parts.append(_resampled(path, rows[:last], window, line - len(rows)))
         rest = rows[last:]
     if not len(rest):
-        raise refusal(path, "it has no rows")
+        raise format_error(path, "it has no rows")
     parts.append(_resampled(path, rest, window, line - len(rest)))
     names = [field.name for field in fields(Captures)]
     return Captures(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -113,7 +113,7 @@ def _blocks(path: Path) -> Iterator[np.ndarray]:
                 if batch.num_rows:
                     yield np.column_stack([column.to_numpy() for column in batch.columns])
     except pa.ArrowException as error:
-        raise refusal(path, _words(error)) from error
+        raise format_error(path, _words(error)) from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
 
@@ -136,22 +136,22 @@ def _check_header(path: Path) -> None:
     names = [name.strip() for name in text.split(",")]
     if len(names) != len(COLUMNS):
         wrong = f"its first line has {len(names)} columns, not the {len(COLUMNS)}"
-        raise refusal(path, f"{wrong} subject, variant, gesture, frame, ch1 ... ch64")
+        raise format_error(path, f"{wrong} subject, variant, gesture, frame, ch1 ... ch64")
     for number, (name, needed) in enumerate(zip(names, COLUMNS, strict=True), start=1):
         if name != needed:
-            raise refusal(path, f"column {number} is called {name!r} instead of {needed!r}")
+            raise format_error(path, f"column {number} is called {name!r} instead of {needed!r}")
     if not text.endswith("\n"):
-        raise refusal(path, "it has no rows")
+        raise format_error(path, "it has no rows")
 
 
 def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:
     """Refuse values out of range, and frames that do not run 1, 2, 3, ... within one capture.
 
     Args:
-        path: for the sentence.
+        path: for the message.
         rows: (R, 68).
-        known: how many of them have been checked before.
-        line: of the first one that has not.
+        known: number of rows that have been checked before.
+        line: number of the first unchecked row's line.
     """
     new = rows[known:]
     for name, largest in _LARGEST.items():
@@ -169,7 +169,7 @@ def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:
 
 def _refuse_first(path: Path, bad: np.ndarray, line: int, wrong: str) -> None:
     if bad.any():
-        raise refusal(path, f"in line {line + int(bad.argmax())} {wrong}")
+        raise format_error(path, f"in line {line + int(bad.argmax())} {wrong}")
 
 
 def _resampled(path: Path, rows: np.ndarray, window: int, line: int) -> Captures:
@@ -178,7 +178,7 @@ def _resampled(path: Path, rows: np.ndarray, window: int, line: int) -> Captures
     lengths = np.diff(starts, append=len(rows))
     if (lengths < 2).any():
         at = line + int(starts[(lengths < 2).argmax()])
-        raise refusal(path, f"the capture in line {at} has one frame, at least 2 make a movement")
+        raise format_error(path, f"the capture in line {at} has one frame, at least 2 make a movement")
     times = np.linspace(0, 1, window) * (lengths[:, None] - 1)
     before = np.minimum(times.astype(int), lengths[:, None] - 2)
     share = (times - before)[..., None].astype(np.float32)

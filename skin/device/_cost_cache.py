@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from skin.device._cost import CHANNELS, SOURCE, Captures, read
+from skin.device._cost import CHANNELS, SOURCE, Captures, read_captures
 from skin.errors import InputError
 from skin.files import whole
-from skin.foreign import arrays
+from skin.safe_loading import load_npz
 from skin.simulator._store import folder
 
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 1
 
 
-def captures(path: Path, window: int) -> Captures:
-    """Return the captures of a file from the cache, or read it and keep what was read.
+def cached_captures(path: Path, window: int) -> Captures:
+    """Return the captures of a file from the cache, or read the file and cache them.
 
-    The cache's key is the file's content, so a changed file is read again. A folder that cannot be written to
-    costs a warning.
+    The cache's key is the file's content, so a changed file is read again. If the cache folder cannot be
+    written to, a warning is issued.
 
     Args:
         path: of CoST.csv.
@@ -42,7 +42,7 @@ def captures(path: Path, window: int) -> Captures:
     known = _load(stored, window)
     if known is not None:
         return known
-    found = read(path, window)
+    found = read_captures(path, window)
     try:
         _save(stored, found)
     except InputError as error:
@@ -51,11 +51,11 @@ def captures(path: Path, window: int) -> Captures:
 
 
 def _load(path: Path, window: int) -> Captures | None:
-    """Return the captures in a cache file, or None if there is none or anything about it is wrong."""
+    """Return the captures in a cache file, or None if it is missing or invalid."""
     try:
-        stored = arrays(path)
+        stored = load_npz(path)
         found = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
-    except Exception:  # Whatever a broken archive raises, the answer is the same: read the file anew.
+    except Exception:  # A broken archive may raise anything; the file is then read again.
         return None
     sound = found.counts.shape[1:] == (window, CHANNELS) and found.counts.dtype == np.float32
     others = [values for name, values in vars(found).items() if name != "counts"]
@@ -64,6 +64,6 @@ def _load(path: Path, window: int) -> Captures | None:
 
 
 def _save(path: Path, found: Captures) -> None:
-    """Write a cache file whole or not at all: others may read or write it at the same time."""
+    """Write a cache file atomically: other processes may read or write it at the same time."""
     with whole(path) as partial:
         np.savez(partial, **vars(found))

@@ -1,4 +1,4 @@
-"""How far sensors have moved: known from the simulator, or estimated from readings."""
+"""Displacement of the sensors: from the simulator, or estimated from readings."""
 
 from dataclasses import dataclass, replace
 
@@ -17,22 +17,22 @@ _PENALTIES = np.logspace(-2, 6, 9)
 
 @dataclass(frozen=True)
 class Tracker:
-    """Tells where the sensors of a simulated device go.
+    """Gives the displacement of the sensors of a simulated device.
 
     Attributes:
-        simulator: knows it; or None.
-        weights: (S, 3 S), m/N, estimate it from readings; or None.
+        simulator: computes the true displacement; or None.
+        weights: (S, 3 S), m/N, of the estimate from readings; or None.
     """
 
     simulator: AbstractSimulator | None = None
     weights: Tensor | None = None
 
-    def known(self, movie: Movie) -> Tensor | None:
+    def true_motion(self, movie: Movie) -> Tensor | None:
         """Return the true motion, (B, T, S, 3), m, of sensors under gestures."""
         return None if self.simulator is None else _motion(self.simulator, movie)
 
-    def told(self, touches: Touches) -> Touches:
-        """Return touches with the motion that their readings tell."""
+    def with_estimate(self, touches: Touches) -> Touches:
+        """Return touches with the motion estimated from their readings."""
         if self.weights is None:
             return touches
         guess = (touches.readings @ self.weights.to(touches.readings.device)).unflatten(-1, (-1, 3))
@@ -40,12 +40,12 @@ class Tracker:
 
 
 def oracle(model: AbstractSimulator, shape: tuple[int, int]) -> Tracker:
-    """Return a tracker that knows what a simulator of a sheet of ``shape`` (H, W) knows.
+    """Return a tracker with the true motion of a simulator of a sheet of ``shape`` (H, W) cells.
 
     Raises:
-        InputError: in this simulator sensors do not move along the sheet.
+        InputError: sensors do not move along the sheet in this simulator.
     """
-    model.motion(torch.zeros(shape))  # refused at the door rather than in the first batch
+    model.motion(torch.zeros(shape))  # fails now rather than in the first batch
     return Tracker(simulator=model)
 
 
@@ -56,21 +56,21 @@ def estimated(
     sensors: int,
     randomness: np.random.Generator,
 ) -> Tracker:
-    """Fit a ridge regression from readings to motion, on gestures that no test draws.
+    """Fit a ridge regression from readings to motion, on gestures that differ from those of the test.
 
     There is no intercept: a skin at rest does not move.
 
     Args:
         model: of the skin as designed.
         sampler: of gestures on it.
-        imperfection: every gesture is felt by another device of this kind, so the tracker knows none.
-        sensors: how many there are.
+        imperfection: every gesture is measured by another device of this kind, so the fit depends on none.
+        sensors: number of sensors.
         randomness: of gestures, devices and noise.
 
     Raises:
-        InputError: in this simulator sensors do not move along the sheet.
+        InputError: sensors do not move along the sheet in this simulator.
     """
-    # Here, because it takes a second and few devices need it.
+    # Imported here because it takes a second and few devices need it.
     from sklearn.linear_model import RidgeCV
 
     with torch.no_grad():

@@ -18,9 +18,9 @@ if TYPE_CHECKING:  # only their names are needed here
     from skin.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
     from skin.touch.stream import TouchStream
-    from skin.wire.conversion import Newtons
-    from skin.wire.listener import Tap
-    from skin.wire.segmentation import AbstractDirector, Take
+    from skin.wire.announcement import AnnouncementListener
+    from skin.wire.conversion import UnitConversion
+    from skin.wire.segmentation import AbstractSegmenter, RecordedGesture
     from skin.wire.skin import Skin
     from skin.wire.source import Source
 
@@ -28,15 +28,15 @@ Split = Literal["train", "validation", "holdout", "test"]
 
 
 class AbstractDevice(ABC):
-    """Yields touches; nothing downstream knows where they come from.
+    """Base class of devices: sources of touches.
 
-    A subclass needs ``task``, ``size`` and :meth:`touches`. Everything else has a default, which holds for a
-    device that knows nothing but its touches.
+    A subclass needs ``task``, ``size`` and :meth:`touches`. The defaults of everything else apply to a device
+    that has only touches.
 
     Attributes:
-        task: what the labels mean.
+        task: the labels and their kind.
         size: extent (x, y) of the sheet, m.
-        surface: the body that is touched, for pictures; None: a flat sheet of ``size``.
+        surface: the touched body, for plots; None: a flat sheet of ``size``.
     """
 
     task: Task
@@ -58,19 +58,19 @@ class AbstractDevice(ABC):
         """Return the touches of a split.
 
         ``train``, ``validation`` and ``holdout`` share the training budget 80/10/10 by gesture; ``test``
-        comes from gestures that no training can draw, where the device has such. ``epoch`` matters to devices
-        that draw fresh gestures.
+        comes from gestures that are not used for training, if the device has such. ``epoch`` is used by
+        devices that draw fresh gestures.
         """
 
     def all_touches(self) -> Touches:
-        """Return the touches that one can look at by their number: by default those of ``test``."""
+        """Return the touches that can be selected by number for plots: by default those of ``test``."""
         return self.touches("test")
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the touches of a split, or the whole budget, with all that is known about them.
+        """Return the touches of a split, or the whole budget, with applied force and parameters.
 
         Raises:
-            InputError: only readings and labels are known.
+            InputError: the device has only readings and labels.
         """
         raise InputError(
             "only simulated or recorded touches can be written to a file: leave out device=, or add "
@@ -78,9 +78,9 @@ class AbstractDevice(ABC):
         )
 
     def blank(self) -> "AbstractDevice":
-        """Return a device with labelled touches of the same shape, to restore a run with.
+        """Return a device with labelled touches of the same shapes, with which a run can be restored.
 
-        By default it is the device itself. One whose touches may lack labels returns another.
+        By default it is the device itself. A device whose touches may lack labels returns another one.
         """
         return self
 
@@ -88,7 +88,7 @@ class AbstractDevice(ABC):
         """Open the stream of frames that ``skin live`` watches.
 
         Raises:
-            InputError: it cannot be opened, or there is none.
+            InputError: the stream cannot be opened, or the device has none.
         """
         raise InputError(
             "only a skin at a port, a recording or the simulator can be watched: give device=serial "
@@ -99,10 +99,10 @@ class AbstractDevice(ABC):
         """Return this device as a simulated one.
 
         Args:
-            purpose: what needs it, as the beginning of a sentence.
+            purpose: the reason, the beginning of the error message.
 
         Raises:
-            InputError: it is not simulated.
+            InputError: the device is not simulated.
         """
         if self.simulation is None:
             raise InputError(f"{purpose}: leave out device=, or add device=simulated")
@@ -110,23 +110,23 @@ class AbstractDevice(ABC):
 
 
 class AbstractSimulated(AbstractDevice):
-    """Simulates its touches: everything about them is known, and it can draw others.
+    """Base class of devices that simulate their touches, with all parameters, and can draw others.
 
     Attributes:
         body: the sheet.
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
-        sensors: S sensors, where touches say they are.
-        model: from pressure to the true readings of the true sensors.
+        sensors: S sensors, at the positions that touches report.
+        model: maps pressure to the true readings of the sensors at their true positions.
         sampler: draws the gestures.
         window: frames per touch.
         rate: frames per second, Hz.
         stream: whether touches are windows of streams.
-        seed: of the device's constants and noise.
-        data_seed: of the gestures of the budget.
-        calibration: file that ``imperfection`` was read from; or None.
-        imperfection: of a device of this kind.
-        constants: of this device.
-        idle: what the untouched skin reads on average, (S,), N.
+        seed: for the device's constants and noise.
+        data_seed: for the gestures of the training budget.
+        calibration: file with the imperfections; or None.
+        imperfection: distribution of the imperfections of such devices.
+        constants: imperfections of this device.
+        idle: mean readings of the untouched skin, (S,), N.
     """
 
     body: AbstractBody
@@ -151,7 +151,7 @@ class AbstractSimulated(AbstractDevice):
     @property
     @abstractmethod
     def idle(self) -> Tensor:
-        """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
+        """Mean readings of the untouched skin, (S,), N; 0 for dead sensors."""
 
     @abstractmethod
     def replace(self, **changes: Any) -> "AbstractSimulated":
@@ -167,8 +167,8 @@ class AbstractSimulated(AbstractDevice):
 
         Args:
             split: None takes the whole budget.
-            epoch: matters to ``train`` with fresh gestures.
-            complete: with the displacements and the largest strains, too.
+            epoch: used by ``train`` with fresh gestures.
+            complete: include the displacements and the largest strains.
         """
 
     @abstractmethod
@@ -178,22 +178,22 @@ class AbstractSimulated(AbstractDevice):
         """Return a test stream in one piece, to be cut as one likes; one device feels all of it.
 
         Args:
-            frames: its length.
-            gap: [least, most] idle frames between two touches; None: as ``touch.gap``.
-            number: of the stream: another number, other gestures.
+            frames: its length, frames.
+            gap: [least, most] idle frames between two touches; None: ``touch.gap``.
+            number: of the stream; each number gives other gestures.
         """
 
 
 class AbstractWired(AbstractDevice):
-    """Reads a skin at a port, frame by frame.
+    """Base class of devices that read a skin at a port, frame by frame.
 
     Attributes:
-        sensors: S sensors, as many as values in a frame.
+        sensors: S sensors, one per value of a frame.
         window: frames per touch.
         rate: frames per second that touches are resampled to, Hz; None before it is known.
-        labels: where labels come from.
-        gestures: how many touches ``test`` has.
-        calibration: file that tells what values mean; or None.
+        labels: source of the labels.
+        gestures: number of touches of ``test``.
+        calibration: calibration file of the device; or None.
     """
 
     sensors: Sensors
@@ -209,33 +209,37 @@ class AbstractWired(AbstractDevice):
         return self
 
     @abstractmethod
-    def open(self, reconnect: bool = False) -> "tuple[Skin, Tap]":
-        """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
+    def open(self, reconnect: bool = False) -> "tuple[Skin, AnnouncementListener]":
+        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
 
     @abstractmethod
-    def settle(self, skin: "Skin") -> "tuple[list[Frame], Newtons]":
-        """Read the beginning: is the device fast enough, and what does it say untouched?
+    def warm_up(self, skin: "Skin") -> "tuple[list[Frame], UnitConversion]":
+        """Read the first frames: check the rate and take the baseline.
 
         Returns:
-            all frames that came, and what values mean.
+            all frames read, and the conversion of values to N.
 
         Raises:
-            InputError: no frames come, they come too slowly, or nobody knows what values mean.
+            InputError: no frames arrive, the device is too slow, or the scale is unknown.
         """
 
     @abstractmethod
-    def director(
-        self, tap: "Tap", meaning: "Newtons", first: "Sequence[Frame]", done: Collection[int] = ()
-    ) -> "AbstractDirector":
-        """Return what finds the gestures of a stream.
+    def segmenter(
+        self,
+        listener: "AnnouncementListener",
+        conversion: "UnitConversion",
+        first: "Sequence[Frame]",
+        done: Collection[int] = (),
+    ) -> "AbstractSegmenter":
+        """Return the segmenter of a stream.
 
         Args:
-            tap: hears announcements.
-            meaning: of the values.
-            first: frames that came before.
-            done: numbers of gestures that are there already.
+            listener: collects announcements.
+            conversion: of the values to N.
+            first: frames read before.
+            done: numbers of gestures that are already recorded.
         """
 
     @abstractmethod
-    def stored(self, takes: "Sequence[Take]", meaning: "Newtons") -> Recording:
+    def to_recording(self, gestures: "Sequence[RecordedGesture]", conversion: "UnitConversion") -> Recording:
         """Return gestures as a recording."""

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from skin.body.base import AbstractBody
-from skin.device._cost import CAPTURES, FULL, ROWS, SOURCE, refusal
-from skin.device._cost_cache import captures
+from skin.device._cost import CAPTURES, FULL, ROWS, SOURCE, format_error
+from skin.device._cost_cache import cached_captures
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import Task
@@ -46,15 +46,15 @@ _SHARES = {"test": 0.2, "validation": 0.1, "holdout": 0.1}
 
 @dataclass(kw_only=True, eq=False)
 class Cost(AbstractDevice):
-    """Yields the captures of the user's ``CoST.csv``, split by subject: nobody is in two splits.
+    """Yields the captures of the user's ``CoST.csv``, split by subject: no subject is in two splits.
 
     7805 captures of 14 gestures by 31 subjects in three variants, on textile taxels around a mannequin's arm
     (Jung, Poel, Poppe, Heylen, J. Multimodal User Interfaces 11, 2017). The corpus is not part of this
-    project; its licence is non-commercial. It brings its own sensors, so ``body`` and ``layout`` are ignored;
-    its counts are uncalibrated, so newtons are such in name only.
+    project; its licence is non-commercial. Its sensors are given, so ``body`` and ``layout`` are ignored.
+    Its counts are uncalibrated, so the unit N of readings is nominal.
 
     Captures last 10 to 1747 frames; each is resampled to ``window`` frames over its whole length, whatever
-    the fusion. What a gesture's duration says is therefore lost, and ``rate`` is that of a capture of median
+    the fusion. The duration of a gesture is therefore lost, and ``rate`` is that of a capture of median
     length.
 
     Args:
@@ -62,17 +62,17 @@ class Cost(AbstractDevice):
         layout: ignored.
         path: ``CoST.csv``.
         gestures: ``report`` (grab and hit; report, section 3.2), ``all`` or names.
-        variants: every variant of a gesture is a class of its own; None: only where ``gestures`` is
-            ``report``, which tells "a grab and hit with various strengths" apart.
-        taxels: how many of the 64, spread evenly, or the numbers of their channels from 1.
-        taxel_seed: another number spreads them otherwise.
+        variants: every variant of a gesture is a separate class; None: only if ``gestures`` is ``report``,
+            which distinguishes "a grab and hit with various strengths".
+        taxels: number of the 64 taxels, spread evenly, or the numbers of their channels from 1.
+        taxel_seed: seed of their selection.
         window: frames per touch.
         full_scale: what the largest count is called, N.
         pitch: between neighbouring taxels, m. Not in the file; nothing but the features of
             ``learner=boosted_trees`` depends on more than proportions.
         split_seed: what the subjects of the splits are drawn from: about 60/10/10/20 per cent of them.
         test_subjects: number or numbers of the subjects of ``test``; None draws them.
-        strict: demand the whole corpus, to the row.
+        strict: require the complete corpus.
 
     Attributes:
         sensors: as ``taxels`` and ``pitch`` place them; channels 1 to 8 are the upper row, from the left.
@@ -80,7 +80,7 @@ class Cost(AbstractDevice):
         subjects: split -> its subjects.
 
     Raises:
-        InputError: settings that cannot be used, no file, or one that is not in the corpus's format.
+        InputError: invalid settings, no file, or a file that is not in the corpus's format.
     """
 
     body: AbstractBody | None = None
@@ -117,7 +117,7 @@ class Cost(AbstractDevice):
         self.subjects = self._divide(np.unique(self._captures.subject))
 
     def _check(self) -> None:
-        """Refuse settings that cannot be used, before a large file is read."""
+        """Check the settings before a large file is read."""
         if self.path is None:
             raise InputError(
                 f"device=cost needs the file CoST.csv, which is not shipped: download it from {SOURCE} and "
@@ -131,10 +131,10 @@ class Cost(AbstractDevice):
 
     def _read(self, names: tuple[str, ...]) -> None:
         path = Path(str(self.path)).expanduser()
-        found = captures(path, self.window)
+        found = cached_captures(path, self.window)
         rows = int(found.frames.sum(dtype=np.int64))
         if self.strict and (rows, len(found)) != (ROWS, CAPTURES):
-            raise refusal(
+            raise format_error(
                 path,
                 f"it has {rows} rows in {len(found)} captures, the whole corpus has {ROWS} in {CAPTURES}",
                 "add device.strict=false to use a part of it, or download it again",
@@ -147,7 +147,7 @@ class Cost(AbstractDevice):
         self._captures = found[wanted]
 
     def _divide(self, subjects: np.ndarray) -> dict[Split, list[int]]:
-        """Return the subjects of each split, drawn in an order that only ``split_seed`` decides."""
+        """Return the subjects of each split; the order depends on ``split_seed`` alone."""
         order = generator(Stream.SPLIT, self.split_seed).permutation(subjects).tolist()
         taken = {name: max(1, round(share * len(order))) for name, share in _SHARES.items()}
         if self.test_subjects is not None:
@@ -201,10 +201,10 @@ def _numbers(given: int | Sequence[int], name: str) -> list[int]:
 
 
 def _channels(taxels: int | Sequence[int], seed: int) -> np.ndarray:
-    """Return which taxels, (S,), counted from 0 and rising.
+    """Return the indices of the taxels, (S,), from 0, in rising order.
 
-    A number of them is spread by farthest points: each next one is as far as can be from all before it, the
-    first and the choice among equals being random.
+    A number of taxels is selected by farthest-point sampling, with a random first one and random choice among
+    equals.
     """
     count = _EDGE**2
     if isinstance(taxels, int):

@@ -6,12 +6,12 @@ import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.device._blank import Blank
-from skin.device._split import rows
+from skin.device._split import split_rows
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.storage import read
+from skin.recording_file import read_recording
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
@@ -23,10 +23,10 @@ class Recorded(AbstractDevice):
 
     Args:
         path: ``x.parquet`` or ``x.csv``.
-        body: the sheet, to be compared with the file's.
-        layout: where the sensors are, to be compared with the file's.
-        split_seed: what the split is drawn from.
-        test: ``holdout``, or ``all`` touches, for a run that learnt from others.
+        body: the sheet; it is compared with the file's.
+        layout: positions of the sensors; they are compared with the file's.
+        split_seed: seed of the split.
+        test: ``holdout``, or ``all`` touches, for a run that was trained on others.
 
     Attributes:
         sensors: as ``layout`` gives them.
@@ -48,14 +48,14 @@ class Recorded(AbstractDevice):
     ) -> None:
         if path is None:
             raise InputError("device=recording needs a file: add device.path=x.parquet")
-        self._recording = read(path)
+        self._recording = read_recording(path)
         if test not in ("holdout", "all"):
             raise InputError(f"device.test must be holdout or all, got {test}")
         self._test = test
         if len(self._recording) < 10 and test == "holdout":
             raise InputError(
                 f"{path} has {len(self._recording)} touches: 80/10/10 needs at least 10, or a "
-                "run that learnt from others and device.test=all"
+                "run that was trained on others and device.test=all"
             )
         self.path, self.split_seed = path, split_seed
         self.sensors = layout.sensors(body)
@@ -86,7 +86,7 @@ class Recorded(AbstractDevice):
             )
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the touches of a split; a file has no fresh ones."""
+        """Return the touches of a split, the same in every epoch."""
         return self.recording(split, epoch).touches
 
     def all_touches(self) -> Touches:
@@ -102,8 +102,8 @@ class Recorded(AbstractDevice):
         return Source.of_newtons(self.path, open_skin(self.path, self.sensors), len(self.sensors))
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return all that the file holds of a split; None takes the whole file."""
+        """Return the recording of a split; None takes the whole file."""
         if split is None or (split == "test" and self._test == "all"):
             return self._recording
         part: Split = "holdout" if split == "test" else split
-        return self._recording[rows(part, len(self._recording), self.split_seed)]
+        return self._recording[split_rows(part, len(self._recording), self.split_seed)]

@@ -16,20 +16,28 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.signal.calibration import read
+from skin.signal.calibration import read_calibration
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.announcement import Tap
-from skin.wire.conversion import Newtons, newtons
-from skin.wire.detect import Format
+from skin.wire.announcement import AnnouncementListener
+from skin.wire.conversion import UnitConversion, unit_conversion
 from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.open import Settings, open_skin
-from skin.wire.segmentation import AbstractDirector, Announced, Continuous, Prompted, Take, plan, sentence
+from skin.wire.format_detection import Format
+from skin.wire.open import PortSettings, open_skin
+from skin.wire.segmentation import (
+    AbstractSegmenter,
+    AnnouncedSegmenter,
+    ContinuousSegmenter,
+    PromptedSegmenter,
+    RecordedGesture,
+    label_plan,
+    label_text,
+)
 from skin.wire.skin import Skin
 from skin.wire.source import Source
-from skin.wire.tare import Tare, settle
+from skin.wire.tare import Tare, warm_up
 from skin.wire.text import Header
-from skin.wire.transport import open_wire
+from skin.wire.transport import open_stream
 
 _LABELS = ("announced", "prompted", "none")
 _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
@@ -37,28 +45,28 @@ _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
 
 @dataclass(kw_only=True, eq=False)
 class Serial(AbstractWired):
-    """Yields the gestures that somebody, or the emulator, does on a skin: its only split is ``test``.
+    """Yields gestures on a real or emulated skin; its only split is ``test``.
 
-    Readings are N without offset: the baseline is taken off, of values that are already reduced, because the
-    maximum of noise is not 0.
+    Readings are in N above the baseline, which is taken from resampled values, because the maximum of noise
+    is not 0.
 
     Args:
         body: the sheet of the model.
-        layout: where its sensors are; the device must send as many values.
+        layout: positions of its sensors; the device must send as many values.
         port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
         labels: ``announced``, ``prompted`` or ``none``.
-        gestures: how many.
+        gestures: number of gestures.
         seed: of the order of prompts.
-        tare: s.
-        trigger: N.
+        tare: duration of the tare, s.
+        trigger: force above which a window begins with ``labels=none``, N.
         scale: N per unit.
-        calibration: file.
+        calibration: calibration file.
         window: T, frames of the model.
         rate: of the model, Hz; None: 10.
-        stream: the labels have ``touch`` too.
+        stream: add the label ``touch``.
 
     Raises:
-        InputError: settings that cannot be used, or a device that does not fit the model.
+        InputError: invalid settings, or a device that does not match the model.
     """
 
     body: AbstractBody
@@ -92,22 +100,22 @@ class Serial(AbstractWired):
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
         self._settings: dict[str, Any] = {name: getattr(self, name) for name in _AS_OPENED}
         self._settings["limits"] = None if self.limits is None else tuple(self.limits)
-        Settings(**self._settings)  # refuses what cannot be used
+        PortSettings(**self._settings)  # checks them
         self.rate = 10.0 if self.rate is None else float(self.rate)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self._known = None if self.calibration is None else read(self.calibration)
+        self._known = None if self.calibration is None else read_calibration(self.calibration)
         if self._known is not None:
             self._known.fits(len(self.sensors))
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the gestures, read when first asked for; labels are None where nobody knows them."""
+        """Return the gestures, read at the first call; labels are None if unknown."""
         return self.recording(split).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the gestures of ``test``, read when first asked for."""
+        """Return the gestures of ``test``, read at the first call."""
         if split != "test":
             raise InputError(
                 f"device=serial has the split test alone, not {split or 'a budget'}: record a session with "
@@ -118,83 +126,93 @@ class Serial(AbstractWired):
         return self._recording
 
     def blank(self) -> AbstractDevice:
-        """Return a device whose touches have the same shape and are 0: a run is restored without a touch."""
+        """Return a device with touches of the same shapes that are 0, so that no touch is read."""
         assert self.rate is not None
         empty = torch.zeros(1, self.window, len(self.sensors))
         touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)
         return Blank(self.task, self.size, touches)
 
-    def open(self, reconnect: bool = False) -> tuple[Skin, Tap]:
-        """Open the port, and listen to its announcements; ``reconnect`` waits for an unplugged skin."""
+    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
+        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
         if self.port is None:
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        tap = Tap(partial(open_wire, self.port, self.baudrate))
-        return open_skin(self.port, self.sensors, opener=tap, reconnect=reconnect, **self._settings), tap
+        listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
+        return open_skin(
+            self.port, self.sensors, opener=listener, reconnect=reconnect, **self._settings
+        ), listener
 
     def source(self) -> Source:
-        """Open the port, and wait for a skin that is unplugged."""
+        """Open the port as a stream of frames; wait for an unplugged skin."""
         skin, _ = self.open(reconnect=True)
         return Source(str(self.port), skin, self.taring(skin))
 
-    def settle(self, skin: Skin) -> tuple[list[Frame], Newtons]:
-        """Return the first frames and what values mean: is the device fast enough, what is it untouched?"""
+    def warm_up(self, skin: Skin) -> tuple[list[Frame], UnitConversion]:
+        """Read the first frames: check the rate and take the baseline."""
         assert self.rate is not None
         tare = self.taring(skin)
         try:
-            frames = settle(skin, tare, self.rate, self.tare, _say)
+            frames = warm_up(skin, tare, self.rate, self.tare, _say)
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{self.port}: {error}") from error
-        assert tare.newtons is not None
-        return frames, tare.newtons
+        assert tare.conversion is not None
+        return frames, tare.conversion
 
     def taring(self, skin: Skin) -> Tare:
-        """Return what finds out what the values of an open skin mean."""
+        """Return the tare of an open skin."""
         assert self.rate is not None
-        return Tare(self.meaning, self.tare, self.rate, lambda: skin.header)
+        return Tare(self.conversion, self.tare, self.rate, lambda: skin.header)
 
-    def meaning(self, baseline: np.ndarray | None, header: Header | None) -> Newtons:
-        """Return what values mean, given a baseline (S,) and what the device tells of itself.
+    def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
+        """Return the conversion of values to N, given a baseline (S,) and the header of the device.
 
         Raises:
-            InputError: nobody knows what a count is worth.
+            InputError: the scale is unknown.
         """
-        return newtons(len(self.sensors), baseline, self.scale, self._known, header)
+        return unit_conversion(len(self.sensors), baseline, self.scale, self._known, header)
 
-    def director(
-        self, tap: Tap, meaning: Newtons, first: Sequence[Frame], done: Collection[int] = ()
-    ) -> AbstractDirector:
-        """Return what finds the gestures of a stream, as ``labels`` says."""
+    def segmenter(
+        self,
+        listener: AnnouncementListener,
+        conversion: UnitConversion,
+        first: Sequence[Frame],
+        done: Collection[int] = (),
+    ) -> AbstractSegmenter:
+        """Return the segmenter that ``labels`` selects."""
         assert self.rate is not None
         window = Window(self.window, self.rate, len(self.sensors))
         for frame in first:
             window.add(frame)
         if self.labels == "announced":
-            return Announced(window, tap, self.task)
+            return AnnouncedSegmenter(window, listener, self.task)
         if self.labels == "none":
             known = np.ones(len(self.sensors), dtype=bool)
-            return Continuous(
+            return ContinuousSegmenter(
                 window,
                 max(done, default=-1) + 1,
-                lambda values: bool((meaning(values, known)[0] > self.trigger).any()),
+                lambda values: bool((conversion(values, known)[0] > self.trigger).any()),
             )
-        wanted = enumerate(plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
-        return Prompted(
+        wanted = enumerate(label_plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
+        return PromptedSegmenter(
             window, (one for one in wanted if one[0] < self.gestures and one[0] not in done), _say
         )
 
-    def stored(self, takes: Sequence[Take], meaning: Newtons) -> Recording:
+    def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
         """Return gestures as a recording."""
-        touches = self._touches([take.seen for take in takes if take.seen is not None], meaning)
-        if takes and takes[0].labels is not None:
-            rows = [[float(value) for value in take.labels.values()] for take in takes if take.labels]
+        touches = self._touches(
+            [gesture.resampled for gesture in gestures if gesture.resampled is not None], conversion
+        )
+        if gestures and gestures[0].labels is not None:
+            rows = [
+                [float(value) for value in gesture.labels.values()] for gesture in gestures if gesture.labels
+            ]
             touches = replace(touches, labels=torch.tensor(rows))
-        about = {"source": "serial", "lost": [take.lost for take in takes]}
+        about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
 
-    def _touches(self, windows: Sequence[Resampled], meaning: Newtons) -> Touches:
+    def _touches(self, windows: Sequence[Resampled], conversion: UnitConversion) -> Touches:
         """Return windows in the device's unit as touches."""
         assert self.rate is not None
-        readings, valid = meaning(
+        readings, valid = conversion(
             np.stack([window.values for window in windows]), np.stack([window.valid for window in windows])
         )
         saturated = valid & np.stack([window.saturated for window in windows])
@@ -202,39 +220,42 @@ class Serial(AbstractWired):
         return Touches(known[0], known[1], self._positions, None, self.rate, saturated=known[2])
 
     def _record(self) -> Recording:
-        """Read gestures until there are enough, the skin falls silent, or a person ends it."""
-        takes: list[Take] = []
-        skin, tap = self.open()
+        """Read gestures until there are enough, the skin stops sending, or the user ends it."""
+        gestures: list[RecordedGesture] = []
+        skin, listener = self.open()
         with skin:
-            first, meaning = self.settle(skin)
-            director = self.director(tap, meaning, first)
+            first, conversion = self.warm_up(skin)
+            segmenter = self.segmenter(listener, conversion, first)
             _say(f"waiting for {self.gestures} gestures, labels {self.labels}")
-            for take in self._takes(skin, director):
-                takes.append(take)
-                words = "" if take.labels is None else f": {sentence(take.labels)}"
+            for gesture in self._finished_gestures(skin, segmenter):
+                gestures.append(gesture)
+                words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
                 _say(
-                    f"{len(takes)}/{self.gestures}{words}" + (f" ({take.lost} frames lost)" * bool(take.lost))
+                    f"{len(gestures)}/{self.gestures}{words}"
+                    + (f" ({gesture.lost} frames lost)" * bool(gesture.lost))
                 )
-                if len(takes) == self.gestures:
+                if len(gestures) == self.gestures:
                     break
-        if not takes:
-            raise InputError("no gesture came: does the emulator announce, does something touch the skin?")
-        return self.stored(takes, meaning)
+        if not gestures:
+            raise InputError(
+                "no gesture was read: does the emulator announce, does something touch the skin?"
+            )
+        return self.to_recording(gestures, conversion)
 
-    def _takes(self, skin: Skin, director: AbstractDirector) -> Iterator[Take]:
+    def _finished_gestures(self, skin: Skin, segmenter: AbstractSegmenter) -> Iterator[RecordedGesture]:
         try:
             for frame in skin:
-                take = director.show(frame)
-                if take is not None and take.broken:
-                    _say(f"gesture {take.number} broke off: the device started anew")
-                elif take is not None:
-                    yield take
-                if director.over:
+                gesture = segmenter.add(frame)
+                if gesture is not None and gesture.broken:
+                    _say(f"gesture {gesture.number} was interrupted: the device restarted")
+                elif gesture is not None:
+                    yield gesture
+                if segmenter.over:
                     return
         except (SkinTimeout, SkinDisconnected) as end:
             _say(str(end))
 
 
 def _say(text: str) -> None:
-    """Tell the person at the skin; results go to standard output."""
+    """Print a message for the user; results go to standard output."""
     print(text, file=sys.stderr, flush=True)

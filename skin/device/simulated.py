@@ -13,7 +13,7 @@ from skin import __version__
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
-from skin.device._split import parts, rows
+from skin.device._split import split_rows, split_slices
 from skin.device._threads import in_threads
 from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import misplaced, modelled, refuse_relaxation
@@ -21,10 +21,10 @@ from skin.device.base import AbstractSimulated, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
-from skin.recording import Recording, Touches, join
+from skin.recording import Recording, Touches, concatenate
 from skin.rng import Stream, generator
 from skin.sensors import Sensors
-from skin.settings import check
+from skin.settings import check_settings
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.simulator.base import AbstractSimulator
 from skin.summary import summarise
@@ -41,33 +41,33 @@ _VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__vers
 
 @dataclass(kw_only=True, eq=False)
 class Simulated(ImperfectionSettings, AbstractSimulated):
-    """Yields gestures sampled from seeds alone, as a device with imperfections feels them.
+    """Yields simulated gestures, measured by a device with imperfections.
 
     Training, validation and holdout are 80/10/10 of one budget of gestures; test gestures come from a stream
-    of randomness that no training seed can draw, and are the same for all of them.
+    of randomness that no training seed can select, and are the same for all seeds.
 
     Args:
-        body, layout: the sheet, and where its sensors are.
+        body, layout: the sheet, and the positions of its sensors.
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
-        contact: ``contact(body, simulator)`` makes pressure of them.
+        contact: ``contact(body, simulator)`` gives the pressure of a gesture.
         touch: difficulty of the gestures (``conf/touch.yaml``).
-        gestures, test_gestures: how many the budget and ``test`` have.
+        gestures, test_gestures: number of gestures of the budget and of ``test``.
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
-        stream: touches are windows of streams of gestures with idle gaps between them: a window shows part
-            of a gesture, a whole one or none, and has the label ``touch`` too. Each split has its own.
+        stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
+            of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
         direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
-        data_seed: what the budget is drawn from.
-        seed: what the device's constants and the noise are drawn from: another number, another device.
+        data_seed: seed of the budget.
+        seed: seed of the device's constants and noise; each seed is another device.
         gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`.
-        calibration: file of skin calibrate, which takes the place of all these but dead, tare and rate.
-        randomise: every gesture is felt by a device of its own.
-        position_error: standard deviation of the true sensors' places about those that touches report, m.
-        track: whether touches tell how far sensors have moved (docs/adr/0007): ``none``, ``oracle`` (what the
-            simulator knows) or ``estimated`` from readings; both need sensors that move along the sheet.
+        calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
+        randomise: measure every gesture with another device.
+        position_error: standard deviation of the true sensor positions from the reported ones, m.
+        track: motion of the sensors in touches (docs/adr/0007): ``none``, ``oracle`` (from the simulator) or
+            ``estimated`` from readings; both need sensors that move along the sheet.
 
     Raises:
-        InputError: settings that cannot be used.
+        InputError: invalid settings.
     """
 
     body: AbstractBody
@@ -105,8 +105,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self._kept: dict[str, Recording] = {}
 
     def _refuse(self) -> None:
-        """Refuse settings that cannot be used, or not together."""
-        check(type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device")
+        """Check the settings, and combinations that are not possible."""
+        check_settings(
+            type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device"
+        )
         if self.stream and self.direction:
             raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
         if self.stream or self.track != "none":
@@ -117,12 +119,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return TouchSampler(body, body.footprints(sensors), contact, self.touch, self.padded)
 
     def _tracker(self) -> Tracker:
-        """Return what tells how far sensors have moved."""
+        """Return the tracker that ``track`` selects."""
         if self.track == "none":
             return Tracker()
         if self.track == "oracle":
             return oracle(self.model, self.body.shape)
-        # As for a real skin: nobody knows where its sensors truly are or how its layers vary.
+        # As for a real skin, whose true sensor positions and layer variations are unknown.
         body = replace(self.body, variation=0.0)
         model = self.simulator(body, self.sensors)
         sampler = self._sampler(body, self.sensors, model)
@@ -143,7 +145,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return replace(self, **changes)
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
-        """Return the touches of a split; fixed ones are drawn once and kept."""
+        """Return the touches of a split; those that do not depend on the epoch are cached."""
         return self._split(split, epoch, complete=False).touches
 
     def fresh_touches(self, count: int) -> Touches:
@@ -163,18 +165,18 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         if split == "test":
             return self._keep("test", complete, Stream.TEST, self.test_gestures)
         if split == "train" and self.fresh:
-            count = parts(self.gestures)["train"].stop
+            count = split_slices(self.gestures)["train"].stop
             return self._draw(complete, Stream.FRESH, count, self.data_seed, epoch)
         if self.stream:
             return self._streams(split, complete)
         budget = self._keep("budget", complete, Stream.BUDGET, self.gestures, self.data_seed)
-        return budget if split is None else budget[rows(split, self.gestures, self.data_seed)]
+        return budget if split is None else budget[split_rows(split, self.gestures, self.data_seed)]
 
     def _streams(self, split: Split | None, complete: bool) -> Recording:
         """Return the windows of a split of the budget: they overlap, so no stream is split."""
-        own = parts(self.gestures)
+        own = split_slices(self.gestures)
         if split is None:
-            return join([self._streams(name, complete) for name in own])
+            return concatenate([self._streams(name, complete) for name in own])
         count = len(range(self.gestures)[own[split]])
         return self._keep(split, complete, Stream.BUDGET, count, self.data_seed, [*own].index(split))
 
@@ -189,10 +191,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         """Draw gestures or windows in batches; ``complete`` adds the displacements."""
         cuts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
         if self.stream:
-            return join(in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts)))
+            return concatenate(
+                in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts))
+            )
         wanted = balanced(count, generator(stream, *key, 0))
         found = in_threads(lambda n: self._batch(wanted[cuts[n]], complete, stream, (*key, 1 + n)), len(cuts))
-        return join(found)
+        return concatenate(found)
 
     @torch.no_grad()
     def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
@@ -223,12 +227,14 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return TouchStream(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
 
     def _true(self, movie: Movie, complete: bool) -> Recording:
-        """Return gestures as perfect sensors read them; ``complete`` adds displacements and strains."""
+        """Return the true readings of gestures; ``complete`` adds displacements and strains."""
         readings, displacement = self.model.respond(movie, displacement=complete)
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, float(self.rate), self.tracker.known(movie))
+        touches = Touches(
+            readings, valid, positions, labels, float(self.rate), self.tracker.true_motion(movie)
+        )
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # A stream's windows have labels of their own.
@@ -236,14 +242,16 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         return Recording(touches, *about, movie.force, displacement, movie.parameters | known)
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
-        """Return true readings as the device tells them."""
+        """Return true readings with the imperfections of the device."""
         force, constants = true.touches.readings, self.constants
         if self.randomise:
             constants = self.imperfection.constants(len(self.sensors), noise, len(true))
         readings, valid, saturated = self.imperfection.apply(force, constants, noise)
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
-        return replace(true, touches=self.tracker.told(touches), parameters=true.parameters | clipped)
+        return replace(
+            true, touches=self.tracker.with_estimate(touches), parameters=true.parameters | clipped
+        )
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
         about: dict[str, Any] = {"source": "simulated", "simulator": type(self.model).__name__}

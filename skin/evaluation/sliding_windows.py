@@ -17,7 +17,7 @@ from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Predictor
 from skin.evaluation.stream_settings import StreamSettings
 from skin.labels import TOUCH_OR_NOT, Task
-from skin.signal.contact_threshold import Gate, Threshold, gates, rise
+from skin.signal.contact_threshold import ContactThreshold, Gate, gates, rise
 
 _CHUNK = 1024
 _EDGES = (0.2, 0.4, 0.6, 0.8)
@@ -125,11 +125,11 @@ def evaluate_windows(
     )
 
 
-def _tuned(device: AbstractSimulated) -> Threshold:
+def _tuned(device: AbstractSimulated) -> ContactThreshold:
     """Return the threshold that separates touched from idle windows, tuned on the validation split."""
     known, idle = device.touches("validation"), device.idle
     assert known.labels is not None
-    return Threshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
+    return ContactThreshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
 
 
 def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:

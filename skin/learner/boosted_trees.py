@@ -12,10 +12,10 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.foreign import arrays
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.safe_loading import load_npz
 from skin.signal.features import engineered_features
 from skin.signal.sliding_direction import direction_features
 
@@ -89,7 +89,7 @@ class BoostedTrees(AbstractLearner):
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Grow the trees again from the file that :meth:`save` wrote; takes some seconds."""
-        table = arrays(path)
+        table = load_npz(path)
         columns = _matrix(data.touches("train")[:1], data.task).shape[1]
         for split in ("train", "validation"):
             values, labels = table[split], table[f"{split}_labels"]

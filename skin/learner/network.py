@@ -13,11 +13,11 @@ from annotated_types import Ge, Le, Lt
 from torch import Tensor
 
 from skin.config import PARENT
+from skin.error_messages import one_line
 from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
-from skin.refusal import sentence
 from skin.representation.base import Frames
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class Network(AbstractLearner):
                 default_root_dir=folder,
             )
         except (TypeError, ValueError, MisconfigurationException) as error:
-            raise InputError(f"pytorch_lightning.Trainer refuses trainer: {sentence(error)}") from error
+            raise InputError(f"pytorch_lightning.Trainer refuses trainer: {one_line(error)}") from error
         _check(trainer)
         return trainer
 

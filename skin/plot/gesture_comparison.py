@@ -11,12 +11,13 @@ import torch
 
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.hardware.emulator.gestures import Gesture, alike, gestures
-from skin.hardware.record import log
+from skin.hardware.emulator.gestures import Gesture, emulated_gestures, gestures_with_labels
+from skin.hardware.record.session_log import check_session
+from skin.hardware.record.session_reader import read_session
 from skin.labels import TOUCH
 from skin.recording import Touches
 from skin.rng import Stream, generator
-from skin.wire.segmentation import sentence
+from skin.wire.segmentation import label_text
 
 _IDLE = 30  # frames before a simulated gesture, which give its baseline
 
@@ -105,22 +106,28 @@ def read_gestures(device: AbstractSimulated, path: str, seed: int) -> Gestures:
     Raises:
         InputError: no session, no labels in it, another layout, window or rate, or another emulator's.
     """
-    stored = log.read(Path(path).expanduser())
+    stored = read_session(Path(path).expanduser())
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
-    log.check(Path(path), stored.about, now)
-    takes = [entry for _, entry in sorted(stored.takes.items()) if entry[0].labels is not None]
+    check_session(Path(path), stored.about, now)
+    takes = [entry for _, entry in sorted(stored.gestures.items()) if entry[0].labels is not None]
     if not takes:
         raise InputError(f"{path} has no gesture with labels: record it with device.labels=prompted")
     same = stored.about.get("labels") == "announced"
     numbers, labels = [take.number for take, _ in takes], [dict(take.labels or {}) for take, _ in takes]
     if same:
-        played = list(islice(gestures(device, seed), max(numbers) + 1))
+        played = list(islice(emulated_gestures(device, seed), max(numbers) + 1))
         drawn = [played[number] for number in numbers]
         _are(drawn, numbers, labels)
     else:
-        drawn = alike(device, np.array([[one[name] for name in TOUCH.names] for one in labels]), seed)
+        drawn = gestures_with_labels(
+            device, np.array([[one[name] for name in TOUCH.names] for one in labels]), seed
+        )
     felt = _felt(device, drawn)
-    recorded = [meaning(take.seen.values, take.seen.valid) for take, meaning in takes if take.seen]
+    recorded = [
+        conversion(take.resampled.values, take.resampled.valid)
+        for take, conversion in takes
+        if take.resampled
+    ]
     working = ~device.constants.dead.numpy()
     pairs = [
         Pair(number, known, one.applied, simulated, values.astype(float), valid & working)
@@ -136,8 +143,8 @@ def _are(drawn: Sequence[Gesture], numbers: Sequence[int], labels: Sequence[Mapp
     for number, one, said in zip(numbers, drawn, labels, strict=True):
         if any(said.get(name, on) != on for name, on in one.labels.items()):
             raise InputError(
-                f"gesture {number} of the session is {sentence(said)}, the simulated one is "
-                f"{sentence(one.labels)}: give the emulator's settings, and its emulate.seed as compare.seed"
+                f"gesture {number} of the session is {label_text(said)}, the simulated one is "
+                f"{label_text(one.labels)}: give the emulator's settings and its emulate.seed as compare.seed"
             )
 
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from skin.plot.figures import COLOURS, save_figure
 from skin.plot.gesture_comparison import Gestures
 from skin.plot.press_comparison import Verdicts, agreement
-from skin.wire.segmentation import sentence
+from skin.wire.segmentation import label_text
 
 
 def gestures_markdown(found: Gestures, verdicts: Verdicts | None, about: str) -> str:
@@ -52,7 +52,7 @@ def gestures_markdown(found: Gestures, verdicts: Verdicts | None, about: str) ->
     for pair, ratio in zip(pairs, ratios, strict=True):
         rmse = f"{pair.rmse:.3f}" if same else ""
         lines.append(
-            f"| {pair.number}: {sentence(pair.labels)} | {pair.sensor} | {pair.applied.max():.1f} | "
+            f"| {pair.number}: {label_text(pair.labels)} | {pair.sensor} | {pair.applied.max():.1f} | "
             f"{pair.peaks[0]:.2f} | {pair.peaks[1]:.2f} | {ratio:.3f} | {rmse} |"
         )
     return "\n".join(lines) + "\n"

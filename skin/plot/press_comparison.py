@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration import bench_session, gauge
-from skin.hardware.calibration.bench import Bench, bench
+from skin.hardware.calibration.bench_data import BenchData, build_bench_data
 from skin.plot.figures import COLOURS, save_figure
 from skin.recording import Touches
 from skin.rng import Stream, generator
@@ -52,7 +52,7 @@ class Comparison:
         presses: one by one.
     """
 
-    bench: Bench
+    bench: BenchData
     simulated: np.ndarray
     recorded: np.ndarray
     valid: np.ndarray
@@ -106,15 +106,15 @@ def read_presses(
         InputError: files that cannot be used, or that do not fit each other.
     """
     shape = settings["indenter"], settings["radius"]
-    said = bench_session.read(path, *shape, settings["unit"])
-    rows = None if presses is None else gauge.read(presses, *shape, settings["delay"])
-    found = compare(device, bench(device, said, rows), settings["scale"])
+    said = bench_session.read_bench_session(path, *shape, settings["unit"])
+    rows = None if presses is None else gauge.read_gauge(presses, *shape, settings["delay"])
+    found = compare(device, build_bench_data(device, said, rows), settings["scale"])
     if not found.presses:
         raise InputError("no press has frames in the session: check the clocks, see compare.delay")
     return found
 
 
-def compare(device: AbstractSimulated, bench: Bench, scale: float | None) -> Comparison:
+def compare(device: AbstractSimulated, bench: BenchData, scale: float | None) -> Comparison:
     """Simulate a session's presses on a device, and compare reading by reading.
 
     Args:

@@ -1,4 +1,4 @@
-"""Data augmentation: changes of a touch that leave its labels true."""
+"""Data augmentation: changes of a touch that keep its labels."""
 
 from dataclasses import dataclass, replace
 
@@ -19,14 +19,14 @@ _MARGIN = 2  # frames that a touch may last beyond what stands out
 class Augmentation:
     """Shifts, reverses, scales and blurs touches of a training batch.
 
-    None of it needs a simulator, so it serves recordings of a real skin too. It presumes that a window holds
-    a touch whole, with idle frames around it.
+    It needs no simulator, so it applies to recordings of a real skin too. It assumes that a window contains a
+    whole touch with idle frames around it.
 
     Args:
-        shift: move the touch in its window, as far as it stays whole; idle frames go round.
-        reverse: let time run backwards, for every second touch.
+        shift: shift the touch in its window, as far as it stays whole; idle frames wrap around.
+        reverse: reverse time with probability 0.5.
         gain: standard deviation of the logarithm of a factor per sensor and touch.
-        noise: standard deviation of what is added to every reading, N.
+        noise: standard deviation of the noise added to every reading, N.
 
     Raises:
         InputError: a negative number.
@@ -38,13 +38,13 @@ class Augmentation:
     noise: NonNegativeFloat = 0.0
 
     def __call__(self, touches: Touches, generator: torch.Generator) -> Touches:
-        """Return changed touches; ``generator`` is where all randomness comes from.
+        """Return augmented touches; ``generator`` is the source of randomness.
 
         Raises:
-            InputError: touches whose sensors move: what they do under a shift is not known.
+            InputError: touches whose sensors move, for which shifts are not defined.
         """
         if touches.motion is not None:
-            raise InputError("data.augment knows nothing of sensors that move: set device.track=none")
+            raise InputError("data.augment does not support sensors that move: set device.track=none")
         count, time, sensors = touches.readings.shape
         order = torch.arange(time).expand(count, time)
         if self.shift:
@@ -62,7 +62,7 @@ class Augmentation:
         return replace(touches, readings=readings, valid=valid, saturated=saturated)
 
     def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
-        """Draw by how many frames each touch moves, (B,), so that none is torn apart."""
+        """Draw the shift of each touch, (B,), frames, such that none is cut."""
         raw = touches.readings * touches.valid
         idle = raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
         force = (raw - idle).clamp(min=0).sum(dim=2)

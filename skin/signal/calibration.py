@@ -11,8 +11,8 @@ import numpy as np
 
 from skin import files
 from skin.errors import InputError
-from skin.foreign import settings
 from skin.paths import candidates
+from skin.safe_loading import load_yaml
 
 FORMAT = 1
 QUANTITIES = {
@@ -25,28 +25,27 @@ QUANTITIES = {
     "clip": math.inf,
     "quantum": 0.0,
 }
-"""Quantities per sensor, as :class:`skin.signal.imperfection.Constants` has them, and what stands for unknown
-ones."""
+"""Quantities per sensor, as in :class:`skin.signal.imperfection.Constants`, with defaults."""
 _SIGNED = ("offset", "drift")
 BROKEN = ("dead", "stuck", "saturated")
-"""Why readings mean nothing; ``stuck`` and ``saturated`` sensors say their ``offset`` all the time."""
+"""Kinds of broken sensors; ``stuck`` and ``saturated`` ones always read their ``offset``."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The constants of a device, and the ranges that others of its kind are drawn from.
+    """The constants of a device, and ranges from which similar devices are drawn.
 
     Attributes:
-        sensors: quantity -> a number per sensor, None where nothing is known; units as in ``QUANTITIES``.
+        sensors: quantity -> a number per sensor, None if unknown.
         broken: kind of ``BROKEN`` -> numbers of sensors, from 0.
         ranges: quantity -> (low, high), drawn evenly for every sensor of a device; ``dead`` -> (fewest, most)
             sensors of a device that are dead.
         scale: N per raw unit of the session; 1 where that is N.
         zero: raw units that stand for 0 N before offsets: a raw value is (raw - zero) scale, N.
-        about: whence this is; anything that JSON can hold.
+        about: origin of the calibration; any JSON data.
 
     Raises:
-        InputError: another name, lengths that differ, a number that is out of bounds.
+        InputError: an unknown name, different lengths, or a number out of range.
     """
 
     sensors: Mapping[str, Sequence[float | None]]
@@ -80,17 +79,17 @@ class Calibration:
         return len(next(iter(self.sensors.values())))
 
     def newtons(self, raw: np.ndarray) -> np.ndarray:
-        """Return raw values in N, with offsets and gains: what a simulated device of this kind says."""
+        """Return raw values in N, with offsets and gains, like the readings of a simulated device."""
         return (raw - self.zero) * self.scale
 
     def corrected(self, raw: np.ndarray) -> np.ndarray:
-        """Return the true readings behind raw values, (..., S), N: no offset, gain 1; broken ones NaN."""
+        """Return the true readings of raw values, (..., S), N: no offset, gain 1; NaN for broken sensors."""
         values = self.values()
         true = (self.newtons(raw) - values["offset"]) / values["gain"]
         return np.where(values["dead"], np.nan, true)
 
     def fits(self, sensors: int) -> None:
-        """Raise InputError where this is not the calibration of so many sensors."""
+        """Raise InputError if the calibration has another number of sensors."""
         if sensors != len(self):
             raise InputError(
                 f"the calibration has {len(self)} sensors, the layout {sensors}: give the layout that it was "
@@ -98,9 +97,9 @@ class Calibration:
             )
 
     def known(self, name: str) -> np.ndarray:
-        """Return a quantity, (S,): the median of the known where one is unknown, neutral where all are.
+        """Return a quantity, (S,): unknown values are the median of known ones, or neutral without any.
 
-        So a sensor that was never driven to its limit clips where the others do: channels share a converter.
+        A sensor that was never driven to its limit thus clips like the others: channels share a converter.
         """
         given = np.array([np.nan if value is None else value for value in self.sensors.get(name, [None])])
         given = np.broadcast_to(given, (len(self),))
@@ -110,7 +109,7 @@ class Calibration:
         return np.where(np.isnan(given), spare, given)
 
     def values(self) -> dict[str, np.ndarray]:
-        """Return every quantity, (S,), with ``dead`` and the ``level`` that broken sensors say, N."""
+        """Return every quantity, (S,), with ``dead`` and the constant ``level`` of broken sensors, N."""
         found = {name: self.known(name) for name in QUANTITIES}
         dead = np.zeros(len(self), dtype=bool)
         dead[[number for group in self.broken.values() for number in group]] = True
@@ -119,9 +118,9 @@ class Calibration:
         return found | {"dead": dead, "level": level}
 
     def draw(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
-        """Return the same for devices of this kind, (..., S) each, drawn from the ranges.
+        """Return the same for similar devices, (..., S) each, drawn from the ranges.
 
-        What has no range keeps its values. Sensors that are broken here need not be there.
+        Quantities without a range keep their values. Broken sensors are drawn as well.
         """
         own, found = self.values(), dict[str, np.ndarray]()
         for name in QUANTITIES:
@@ -134,20 +133,20 @@ class Calibration:
         return found | {"dead": rank < count, "level": np.zeros(shape)}
 
 
-def read(path: str | Path) -> Calibration:
-    """Read a file that :func:`write` or a person wrote; a single number stands for every sensor.
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration file; a single number applies to every sensor.
 
     Args:
-        path: a relative one is looked for in the current folder, then beside the package.
+        path: YAML file; relative paths are searched in the current folder, then beside the package.
 
     Raises:
-        InputError: no such file, unreadable, or contents that cannot be used.
+        InputError: no such file, unreadable, or invalid contents.
     """
     found = next((place for place in candidates(path) if place.is_file()), None)
     if found is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
-        stored: Any = settings(found)
+        stored: Any = load_yaml(found)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the calibration {found}: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
@@ -168,8 +167,8 @@ def read(path: str | Path) -> Calibration:
         raise InputError(f"{found} is no calibration: {error}") from error
 
 
-def write(calibration: Calibration, path: str | Path) -> Path:
-    """Write a calibration whole, one quantity a line.
+def write_calibration(calibration: Calibration, path: str | Path) -> Path:
+    """Write a calibration atomically, one quantity per line.
 
     Raises:
         InputError: the file cannot be written.

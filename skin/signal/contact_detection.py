@@ -1,4 +1,4 @@
-"""When does something touch the skin? Readings against the tared baseline, over time."""
+"""Contact detection: readings against the tared baseline, over time."""
 
 from math import ceil
 
@@ -8,8 +8,8 @@ DRIFT = 0.2 / 600  # N/s: 0.2 N in ten minutes
 _RELEASE = 0.3  # s below the threshold that end a contact
 
 
-class Contact:
-    """Follows contact over a stream of tared readings.
+class ContactDetector:
+    """Detects contact in a stream of tared readings.
 
     A contact begins where a reading rises by the threshold above the baseline. It ends where no reading did
     so for 0.3 s, however long it lasts. The baseline is 0 after a tare. It follows what the sensors read only
@@ -35,10 +35,10 @@ class Contact:
         self._rate, self._threshold, self._drift = rate, threshold, drift
         self._recent = max(1, ceil(_RELEASE * rate - 1e-9))
         self._touched = np.zeros(sensors, dtype=bool)
-        self.tared()
+        self.reset()
 
-    def tared(self) -> None:
-        """Begin anew with a new tare."""
+    def reset(self) -> None:
+        """Reset after a new tare."""
         self.baseline = np.zeros(len(self._touched))
         self._touched[:] = False
         self.since: float | None = None
@@ -49,7 +49,7 @@ class Contact:
         return valid & (readings - self.baseline >= self._threshold)
 
     def update(self, readings: np.ndarray, valid: np.ndarray, t: float) -> bool:
-        """Take the window that ends now; return whether something touches the skin.
+        """Update with the window that ends now; return whether something touches the skin.
 
         Args:
             readings: (T, S), N, tared.

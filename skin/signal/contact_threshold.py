@@ -1,4 +1,4 @@
-"""Is the skin touched? The simple threshold of the report's section 4.2."""
+"""Contact detection by a threshold (report, section 4.2)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,24 +12,24 @@ from skin.labels import Task
 from skin.recording import Touches
 
 Gate = Callable[[Touches, Tensor], Tensor]
-"""From windows and their probabilities (B, L) to which of them are said to be touched, (B,), bool."""
+"""Maps windows and their probabilities (B, L) to predicted contact, (B,), bool."""
 
 
 def rise(touches: Touches, idle: Tensor | float = 0.0) -> Tensor:
-    """Return how far the readings of each window rise above the untouched skin's, (B,), N; at least 0.
+    """Return the largest rise of each window above the untouched skin, (B,), N; at least 0.
 
-    The baseline is not taken from the window: a touch that is held all through it would become the baseline.
+    The baseline is not taken from the window: a touch held throughout it would become the baseline.
 
     Args:
-        touches: readings that are not valid rise by nothing.
-        idle: (S,), N, what the untouched skin reads; 0 after a tare.
+        touches: invalid readings are ignored.
+        idle: (S,), N, readings of the untouched skin; 0 after a tare.
     """
     return ((touches.readings - idle) * touches.valid).flatten(1).amax(dim=1).clamp(min=0)
 
 
 @dataclass(frozen=True)
-class Threshold:
-    """Says that a window is touched if a reading rises by ``least`` N or more above its baseline.
+class ContactThreshold:
+    """Predicts contact if a reading rises by ``least`` N or more above its baseline.
 
     Attributes:
         least: N.
@@ -40,16 +40,16 @@ class Threshold:
     idle: Tensor | float = 0.0
 
     @classmethod
-    def tuned(cls, rises: Tensor, touched: Tensor, idle: Tensor | float = 0.0) -> "Threshold":
-        """Return the threshold that tells best, by balanced accuracy.
+    def tuned(cls, rises: Tensor, touched: Tensor, idle: Tensor | float = 0.0) -> "ContactThreshold":
+        """Return the threshold of the highest balanced accuracy.
 
         Args:
-            rises: (B,), N, as :func:`rise` gives them, of windows that no test will see again.
+            rises: (B,), N, from :func:`rise`, of windows that are not used for testing.
             touched: (B,), bool.
             idle: (S,), N, as in :func:`rise`.
 
         Raises:
-            InputError: windows that are all touched, or none of them.
+            InputError: all windows are touched, or none is.
         """
         if touched.all() or not touched.any():
             raise InputError(
@@ -64,7 +64,7 @@ class Threshold:
         return rise(touches, self.idle) >= self.least
 
 
-def gates(threshold: Threshold, task: Task) -> dict[str, Gate]:
+def gates(threshold: ContactThreshold, task: Task) -> dict[str, Gate]:
     """Return the gates by name: ``none`` lets all through; ``learned`` only where the task has a gate."""
     found: dict[str, Gate] = {
         "none": lambda touches, chances: torch.ones(len(touches), dtype=torch.bool),

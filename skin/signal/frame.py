@@ -8,8 +8,8 @@ import numpy as np
 
 Check = Literal["crc16", "xor", "none"]
 After = Literal["", "gap", "cut", "reset", "reconnect"]
-"""What lies before a frame: nothing; lost frames; another touch of a recording; a restart of the device; an
-unplugged cable. Later ones outweigh earlier ones."""
+"""Interruption before a frame: none; lost frames; another touch of a recording; a restart of the device; a
+reconnection. Of several, the last in this list counts."""
 
 _WEIGHT: dict[After, int] = {"": 0, "gap": 1, "cut": 2, "reset": 3, "reconnect": 4}
 
@@ -18,15 +18,15 @@ class Frame(NamedTuple):
     """The readings of all sensors at one moment.
 
     Attributes:
-        seq: the device's own count, as sent; None where it sends none.
-        t: s, the device's clock, unwrapped, within a segment; the host's where the device tells no time.
+        seq: the device's frame number, as sent; None if it sends none.
+        t: s, the device's clock, unwrapped, within a segment; the host's if the device sends no time.
         t_host: s, the host's monotonic clock (``time.monotonic``), never before the frame before.
-        values: (S,), float64, what the device sends (raw counts, or N from a recording): never re-scaled.
-        valid: (S,), bool: False where a value means nothing (stuck or dead channel).
-        segment: counts restarts, reconnections and cuts: no window should span two.
-        lost: how many frames are known to be missing just before this one; 0 where nobody can know.
-        after: what lies before this frame; empty if it follows the one before without a gap.
-        saturated: (S,), bool: the channel is at its limit, so the force is at least what it says; None: no
+        values: (S,), float64, as sent (raw counts, or N from a recording).
+        valid: (S,), bool: False for stuck and dead channels.
+        segment: number of restarts, reconnections and cuts so far; a window should not span two segments.
+        lost: number of frames known to be missing just before this one.
+        after: interruption before this frame; empty if there is none.
+        saturated: (S,), bool: the channel is at its limit, so the force is at least its value; None: no
             channel is.
     """
 
@@ -41,7 +41,7 @@ class Frame(NamedTuple):
     saturated: np.ndarray | None = None
 
     def behind(self, dropped: "Frame") -> "Frame":
-        """Return this frame as it is told where the one before it was dropped: the gap is never hidden."""
+        """Return this frame with the previous one, which was dropped, counted as lost."""
         after = max(self.after, dropped.after, "gap", key=_WEIGHT.__getitem__)
         return self._replace(lost=self.lost + dropped.lost + 1, after=after)
 
@@ -51,7 +51,7 @@ class FrameError(Exception):
 
     Attributes:
         reason: ``checksum``, ``fields`` (their count), ``number``, ``long``, ``structure`` or ``repeat``.
-        found: what the frame holds, where that helps: how many fields.
+        found: number of fields, for the reason ``fields``.
     """
 
     def __init__(self, reason: str, found: int | None = None) -> None:
@@ -61,18 +61,18 @@ class FrameError(Exception):
 
 @dataclass
 class Counters:
-    """What a decoder has seen.
+    """Numbers of frames and errors of a decoder.
 
     Attributes:
         bytes: received.
-        frames: good ones.
-        bad: reason -> how many frames were dropped for it.
+        frames: good frames.
+        bad: reason -> number of frames dropped.
         skipped: pieces before the first good frame of a connection: half a line, a banner, noise.
-        resyncs: how often a good frame followed bad ones.
-        gaps: how often frames were missing.
-        lost: how many frames were missing, as far as their numbers tell.
-        resets: how often the device started anew.
-        weak: frames taken without a CRC, which let wrong values through.
+        resyncs: good frames after bad ones.
+        gaps: interruptions by missing frames.
+        lost: missing frames, according to frame numbers.
+        resets: restarts of the device.
+        weak: frames accepted without a CRC, which may have wrong values.
     """
 
     bytes: int = 0

@@ -10,9 +10,9 @@ from annotated_types import Ge, Gt
 from torch import Tensor
 
 from skin.errors import InputError
-from skin.lag import lagged, rounded, unloading
-from skin.settings import check
-from skin.signal.calibration import Calibration, read
+from skin.sensor_dynamics import apply_hysteresis, first_order_lag, quantize
+from skin.settings import check_settings
+from skin.signal.calibration import Calibration, read_calibration
 
 _IDLE_FRAMES = 30
 
@@ -26,8 +26,8 @@ class Constants(NamedTuple):
         baseline: what the device subtracts as its idle reading, N; 0 without tare.
         dead: bool, sensors whose readings mean nothing: dead, stuck or saturated.
         noise: standard deviation in every frame, N.
-        clip: largest force that a sensor tells, N.
-        level: what a sensor of ``dead`` says all the time, N.
+        clip: largest force that a sensor measures, N.
+        level: constant reading of the sensors in ``dead``, N.
         drift: N/s.
         hysteresis: mean gap between unloading and loading, share of the touch's peak.
         time_constant: of a first-order lag, s; 0: none.
@@ -53,21 +53,21 @@ class Constants(NamedTuple):
 
 @dataclass(kw_only=True)
 class ImperfectionSettings:
-    """What may be set of a device's imperfections (``conf/device/simulated.yaml``).
+    """Settings of a device's imperfections (``conf/device/simulated.yaml``).
 
     Attributes:
         gain_spread: standard deviation of the logarithm of each sensor's gain; the report gives none.
         offset: standard deviation of each sensor's offset, N, constant in a device.
         noise: standard deviation of the noise in every frame, N.
-        clip: largest force that a sensor tells, N.
+        clip: largest force that a sensor measures, N.
         dead: how many sensors are dead, or [least, most], of which each device draws its number: they read 0
             and are marked invalid.
         tare: subtract the idle baseline, the mean of 30 idle frames with their noise.
-        stuck: how many more say one force all the time, between 0 and ``clip``; they are invalid too.
-        saturated: how many more say ``clip`` all the time; they are invalid too.
+        stuck: number of further sensors with a constant reading between 0 and ``clip``; they are invalid.
+        saturated: number of further sensors with the constant reading ``clip``; they are invalid.
         drift: standard deviation of each sensor's drift, N/s, from the first frame of a window or stream.
         hysteresis: mean gap between unloading and loading, share of the peak. At a force x after a peak P the
-            sensor feels x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
+            sensor measures x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
         time_constant: of a first-order lag behind the force, s.
         quantum: step of the converter, N.
         rate: frames per second, Hz.
@@ -92,9 +92,8 @@ class ImperfectionSettings:
 class Imperfection(ImperfectionSettings):
     """A device's imperfections, in the report's order (2.1.4): clip the force, then add noise and offset.
 
-    Before the clip the material answers late (hysteresis, then a lag) and the sensor has its gain; after the
-    noise readings drift and a converter rounds them. All of that is our addition to the report, and neutral
-    unless asked for.
+    Hysteresis, a first-order lag and the gain of the sensor are applied before the clip; drift and rounding
+    after the noise. These are additions to the report and are off by default.
 
     Attributes:
         calibration: of a real device; replaces all settings but ``rate``, ``tare`` and ``dead``, which breaks
@@ -113,7 +112,7 @@ class Imperfection(ImperfectionSettings):
                 f"device.dead must be a number from 0 up or a range [least, most], got {self.dead}: as in "
                 "device.dead=3 or device.dead=[0,5]"
             )
-        check(ImperfectionSettings, _settings(self), "device")
+        check_settings(ImperfectionSettings, _settings(self), "device")
 
     @property
     def dead_range(self) -> tuple[int, int]:
@@ -125,7 +124,9 @@ class Imperfection(ImperfectionSettings):
     @classmethod
     def of(cls, settings: ImperfectionSettings, calibration: str | None) -> "Imperfection":
         """Return imperfections of these settings, and of a file of ``skin calibrate`` where one is given."""
-        return cls(**_settings(settings), calibration=None if calibration is None else read(calibration))
+        return cls(
+            **_settings(settings), calibration=None if calibration is None else read_calibration(calibration)
+        )
 
     def constants(
         self, sensors: int, generator: np.random.Generator, gestures: int | None = None
@@ -184,20 +185,20 @@ class Imperfection(ImperfectionSettings):
     def apply(
         self, readings: Tensor, constants: Constants, generator: np.random.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the device says, which of it is valid, and which is at a sensor's limit.
+        """Return the readings of the device, with masks of valid and of saturated ones.
 
         Args:
             readings: (B, T, S), true readings, N.
             constants: of this device.
-            generator: where the noise comes from.
+            generator: source of the noise.
 
         Returns:
             readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
         """
         constants = constants.to(readings.device)
         dead = constants.dead.expand(readings.shape)
-        said, saturated = self._say(readings, constants, generator)
-        return said.masked_fill(dead, 0.0), ~dead, saturated & ~dead
+        output, saturated = self._measure(readings, constants, generator)
+        return output.masked_fill(dead, 0.0), ~dead, saturated & ~dead
 
     def raw(
         self,
@@ -206,19 +207,19 @@ class Imperfection(ImperfectionSettings):
         generator: np.random.Generator,
         time: Tensor | None = None,
     ) -> Tensor:
-        """Return what comes out of the converter, (B, T, S), N: before a tare, broken sensors at their level.
+        """Return the output of the converter, (B, T, S), N: without a tare, broken sensors at their level.
 
         Args:
             readings: (B, T, S), true readings, N.
             constants: of this device.
-            generator: where the noise comes from.
+            generator: source of the noise.
             time: of every frame, (T,), s; None: at ``rate`` from 0.
         """
         constants = constants._replace(baseline=torch.zeros(())).to(readings.device)
-        said, _ = self._say(readings, constants, generator, time)
-        return torch.where(constants.dead, constants.level, said)
+        output, _ = self._measure(readings, constants, generator, time)
+        return torch.where(constants.dead, constants.level, output)
 
-    def _say(
+    def _measure(
         self,
         readings: Tensor,
         constants: Constants,
@@ -230,17 +231,17 @@ class Imperfection(ImperfectionSettings):
             time = torch.arange(readings.shape[1], device=readings.device) / self.rate
         force = readings
         if constants.hysteresis.any():
-            force = unloading(force, constants.hysteresis)
+            force = apply_hysteresis(force, constants.hysteresis)
         if constants.time_constant.any():
-            force = lagged(force, constants.time_constant, time)
-        felt = force * constants.gain
-        said, saturated = felt.clamp(-constants.clip, constants.clip), felt.abs() > constants.clip
-        said += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
+            force = first_order_lag(force, constants.time_constant, time)
+        scaled = force * constants.gain
+        output, saturated = scaled.clamp(-constants.clip, constants.clip), scaled.abs() > constants.clip
+        output += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
         if constants.drift.any():
-            said += constants.drift * time[:, None]
+            output += constants.drift * time[:, None]
         if constants.quantum.any():
-            said = rounded(said + constants.baseline, constants.quantum) - constants.baseline
-        return said, saturated
+            output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
+        return output, saturated
 
 
 def _settings(of: ImperfectionSettings) -> dict[str, Any]:

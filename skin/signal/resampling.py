@@ -1,4 +1,4 @@
-"""From the frames of a device to those of a model: one resampler for live and recorded touches."""
+"""Resampling of a device's frames to the rate of a model, for live and recorded touches."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,9 +9,9 @@ from skin.errors import InputError
 if TYPE_CHECKING:
     from skin.signal.frame import Frame
 
-_SLOWER = 1.05  # a ceramic resonator may be that wrong, and a frame may be lost
-_FEW = 8  # frames from which no rate can be estimated
-_MANY = 256  # frames over which it is estimated
+_SLOWER = 1.05  # tolerance for the error of a ceramic resonator and for lost frames
+_FEW = 8  # frames below which no rate is estimated
+_MANY = 256  # frames over which the rate is estimated
 
 
 class Resampled(NamedTuple):
@@ -21,7 +21,7 @@ class Resampled(NamedTuple):
         values: (T, S), the largest valid value of each interval, in the unit of the frames; 0 without one.
         valid: (T, S), bool: the interval has a valid value.
         saturated: (T, S), bool: a valid value of the interval is at the sensor's limit.
-        gap: frames are missing in the window.
+        gap: whether frames are missing in the window.
     """
 
     values: np.ndarray
@@ -87,7 +87,7 @@ def check_rate(found: float, rate: float) -> None:
 
 
 class Window:
-    """The latest frames of a stream; slides at every frame.
+    """A sliding window over the frames of a stream.
 
     A faster stream is reduced by the maximum over each interval of the model. A device that is slower by up
     to 5 % gives one frame to each interval. Another segment of the device's clock begins an empty window.
@@ -102,17 +102,17 @@ class Window:
         self.frames, self.rate, self.sensors = frames, rate, sensors
         self._clear(4 * frames)
 
-    def _clear(self, room: int) -> None:
-        self._times, self._lost = np.empty(room), np.zeros(room, dtype=np.int64)
-        self._values = np.empty((room, self.sensors))
-        self._valid, self._saturated = (np.empty((room, self.sensors), dtype=bool) for _ in range(2))
+    def _clear(self, capacity: int) -> None:
+        self._times, self._lost = np.empty(capacity), np.zeros(capacity, dtype=np.int64)
+        self._values = np.empty((capacity, self.sensors))
+        self._valid, self._saturated = (np.empty((capacity, self.sensors), dtype=bool) for _ in range(2))
         self._end, self._segment = 0, -1
 
     @property
     def period(self) -> float:
-        """Seconds from one frame of the device to the next; 0 if too few came.
+        """Time between two frames of the device, s; 0 with too few frames.
 
-        The smaller of median and mean: a pause spoils the mean, frames that come in bursts spoil the median.
+        The smaller of median and mean: pauses distort the mean, bursts of frames the median.
         """
         first = max(0, self._end - _MANY)
         times, lost = self._times[first : self._end], self._lost[first : self._end]
@@ -124,11 +124,11 @@ class Window:
 
     @property
     def filled(self) -> float:
-        """How much of the window has come, from 0 to 1."""
+        """Filled share of the window, from 0 to 1."""
         if not self._end:
             return 0.0
-        came = self._times[self._end - 1] - self._times[0]
-        return float(min(1.0, came * self.rate / self.frames))
+        received = self._times[self._end - 1] - self._times[0]
+        return float(min(1.0, received * self.rate / self.frames))
 
     def add(self, frame: "Frame") -> None:
         """Add a frame."""
@@ -143,10 +143,10 @@ class Window:
         self._saturated[here] = False if frame.saturated is None else frame.saturated
 
     def read(self, partial: bool = False) -> Resampled | None:
-        """Return the window that ends with the latest frame; None before T intervals have come.
+        """Return the window that ends with the latest frame; None before T intervals are complete.
 
         Args:
-            partial: do not wait for them; what has not come is invalid. None before the rate is known.
+            partial: do not wait; missing intervals are invalid. None before the rate is known.
 
         Raises:
             InputError: the stream is slower than the model's rate.
@@ -192,13 +192,13 @@ class Window:
         return found._replace(gap=bool(lost) or len(ages) < self.frames)
 
     def _make_room(self) -> None:
-        """Forget what no window will show again, and double the room if that is not half of it."""
+        """Discard frames older than the window; double the capacity unless that frees half of it."""
         since = self._times[self._end - 1] - 1.1 * _SLOWER * self.frames / self.rate
         first = min(int(np.searchsorted(self._times[: self._end], since)), max(0, self._end - _MANY))
         kept, segment = slice(first, self._end), self._segment
         old = [array[kept] for array in self._arrays]
-        room, count = len(self._times), len(old[0])
-        self._clear(room if 2 * count <= room else 2 * room)
+        capacity, count = len(self._times), len(old[0])
+        self._clear(capacity if 2 * count <= capacity else 2 * capacity)
         self._end, self._segment = count, segment
         for target, source in zip(self._arrays, old, strict=True):
             target[:count] = source

@@ -1,4 +1,4 @@
-"""Signed features that tell the direction of sliding, along x and along y."""
+"""Signed features of the direction of sliding, along x and along y."""
 
 import torch
 from torch import Tensor
@@ -7,13 +7,13 @@ from skin.recording import Touches
 from skin.signal.features import above_idle
 
 SHARES = (0.1, 0.25, 0.5)  # of the touch's own peak: a frame beyond is active
-_FORCE = 0.1  # N, twice the noise: what weighs less is no part of a centre
+_FORCE = 0.1  # N, twice the noise; smaller readings have no weight in a centre
 
 
 def direction_features(touches: Touches) -> dict[str, Tensor]:
     """Return about 60 named features, (B,) each, of touches of any layout.
 
-    Each vector stands as it is and with length 1: its cosines are the label itself where it points rightly.
+    Each vector is given as it is and normalised to length 1, like the label.
     """
     x = above_idle(touches)
     at = touches.positions[..., :2].to(x.dtype).expand(*x.shape, 2)
@@ -35,7 +35,7 @@ def direction_features(touches: Touches) -> dict[str, Tensor]:
 
 
 def _ways(push: Tensor, at: Tensor, x: Tensor, share: float) -> dict[str, Tensor]:
-    """Return vectors (B, 2), m or m per frame, that tell how the centre of ``push`` (B, T, S) moves."""
+    """Return vectors (B, 2), m or m per frame, of the motion of the centre of ``push`` (B, T, S)."""
     total = push.sum(dim=2)
     centre = torch.einsum("bts,btsi->bti", push, at) / total.clamp(min=1e-6)[..., None]
     peak = x.amax(dim=2)
@@ -43,7 +43,7 @@ def _ways(push: Tensor, at: Tensor, x: Tensor, share: float) -> dict[str, Tensor
     rows, last = torch.arange(len(x)), active.shape[1] - 1 - active.flip(1).int().argmax(dim=1)
     first = active.int().argmax(dim=1)
     ends = torch.where(active.any(dim=1)[:, None], centre[rows, last] - centre[rows, first], 0)
-    # The line that fits best, each frame as heavy as it is pressed.
+    # Least-squares line, with frames weighted by force.
     weight = total * active
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
     time = torch.arange(x.shape[1], dtype=x.dtype).expand_as(weight)
@@ -54,7 +54,7 @@ def _ways(push: Tensor, at: Tensor, x: Tensor, share: float) -> dict[str, Tensor
 
 
 def _order(x: Tensor, at: Tensor) -> Tensor:
-    """Return how sensors' places follow their times, (B, 2), m per frame: a slide reaches one by one."""
+    """Return the slope of sensor position over time of contact, (B, 2), m per frame."""
     push = (x - _FORCE).clamp(min=0)
     total = push.sum(dim=1)
     time = torch.arange(x.shape[1], dtype=x.dtype)[None, :, None]
@@ -66,7 +66,7 @@ def _order(x: Tensor, at: Tensor) -> Tensor:
 
 
 def _lean(x: Tensor, at: Tensor) -> dict[str, Tensor]:
-    """Return on which side of the centre readings fall below idle, (B, 2), m: friction lifts behind it."""
+    """Return the offset of readings below idle from the centre, (B, 2), m: friction lifts behind it."""
     push, pull = (x - _FORCE).clamp(min=0), (-x - _FORCE).clamp(min=0)
     sides = []
     for weight in (push, pull):

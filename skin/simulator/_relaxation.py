@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from skin.body.base import AbstractBody
-from skin.lag import lagged
+from skin.sensor_dynamics import first_order_lag
 from skin.sensors import Sensors
 from skin.simulator.base import AbstractSimulator, Response
 
@@ -133,6 +133,6 @@ class Relaxing(AbstractSimulator):
         for lag, share in zip(self.lags, self.shares, strict=True):
             term = torch.einsum("i,i...->...", share, slow)
             constant = torch.full_like(term[:, 0], lag)
-            felt = felt + lagged(term, constant, time).to(felt)
+            felt = felt + first_order_lag(term, constant, time).to(felt)
         response = self._relaxed.read(felt)
         return response if displacement else Response(response.readings, None)

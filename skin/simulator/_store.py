@@ -14,7 +14,7 @@ import platformdirs
 
 from skin.errors import InputError
 from skin.files import whole
-from skin.foreign import arrays
+from skin.safe_loading import load_npz
 
 
 def folder(given: str | Path | None) -> Path:
@@ -64,7 +64,7 @@ def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str
     """Return the arrays of a file, or None if there is no file or anything about it is wrong."""
     try:
         expected = sum(8 * math.prod(shape) for shape in shapes.values())
-        stored = arrays(path, most=expected + 4 * len(key))
+        stored = load_npz(path, most=expected + 4 * len(key))
         if str(stored["key"]) != key:
             return None
         found = {name: stored[name] for name in shapes}

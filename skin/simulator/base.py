@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from skin.errors import InputError
-from skin.option import option
+from skin.option import option_name
 from skin.sensors import Sensors
 from skin.touch.movie import Movie
 
@@ -149,7 +149,7 @@ class AbstractSimulator(nn.Module, ABC):
 
     @property
     def _name(self) -> str:
-        return option(self)
+        return option_name(self)
 
 
 def flatten(pressure: Tensor, shape: tuple[int, int], dtype: torch.dtype) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.labels import TOUCH, measure
+from skin.labels import TOUCH, measure_gestures
 from skin.touch._bodies import Fit
 from skin.touch._paths import sample_paths
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
@@ -184,7 +184,7 @@ class TouchSampler:
             paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
         shown, shares = paths.trajectories.index, paths.trajectories.profile
-        measures = measure(
+        measures = measure_gestures(
             pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
         if not self.contact.proportional:

@@ -1,1 +1,1 @@
-"""Reading a skin at a port: protocol, decoder, reader, tare, conversion to newtons, segmentation."""
+"""Read a skin at a port: protocol, decoder, reader, tare, conversion to newtons, segmentation."""

@@ -1,4 +1,4 @@
-"""Announcements: comments of the text protocol in which an emulated skin tells the next gesture."""
+"""Announcements: comments of the text protocol in which an emulated skin describes its next gesture."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -9,12 +9,12 @@ from skin.wire.transport import ByteStream
 
 _KNOWN = ("number", "seq", "frames")
 _LONGEST = 4096  # bytes
-_KEPT = 64  # announcements, where nobody takes them
+_KEPT = 64  # announcements that are kept unread
 
 
 @dataclass(frozen=True)
 class Announcement:
-    """The truth about a gesture that follows.
+    """The labels and the window of the gesture that follows.
 
     Attributes:
         number: of the gesture, from 0.
@@ -29,15 +29,15 @@ class Announcement:
     labels: Mapping[str, int] = field(default_factory=dict)
 
 
-def encode(said: Announcement) -> bytes:
+def encode_announcement(announcement: Announcement) -> bytes:
     """Return ``# gesture number=0 seq=300 frames=300 big=1 ...*HHHH``, LF at its end."""
-    pairs = {name: getattr(said, name) for name in _KNOWN} | dict(said.labels)
+    pairs = {name: getattr(announcement, name) for name in _KNOWN} | dict(announcement.labels)
     body = ("# gesture " + " ".join(f"{name}={value}" for name, value in pairs.items())).encode()
     return body + b"*%04X\n" % crc16(body)
 
 
-def parse(line: bytes) -> Announcement | None:
-    """Return what a line without its end announces; None if it is another or its checksum is wrong."""
+def parse_announcement(line: bytes) -> Announcement | None:
+    """Return the announcement in a line without its end; None for other lines and wrong checksums."""
     body, _, tail = line.removesuffix(b"\r").rpartition(b"*")
     if not body.startswith(b"# gesture ") or tail != b"%04X" % crc16(body):
         return None
@@ -50,34 +50,34 @@ def parse(line: bytes) -> Announcement | None:
         return None
 
 
-class Tap:
-    """An opener for ``open_skin`` that hands bytes on as they are and keeps the announcements among them.
+class AnnouncementListener:
+    """An opener for ``open_skin`` that passes bytes through and collects the announcements among them.
 
     Args:
         opener: opens the stream of bytes.
 
     Attributes:
-        heard: announcements that nobody has taken yet.
+        announcements: announcements that have not been read yet.
     """
 
     def __init__(self, opener: Callable[[], ByteStream]) -> None:
         self._opener = opener
-        self.heard: deque[Announcement] = deque(maxlen=_KEPT)
+        self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
 
     def __call__(self) -> ByteStream:
-        """Open the stream, once more after each unplugging."""
+        """Open the stream; called again after each disconnection."""
         self._stream, self._rest = self._opener(), b""
-        self.heard.clear()
+        self.announcements.clear()
         return self
 
     def read(self) -> bytes:
-        """Return what came."""
+        """Return the received bytes."""
         data = self._stream.read()
         *lines, self._rest = (self._rest + data).split(b"\n")
         self._rest = self._rest[-_LONGEST:]
-        self.heard.extend(said for line in lines if (said := parse(line)))
+        self.announcements.extend(found for line in lines if (found := parse_announcement(line)))
         return data
 
     def close(self) -> None:
-        """Let go of the stream."""
+        """Close the stream."""
         self._stream.close()

@@ -1,4 +1,4 @@
-"""The baseline of an untouched skin, and a test that it was untouched."""
+"""Baseline of an untouched skin, with a check that it was untouched."""
 
 import numpy as np
 
@@ -9,46 +9,46 @@ _FEWEST = 10  # frames
 # As multiples of the noise and of the smallest step seen.
 _MOVED = 8.0, 3.0  # within the frames
 _SHIFTED = 20.0, 10.0  # against the old baseline, because offsets drift
-_SMOOTH = 0.5  # von Neumann's ratio of successive differences to variance: 2 for noise, near 0 for a hand
+_SMOOTH = 0.5  # von Neumann ratio of successive differences to variance: 2 for noise, near 0 for a touch
 
 
-def rest(
+def quiet_baseline(
     values: np.ndarray, valid: np.ndarray, before: np.ndarray | None = None, touch: float = 0.0
 ) -> np.ndarray:
     """Return the median of each channel over frames without touch, (S,).
 
-    Touch is seen as a change: within the frames, or against the baseline before. A weight that lay there
-    from the first moment on cannot be told from an offset.
+    A touch is detected as a change, within the frames or against the previous baseline. A constant load
+    cannot be distinguished from an offset.
 
     Args:
         values: (F, S).
-        valid: (F, S); a channel that never means anything is not asked.
-        before: the old baseline, (S,), if there is one.
-        touch: smallest shift of the baseline that is taken for a touch, however small the noise.
+        valid: (F, S); channels without a valid value are not checked.
+        before: the previous baseline, (S,), or None.
+        touch: smallest shift of the baseline that counts as a touch, however small the noise.
 
     Raises:
         InputError: too few frames.
         SkinTouched: the skin was touched.
     """
-    middle = median(values)
-    asked = np.asarray(valid.any(axis=0))
+    middle = median_baseline(values)
+    checked = np.asarray(valid.any(axis=0))
     steps = np.abs(np.diff(values, axis=0))
-    # From differences, because a touch that lasts half the time would pass for noise otherwise.
+    # From differences: a touch that lasts half of the time would otherwise count as noise.
     noise = 1.4826 * np.median(steps, axis=0) / np.sqrt(2)
     smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
     smallest[np.isinf(smallest)] = 0.0
     moved = np.abs(values - middle).max(axis=0)
-    # A hand that strokes all the time steps as far as noise does, but its next step goes the same way.
+    # A stroke changes by as much as noise does, but in a consistent direction.
     smooth = (steps**2).mean(axis=0) < _SMOOTH * values.var(axis=0)
     noise = np.where(smooth, 0.0, noise)
-    _refuse("moved by", moved, np.maximum(_MOVED[0] * noise, _MOVED[1] * smallest), asked)
+    _refuse("moved by", moved, np.maximum(_MOVED[0] * noise, _MOVED[1] * smallest), checked)
     if before is not None:
         limit = np.maximum(np.maximum(_SHIFTED[0] * noise, _SHIFTED[1] * smallest), touch)
-        _refuse("rests away from its old baseline by", np.abs(middle - before), limit, asked)
+        _refuse("differs from its old baseline by", np.abs(middle - before), limit, checked)
     return middle
 
 
-def median(values: np.ndarray) -> np.ndarray:
+def median_baseline(values: np.ndarray) -> np.ndarray:
     """Return the median of each channel (S,) over frames (F, S), touched or not.
 
     Raises:
@@ -59,8 +59,8 @@ def median(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.median(values, axis=0))
 
 
-def _refuse(what: str, found: np.ndarray, limit: np.ndarray, asked: np.ndarray) -> None:
-    beyond = np.where(asked, found - limit, -np.inf)
+def _refuse(what: str, found: np.ndarray, limit: np.ndarray, checked: np.ndarray) -> None:
+    beyond = np.where(checked, found - limit, -np.inf)
     channel = int(beyond.argmax())
     if beyond[channel] > 0:
         raise SkinTouched(

@@ -26,7 +26,7 @@ _TYPE: dict[int, np.dtype] = {1: np.dtype("<u2"), 2: np.dtype("<i2"), 3: np.dtyp
 
 
 class Payload(NamedTuple):
-    """What a binary frame says: its number, the device's clock (microseconds) and the values, (S,)."""
+    """Content of a binary frame: its number, the device's clock (microseconds) and the values, (S,)."""
 
     seq: int
     t_us: int
@@ -34,10 +34,10 @@ class Payload(NamedTuple):
 
 
 def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind: Kind = "u16") -> bytes:
-    """Return a frame, stuffed, 0x00 at its end; seq is taken modulo 2**16, t_us modulo 2**32.
+    """Return an encoded frame that ends with 0x00; seq is taken modulo 2**16, t_us modulo 2**32.
 
     Raises:
-        ValueError: a value that the type cannot hold.
+        ValueError: a value is out of range for the type.
     """
     number, given = _NUMBER[kind], np.asarray(values, dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -49,7 +49,7 @@ def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind
 
 
 def decode_frame(data: bytes) -> Payload:
-    """Return what stands between two zeros.
+    """Decode the bytes between two zeros.
 
     Raises:
         FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum``, ``fields`` or ``number``.
@@ -70,13 +70,13 @@ def decode_frame(data: bytes) -> Payload:
 
 
 def encode_comment(text: bytes) -> bytes:
-    """Return a comment, such as ``# skin proto=1 n=25 bits=10``, stuffed, 0x00 at its end."""
+    """Return a comment, such as ``# skin proto=1 n=25 bits=10``, encoded, with 0x00 at its end."""
     body = bytes((_MAGIC, _COMMENT)) + text
     return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
 
 
 def decode_comment(data: bytes) -> bytes | None:
-    """Return the text of what stands between two zeros; None if that is no comment, or a damaged one."""
+    """Return the comment between two zeros; None if it is no comment, or a damaged one."""
     try:
         body = unstuff(data)
     except FrameError:
@@ -86,7 +86,7 @@ def decode_comment(data: bytes) -> bytes | None:
 
 
 def stuff(data: bytes) -> bytes:
-    """Return ``data`` without zeros: each is replaced by the distance to the next."""
+    """Return ``data`` encoded with COBS: without zeros, each replaced by the distance to the next."""
     out = bytearray()
     blocks = data.split(b"\0")
     for place, block in enumerate(blocks):
@@ -101,10 +101,10 @@ def stuff(data: bytes) -> bytes:
 
 
 def unstuff(data: bytes) -> bytes:
-    """Return what :func:`stuff` was given.
+    """Return the data that :func:`stuff` encoded.
 
     Raises:
-        FrameError: ``structure``: a distance that leads nowhere.
+        FrameError: ``structure``: an invalid distance.
     """
     out, place, end = bytearray(), 0, len(data)
     while place < end:

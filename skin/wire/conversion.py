@@ -10,13 +10,13 @@ from skin.wire.text import Header
 
 
 @dataclass(frozen=True)
-class Newtons:
-    """Turns values into N: gain 1, and 0 where nothing touches.
+class UnitConversion:
+    """Converts values of a device to N: gain 1, 0 without touch.
 
     Attributes:
         scale: (S,), N per unit of the device.
-        zero: (S,), what the untouched skin says, in its unit.
-        broken: (S,), bool: sensors that mean nothing, as the calibration knows.
+        zero: (S,), values of the untouched skin, in the device's unit.
+        broken: (S,), bool: sensors without valid readings according to the calibration.
     """
 
     scale: np.ndarray
@@ -24,36 +24,36 @@ class Newtons:
     broken: np.ndarray
 
     def __call__(self, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (..., S), N, 0 where invalid, and which are valid."""
+        """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool."""
         valid = valid & ~self.broken
         return np.where(valid, (values - self.zero) * self.scale, 0.0).astype(np.float32), valid
 
 
-def newtons(
+def unit_conversion(
     sensors: int,
     baseline: np.ndarray | None,
     scale: float | None,
     calibration: Calibration | None,
     header: Header | None,
-) -> Newtons:
-    """Return what values mean.
+) -> UnitConversion:
+    """Return the conversion of a device's values to N.
 
     Args:
         sensors: S.
         baseline: (S,), in the device's unit; None: the calibration's offsets, or 0.
-        scale: N per unit; None: as the calibration says, or 1 where the device says that it sends N.
+        scale: N per unit; None: that of the calibration, or 1 if the header has the unit N.
         calibration: of this device.
-        header: what the device tells of itself.
+        header: of the device; None if it sends none.
 
     Raises:
-        InputError: nobody knows what a count is worth, or a calibration of another number of sensors.
+        InputError: the scale is unknown, or the calibration has another number of sensors.
     """
     if calibration is not None:
         calibration.fits(sensors)
         known = calibration.values()
         per_unit = (calibration.scale if scale is None else scale) / known["gain"]
         offset = calibration.zero + known["offset"] / calibration.scale
-        return Newtons(per_unit, offset if baseline is None else baseline, known["dead"])
+        return UnitConversion(per_unit, offset if baseline is None else baseline, known["dead"])
     if scale is None:
         if header is None or header.unit != "N":
             raise InputError(
@@ -63,4 +63,4 @@ def newtons(
             )
         scale = 1.0
     zero = np.zeros(sensors) if baseline is None else baseline
-    return Newtons(np.full(sensors, scale), zero, np.zeros(sensors, dtype=bool))
+    return UnitConversion(np.full(sensors, scale), zero, np.zeros(sensors, dtype=bool))

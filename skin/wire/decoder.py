@@ -1,56 +1,63 @@
-"""From bytes to frames, without input or output."""
+"""Decode bytes into frames, without input or output."""
 
 import numpy as np
 
 from skin.errors import InputError
 from skin.signal.frame import After, Counters, Frame, FrameError
-from skin.wire.detect import Format, Found, Raw, Speech, detect, refusal
-from skin.wire.sequence import HostClock, Order
+from skin.wire.format_detection import (
+    DetectionResult,
+    Format,
+    FrameFormat,
+    RawFrame,
+    detect_format,
+    detection_error,
+)
+from skin.wire.sequence import HostClock, SequenceTracker
 from skin.wire.text import Header, parse_header
 
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
-_PAUSE = 0.2  # s: what a silence counts for, because a board may take seconds to start
+_PAUSE = 0.2  # s that a silence counts for at most, because a board may take seconds to start
 _PER_FIELD = 12  # bytes
 _SPAN = 2.0  # s over which good frames are compared with bad ones
-_FEW = 3  # bad frames that say nothing yet
+_FEW = 3  # bad frames, too few for a conclusion
 
 
 class Decoder:
-    """Turns bytes into frames; resynchronises at the next delimiter and never raises for what it is fed.
+    """Decodes bytes into frames; resynchronises at the next delimiter and never raises for its input.
 
-    The format is found by itself (two binary frames with a right CRC, or three lines of one field count)
-    and kept. Without a CRC, what comes before the first delimiter is left out, for it may look whole.
+    The format is detected (two binary frames with a correct CRC, or three lines with equal numbers of fields)
+    and then kept. Without a CRC, the bytes before the first delimiter are skipped: they may be half a frame.
 
     Args:
-        sensors: S; None learns it from the header or from eight lines.
+        sensors: S; None: taken from the header or from eight lines.
         format: ``auto``, ``text`` or ``binary``.
 
     Attributes:
-        counters: what was seen; kept by :meth:`restart`.
-        speech: the format, once it is known.
-        header: what the device tells of itself, if it does.
+        counters: numbers of frames and errors; kept by :meth:`restart`.
+        frame_format: the format, once it is known.
+        header: of the device; None until it sends one.
     """
 
     def __init__(self, sensors: int | None = None, format: Format = "auto") -> None:
         self.sensors, self.format = sensors, format
         self.counters, self.quality = Counters(), _Quality()
         self.header: Header | None = None
-        self._order, self._clock = Order(), HostClock()
+        self._order, self._clock = SequenceTracker(), HostClock()
         self._all_valid = np.ones(sensors or 0, dtype=bool)
         self._begin()
 
     def _begin(self) -> None:
-        self.speech: Speech | None = None
+        self.frame_format: FrameFormat | None = None
         self._buffer = b""
-        self._found = Found(None, None, None)
+        self._found = DetectionResult(None, None, None)
         self._receiving, self._fed_at = 0.0, float("nan")
         self._whole = self._overlong = self._synchronous = False
         self._missing = 0
 
     def restart(self, after: After = "reconnect") -> None:
-        """Begin with another connection: find the format anew, demand the same number of sensors."""
+        """Start another connection: detect the format again, with the same number of sensors."""
         self._begin()
         self._order.cut(after)
 
@@ -62,14 +69,14 @@ class Decoder:
             now: s, the host's monotonic clock at their arrival.
         """
         self.counters.bytes += len(data)
-        if self.speech is None:
-            # Where nothing is recognised for long, only the latest is searched.
+        if self.frame_format is None:
+            # Bounds the search while no format is recognised.
             self._buffer = self._buffer[-2 * self._enough :]
         self._buffer += data
-        if self.speech is None and not self._recognise(data, now):
+        if self.frame_format is None and not self._recognise(data, now):
             return []
-        assert self.speech is not None
-        *pieces, self._buffer = self._buffer.split(self.speech.delimiter)
+        assert self.frame_format is not None
+        *pieces, self._buffer = self._buffer.split(self.frame_format.delimiter)
         good, bad = self.counters.frames, sum(self.counters.bad.values())
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
         if len(self._buffer) > _LONGEST:
@@ -77,11 +84,11 @@ class Decoder:
         self.quality.count(now, self.counters.frames - good, sum(self.counters.bad.values()) - bad)
         return frames
 
-    def refusal(self) -> InputError | None:
-        """Return why nothing can be read, once 2 s of receiving or 4 kB (or four frames) show no format."""
-        if self.speech or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
+    def error(self) -> InputError | None:
+        """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None."""
+        if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
             return None
-        return refusal(self._buffer, self._found, self.sensors)
+        return detection_error(self._buffer, self._found, self.sensors)
 
     @property
     def _enough(self) -> int:
@@ -89,34 +96,34 @@ class Decoder:
         return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
 
     def _recognise(self, data: bytes, now: float) -> bool:
-        """Keep the beginning until it shows its format; it is decoded again from its first byte then."""
+        """Buffer the first bytes until they show the format; they are then decoded from the first one on."""
         passed = now - self._fed_at
         self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
         self._fed_at = now
         if b"\n" not in data and b"\0" not in data:
             return False
-        self._found = detect(self._buffer, self.sensors, self.format)
-        self.speech = self._found.speech
-        if self.speech is None:
+        self._found = detect_format(self._buffer, self.sensors, self.format)
+        self.frame_format = self._found.frame_format
+        if self.frame_format is None:
             return False
         self.header = self._found.header or self.header
-        self.sensors = self.speech.sensors
+        self.sensors = self.frame_format.sensors
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         return True
 
     def _frame(self, piece: bytes, now: float) -> Frame | None:
-        assert self.speech is not None
+        assert self.frame_format is not None
         first, self._whole = not self._whole, True
         try:
             if self._overlong or len(piece) > _LONGEST:
                 self._overlong = False
                 raise FrameError("long")
-            raw = self.speech.read(piece)
+            raw = self.frame_format.read(piece)
             if raw is None:
                 self._comment(piece)
                 return None
-            if first and self.speech.check != "crc16":
+            if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
             return self._placed(raw, now)
         except FrameError as bad:
@@ -124,8 +131,8 @@ class Decoder:
             return None
 
     def _comment(self, piece: bytes) -> None:
-        assert self.speech is not None
-        if text := self.speech.comment(piece):
+        assert self.frame_format is not None
+        if text := self.frame_format.comment(piece):
             self.header = parse_header(text) or self.header
 
     def _count_bad(self, bad: FrameError) -> None:
@@ -137,7 +144,7 @@ class Decoder:
         self.counters.bad[bad.reason] += 1
         self.quality.note(bad)
 
-    def _placed(self, raw: Raw, now: float) -> Frame:
+    def _placed(self, raw: RawFrame, now: float) -> Frame:
         t_us = now * 1e6 if raw.t_us is None else raw.t_us
         t, segment, lost, after = self._order.place(raw.seq, t_us, self._missing)
         counters = self.counters
@@ -146,7 +153,7 @@ class Decoder:
         counters.lost += lost
         counters.gaps += after == "gap"
         counters.resets += after == "reset"
-        counters.weak += self.speech is not None and self.speech.check != "crc16"
+        counters.weak += self.frame_format is not None and self.frame_format.check != "crc16"
         self._synchronous, self._missing = True, 0
         if after and after != "gap":
             self._clock.restart()
@@ -157,7 +164,7 @@ class _Quality:
     """Compares good with bad frames over two seconds at a time.
 
     Attributes:
-        trouble: the sentence for a person; empty while most frames are good.
+        trouble: a message; empty while most frames are good.
     """
 
     def __init__(self) -> None:
@@ -167,11 +174,11 @@ class _Quality:
         self._latest = FrameError("")
 
     def note(self, bad: FrameError) -> None:
-        """Keep what the latest bad frame was like."""
+        """Remember the latest bad frame."""
         self._latest = bad
 
     def count(self, now: float, good: int, bad: int) -> None:
-        """Add what came by ``now``, s."""
+        """Add the numbers of frames received by ``now``, s."""
         self._since = now if self._since is None else self._since
         self._good += good
         self._bad += bad

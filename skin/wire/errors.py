@@ -1,4 +1,4 @@
-"""Errors of an open skin."""
+"""Exceptions that an open skin raises."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,10 @@ class SkinTouched(InputError):  # noqa: N818
 
 
 class _TooFewFramesError(Exception):
-    """Fewer frames came than were asked for.
+    """Fewer frames arrived than requested.
 
     Attributes:
-        frames: those that came.
+        frames: those that arrived.
     """
 
     def __init__(self, message: str, frames: Sequence[Frame] = ()) -> None:
@@ -23,7 +23,7 @@ class _TooFewFramesError(Exception):
 
 
 class SkinTimeout(_TooFewFramesError, TimeoutError):  # noqa: N818 - named as TimeoutError is
-    """They did not come in time."""
+    """The frames did not arrive in time."""
 
 
 class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818

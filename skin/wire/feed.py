@@ -1,4 +1,4 @@
-"""Sources of frames for the reader thread: a byte stream or a recording."""
+"""Feeds of frames for the reader thread: a byte stream or a recording."""
 
 import logging
 from collections import Counter
@@ -11,8 +11,8 @@ import numpy as np
 
 from skin.signal.frame import After, Frame
 from skin.wire.decoder import Decoder
-from skin.wire.detect import clock_stands_still
-from skin.wire.health import Health, Limits, State
+from skin.wire.format_detection import stopped_clock_error
+from skin.wire.health import ChannelHealth, ChannelState, Limits
 from skin.wire.transport import ByteStream
 
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -29,26 +29,26 @@ _WEAK = {
 
 
 class Feed(Protocol):
-    """Frames one after another.
+    """A sequence of frames.
 
     Attributes:
-        patient: it can wait, so that no frame needs to be dropped.
+        patient: the feed can wait, so no frame needs to be dropped.
     """
 
     patient: bool
 
     def poll(self) -> list[Frame]:
-        """Return what came within about 0.1 s; OSError once it is unplugged, EOFError at its end."""
+        """Return the frames of about 0.1 s; OSError once it is unplugged, EOFError at its end."""
 
-    def states(self) -> tuple[State, ...]:
-        """Return what is wrong with each channel."""
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return the state of each channel."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the feed."""
 
 
-class Wire:
-    """Frames from bytes, their channels judged; says in the log once a second what was wrong.
+class WireFeed:
+    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
 
     Args:
         stream: of bytes.
@@ -65,10 +65,10 @@ class Wire:
         decoder: Decoder,
         limits: Limits | None,
         silence: float = inf,
-        health: Health | None = None,
+        health: ChannelHealth | None = None,
     ) -> None:
         self._stream, self._decoder, self._limits = stream, decoder, limits
-        self._health = health or Health()
+        self._health = health or ChannelHealth()
         self._told = False
         self._said = Counter(decoder.counters.bad)
         self._said_at = self._heard_at = monotonic()
@@ -76,26 +76,29 @@ class Wire:
         self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
 
     def poll(self) -> list[Frame]:
-        """Return the frames that ended in what came; InputError if nothing can be read at all, OSError if
-        nothing came for too long.
+        """Return the frames received since the last call.
+
+        Raises:
+            InputError: no format is detected, or the device's clock stands still.
+            OSError: the stream is closed, or silent for too long.
         """
         data, now = self._stream.read(), monotonic()
         if data:
             self._heard_at = now
         elif now - self._heard_at >= self._silence:
-            raise TimeoutError(f"nothing came for {self._silence:g} s")
+            raise TimeoutError(f"nothing received for {self._silence:g} s")
         frames = self._decoder.feed(data, now) if data else []
         if frames:
             self._prepare()
             self._check_clock(frames, now)
-        elif data and (refusal := self._decoder.refusal()):
-            raise refusal
+        elif data and (error := self._decoder.error()):
+            raise error
         if now - self._said_at >= 1:
             self._say(now)
         return [self._judged(frame) for frame in frames]
 
-    def states(self) -> tuple[State, ...]:
-        """Return what is wrong with each channel."""
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return the state of each channel."""
         return self._health.states()
 
     def close(self) -> None:
@@ -103,10 +106,10 @@ class Wire:
         self._stream.close()
 
     def _prepare(self) -> None:
-        """Say once what protects the frames; take limits from the header whenever it comes."""
-        speech, header = self._decoder.speech, self._decoder.header
-        if not self._told and speech is not None and speech.check in _WEAK:
-            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[speech.check])
+        """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
+        frame_format, header = self._decoder.frame_format, self._decoder.header
+        if not self._told and frame_format is not None and frame_format.check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[frame_format.check])
         self._told = True
         if self._limits is not None:
             self._health.limits = self._limits
@@ -114,18 +117,18 @@ class Wire:
             self._health.limits = (None, 2**header.bits - 1)
 
     def _check_clock(self, frames: list[Frame], now: float) -> None:
-        """Raise InputError where frames come and the device's clock does not move."""
+        """Raise InputError if frames arrive but the device's clock stands still."""
         if frames[-1].t != self._clock:
             self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
         self._clock_frames += len(frames)
         least, few = _STILL
         if now - self._clock_since >= least and self._clock_frames >= few:
-            raise clock_stands_still(self._clock_frames, self._clock * 1e6)
+            raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
 
     def _judged(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
-        valid, saturated = self._health.judge(frame.values, frame.t)
+        valid, saturated = self._health.check(frame.values, frame.t)
         return frame._replace(valid=valid, saturated=saturated)
 
     def _say(self, now: float) -> None:
@@ -137,13 +140,13 @@ class Wire:
             _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, f"; {trouble}" if trouble else "")
 
 
-class Player:
-    """Frames from memory, in real time or as fast as they are taken.
+class PlaybackFeed:
+    """Frames from memory, in real time or as fast as they are read.
 
     Args:
         pieces: values, valid and saturated, (F, S) each, of each piece; a window should not span two of them.
         rate: frames per second, Hz.
-        realtime: False: as fast as they are taken.
+        realtime: False: as fast as they are read.
     """
 
     def __init__(self, pieces: Iterable[Piece], rate: float, realtime: bool = True) -> None:
@@ -175,8 +178,8 @@ class Player:
             self._next = self._take()
         return frames
 
-    def states(self) -> tuple[State, ...]:
-        """Return nothing: what a file says is valid is in its frames."""
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return nothing: the frames of a file already have masks of valid values."""
         return ()
 
     def close(self) -> None:

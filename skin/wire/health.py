@@ -1,10 +1,10 @@
-"""Which channels are usable: neither stuck nor dead; one at its limit is valid and saturated."""
+"""State of each channel: ok, saturated (valid, at its limit), stuck or dead."""
 
 from typing import Literal
 
 import numpy as np
 
-State = Literal["ok", "saturated", "stuck", "dead"]
+ChannelState = Literal["ok", "saturated", "stuck", "dead"]
 Limits = tuple[float | None, float | None]
 
 _SILENT = 5.0  # s without any change
@@ -12,21 +12,21 @@ _LIVELY = 1.0  # s within which most channels change, if their noise can be seen
 _FAR = 20  # smallest steps of a channel: more than its noise ranges over
 
 
-class Health:
-    """Judges channels frame by frame.
+class ChannelHealth:
+    """Checks channels frame by frame.
 
-    A value at a limit is saturated, and valid: the force is at least that. A channel that does not change at
-    all for five seconds in which most others kept changing is stuck, or dead if it never changed. Where the
-    noise of an untouched skin is below one count, neither can be told, and neither is. One change, and the
-    channel counts again. A channel that stays at the largest value that it ever sent, far above its smallest,
-    has a limit that nobody told: it is saturated, not stuck, because a held press must not be masked.
+    A value at a limit is saturated and valid: the force is at least that. A channel that does not change for
+    five seconds while most others do is stuck, or dead if it has never changed. Neither state is detected if
+    the noise of the untouched skin is below one count. A single change makes the channel valid again. A
+    channel that stays at the largest value it has ever sent, far above its smallest, is saturated at an
+    unknown limit rather than stuck, because a held press must not be masked.
 
     Args:
-        limits: smallest and largest value a channel can send; None where a value at rest may lie there, as
-            at 0 of a resistor that conducts only under load.
+        limits: smallest and largest value of a channel; None where an untouched channel may have this value,
+            such as 0 of a resistor that conducts only under load.
 
     Attributes:
-        limits: as given; another value holds from the next frame on.
+        limits: as given; a new value applies from the next frame on.
     """
 
     def __init__(self, limits: Limits = (None, None)) -> None:
@@ -36,10 +36,10 @@ class Health:
         self._ever, self._smallest = np.zeros(0, dtype=bool), np.zeros(0)
 
     def restart(self) -> None:
-        """Forget times: the device started anew. What channels can send stays known."""
+        """Reset the times after a restart of the device; the known range of each channel is kept."""
         self._begin_time = True
 
-    def judge(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+    def check(self, values: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return which values (S,) are valid and which are saturated, (S,), bool each.
 
         Args:
@@ -71,12 +71,12 @@ class Health:
         self._silent &= ~self._saturated
         return ~self._silent, self._saturated
 
-    def states(self) -> tuple[State, ...]:
-        """Return what is wrong with each channel as of the last frame; empty before the first."""
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return the state of each channel at the last frame; empty before the first."""
         if self._last is None:
             return ()
         dead = self._silent & ~self._ever
-        kinds: list[State] = ["ok", "saturated", "stuck", "dead"]
+        kinds: list[ChannelState] = ["ok", "saturated", "stuck", "dead"]
         worst = np.where(dead, 3, np.where(self._silent, 2, np.where(self._saturated, 1, 0)))
         return tuple(kinds[number] for number in worst)
 

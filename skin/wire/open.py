@@ -1,4 +1,4 @@
-"""Open a skin: a serial port, a socket, a recording or the simulator."""
+"""Open a skin at a serial port or socket, a recording, or the simulator."""
 
 from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveIn
 from skin.errors import InputError
 from skin.settings import RISING, checked
 from skin.wire.decoder import Decoder
-from skin.wire.detect import Format
-from skin.wire.feed import Feed, Piece, Player, Wire
-from skin.wire.health import Health, Limits
+from skin.wire.feed import Feed, Piece, PlaybackFeed, WireFeed
+from skin.wire.format_detection import Format
+from skin.wire.health import ChannelHealth, Limits
 from skin.wire.reader import Reader
 from skin.wire.skin import Skin
-from skin.wire.transport import ByteStream, open_wire
+from skin.wire.transport import ByteStream, open_stream
 
 if TYPE_CHECKING:
     from skin.recording import Touches
@@ -27,7 +27,7 @@ _STRIP = 600.0  # s of simulated touches in one piece
 
 
 class Streamed(Protocol):
-    """A device whose touches come in streams, such as :class:`skin.device.simulated.Simulated`."""
+    """A device that simulates streams of touches, such as :class:`skin.device.simulated.Simulated`."""
 
     rate: float
 
@@ -44,25 +44,25 @@ def _ordered(limits: Limits) -> Limits:
 
 @checked("device")
 @dataclass(frozen=True, kw_only=True)
-class Settings:
-    """How a skin is read.
+class PortSettings:
+    """Settings of :func:`open_skin`.
 
     Args:
         baudrate: bits per second, for serial ports.
         format: ``auto``, ``text`` or ``binary``.
-        limits: smallest and largest value a channel can send, as in :class:`skin.wire.health.Health`; None:
-            the largest count, where the device tells its bits.
-        timeout: s without a frame after which iterating and reading give up.
-        queue: frames that are kept for whoever is late.
-        reconnect: wait for an unplugged skin; its first frame has ``after="reconnect"``.
+        limits: smallest and largest value of a channel, as in :class:`skin.wire.health.ChannelHealth`; None:
+            the largest count, if the header gives the bits.
+        timeout: s without a frame after which iterating and reading raise ``SkinTimeout``.
+        queue: number of frames that are buffered.
+        reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
         backoff: s before the first attempt to reconnect, and the longest between two.
         silence: s without a byte after which a socket is closed and opened again, if ``reconnect``; None or
-            0: never. A computer that lost its power cannot say that it is gone. Serial ports are left open:
-            the system tells when one is unplugged, and opening one restarts many boards.
-        realtime: False plays a recording or the simulator as fast as frames are taken.
+            0: never. A computer that lost its power closes no connection. Serial ports are left open: the
+            system reports when one is unplugged, and opening one restarts many boards.
+        realtime: False plays a recording or the simulator as fast as frames are read.
 
     Raises:
-        InputError: a setting that cannot be used.
+        InputError: a setting is invalid.
     """
 
     baudrate: PositiveInt = 115200
@@ -90,28 +90,30 @@ def open_skin(
     Args:
         port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:number``, a recording (``x.parquet``, ``x.csv``) or
             ``simulated``.
-        layout: the sensors (anything with a length); None learns their number.
-        opener: opens the stream of bytes instead, and again after each unplugging.
-        device: what ``simulated`` plays.
+        layout: the sensors (anything with a length); None: their number is detected.
+        opener: opens the stream of bytes instead of ``port``, and again after each disconnection.
+        device: the device that ``simulated`` plays.
         baseline: (S,), from an earlier tare.
-        settings: as in :class:`Settings`.
+        settings: as in :class:`PortSettings`.
 
     Raises:
         InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
     """
-    chosen, sensors = Settings(**settings), None if layout is None else len(layout)
+    chosen, sensors = PortSettings(**settings), None if layout is None else len(layout)
     decoder = None
     if opener is None and port == "simulated":
         if device is None:
             raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
-        connect = _player(Player(_strips(device), device.rate, chosen.realtime))
+        connect = _player(PlaybackFeed(_strips(device), device.rate, chosen.realtime))
     elif opener is None and port.endswith((".parquet", ".csv")):
         connect = _player(_recorded(port, sensors, chosen.realtime))
     else:
         decoder = Decoder(sensors, chosen.format)
         watched = chosen.reconnect and port.startswith("socket://")
         silence = (chosen.silence if watched else None) or inf
-        connect = _wire(opener or partial(open_wire, port, chosen.baudrate), decoder, chosen.limits, silence)
+        connect = _wire(
+            opener or partial(open_stream, port, chosen.baudrate), decoder, chosen.limits, silence
+        )
     try:
         reader = Reader(connect, chosen.queue, chosen.reconnect, chosen.backoff)
     except OSError as error:
@@ -122,38 +124,38 @@ def open_skin(
 def _wire(
     opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float
 ) -> Callable[[], Feed]:
-    """Return what connects; from the second time on the decoder begins anew.
+    """Return a function that connects; from the second call on it restarts the decoder.
 
-    What channels can send stays known: a cable may come loose under a press that drives them to their limit.
+    The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
     """
-    connections, health = count(), Health()
+    connections, health = count(), ChannelHealth()
 
     def connect() -> Feed:
         stream = opener()
         if next(connections):
             decoder.restart()
             health.restart()
-        return Wire(stream, decoder, limits, silence, health)
+        return WireFeed(stream, decoder, limits, silence, health)
 
     return connect
 
 
-def _player(player: Player) -> Callable[[], Feed]:
+def _player(player: PlaybackFeed) -> Callable[[], Feed]:
     return lambda: player
 
 
-def _recorded(path: str, sensors: int | None, realtime: bool) -> Player:
-    # Here, because it brings torch, which a wire does not need.
-    from skin.storage import read
+def _recorded(path: str, sensors: int | None, realtime: bool) -> PlaybackFeed:
+    # Imported here because it imports torch, which reading a port does not need.
+    from skin.recording_file import read_recording
 
-    touches = read(path).touches
+    touches = read_recording(path).touches
     found = touches.readings.shape[2]
     if sensors not in (None, found):
         raise InputError(
             f"{path} has {found} sensors, the layout has {sensors}: give the layout it was recorded with, "
             "as in layout=file layout.path=FILE.csv"
         )
-    return Player(_pieces(touches), touches.rate, realtime)
+    return PlaybackFeed(_pieces(touches), touches.rate, realtime)
 
 
 def _strips(device: "Streamed") -> Iterator[Piece]:

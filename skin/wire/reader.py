@@ -1,4 +1,4 @@
-"""The reader thread, and the queue from which frames are taken."""
+"""The reader thread and its queue of frames."""
 
 import logging
 from collections import deque
@@ -14,24 +14,24 @@ from skin.wire.feed import Feed
 
 _log = logging.getLogger("skin.wire")
 
-_PAUSE = 0.002  # s between two looks at the port: fewer and larger pieces, a tenth of the work
+_PAUSE = 0.002  # s between two reads of the port: fewer and larger pieces cost a tenth of the time
 _RATE = 256  # frames over which the rate is taken
-_WAKE = 0.2  # s: a lock that is waited for longer would not hear Ctrl-C on Windows
+_WAKE = 0.2  # s: longer waits for a lock would block Ctrl-C on Windows
 
 
 class Reader:
-    """Reads until it is closed. What nobody takes in time is dropped, oldest first; the next frame tells.
+    """Reads frames until it is closed. A full queue drops its oldest frame; the next one counts it as lost.
 
     Args:
-        connect: opens the source; called anew after an unplugged cable.
-        queue: how many frames are kept at most.
-        reconnect: try again when the source is gone.
-        backoff: s before the first attempt, and the longest between two; it doubles until frames come.
+        connect: opens the feed; called again after each disconnection.
+        queue: largest number of frames in the queue.
+        reconnect: try to open the feed again after a disconnection.
+        backoff: s before the first attempt, and the longest between two; it doubles until frames arrive.
 
     Attributes:
-        dropped: frames that nobody took in time.
-        reconnects: how often the source came back.
-        away: the source is gone and tried again.
+        dropped: number of frames dropped from a full queue.
+        reconnects: number of reconnections.
+        away: the feed is disconnected and being reopened.
         error: why the thread ended; EOFError at the end of a recording.
     """
 
@@ -60,7 +60,7 @@ class Reader:
             return (len(times) - 1) / passed if passed > 0 else 0.0
 
     def take(self, count: int, timeout: float) -> Iterator[Frame]:
-        """Yield frames as they come: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
+        """Yield frames as they arrive: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
         deadline = monotonic() + timeout
         for _ in range(count):
             with self._fresh:
@@ -100,7 +100,7 @@ class Reader:
             if not self._reconnect:
                 raise SkinDisconnected(f"the skin was unplugged: {error}") from error
             _log.warning("the skin was unplugged (%s); trying again", error)
-            self._again()
+            self._reopen()
             return
         if frames:
             self._wait = self._backoff[0]
@@ -108,7 +108,7 @@ class Reader:
             if not self.feed.patient:
                 self._stop.wait(_PAUSE)
 
-    def _again(self) -> None:
+    def _reopen(self) -> None:
         self.away = True
         while not self._stop.wait(self._wait):
             self._wait = min(2 * self._wait, self._backoff[1])

@@ -15,7 +15,7 @@ from skin.labels import OPPOSITE, Task
 from skin.rng import Stream, generator
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.announcement import Tap
+from skin.wire.announcement import AnnouncementListener
 
 Labels = Mapping[str, int]
 
@@ -23,18 +23,18 @@ _LATE = 0.25  # share of an announced window that may be missed at its beginning
 
 
 @dataclass
-class Take:
+class RecordedGesture:
     """The frames of one gesture.
 
     Attributes:
         number: of the gesture.
-        labels: name -> 0 or 1; None where nobody knows.
-        begin: of the window, s, the device's clock.
+        labels: name -> 0 or 1; None if unknown.
+        begin: start of the window, s, by the device's clock.
         segment: of the device's clock.
         frames: of the window.
-        lost: frames that are known to be missing in it.
-        broken: the device started anew within it: it cannot be used.
-        seen: the window at the model's rate, in the device's unit; None until it is over.
+        lost: number of frames known to be missing.
+        broken: the device restarted within the window, so it cannot be used.
+        resampled: the window at the model's rate, in the device's unit; None until it is complete.
     """
 
     number: int
@@ -44,10 +44,10 @@ class Take:
     frames: list[Frame] = field(default_factory=list)
     lost: int = 0
     broken: bool = False
-    seen: Resampled | None = None
+    resampled: Resampled | None = None
 
 
-def plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
+def label_plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
     """Yield every combination of the labels, in another random order each repetition."""
     for repetition in range(repetitions):
         order = generator(Stream.SPLIT, 2, seed, repetition).permutation(2 ** len(names))
@@ -55,127 +55,128 @@ def plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
             yield {name: int(code) >> place & 1 for place, name in enumerate(names)}
 
 
-def sentence(labels: Labels) -> str:
+def label_text(labels: Labels) -> str:
     """Return labels in words, as ``small, dynamic, press, safe``."""
     return ", ".join(name if on else OPPOSITE.get(name, f"not {name}") for name, on in labels.items())
 
 
-def typed(file: int) -> Iterator[str]:
-    """Yield the lines that a person types into an open file."""
+def typed_lines(file: int) -> Iterator[str]:
+    """Yield the lines typed into an open file."""
     rest = b""
-    # Not from sys.stdin: a thread that waits there cannot be left when the program ends.
+    # Not sys.stdin: a thread that blocks there would keep the program from ending.
     while data := os.read(file, 1024):
         *lines, rest = (rest + data).split(b"\n")
         yield from (line.decode(errors="replace") for line in lines)
 
 
-class AbstractDirector(ABC):
-    """Is shown every frame and says which make a gesture.
+class AbstractSegmenter(ABC):
+    """Segments a stream of frames into gestures.
 
     Args:
-        window: of the model; frames that came before the first one shown may have been added to it.
+        window: of the model; it may already contain earlier frames.
 
     Attributes:
         window: as given.
-        take: the window that is being filled; None between two.
-        over: nothing more will come.
+        gesture: the gesture that is being recorded; None between two.
+        over: no more gestures follow.
     """
 
     def __init__(self, window: Window) -> None:
         self.window, self._length = window, window.frames / window.rate
-        self.take: Take | None = None
+        self.gesture: RecordedGesture | None = None
         self.over = False
 
-    def show(self, frame: Frame) -> Take | None:
-        """Take a frame; return the gesture whose window ended before it, or one that broke off."""
+    def add(self, frame: Frame) -> RecordedGesture | None:
+        """Add a frame; return the gesture whose window ended before it, complete or broken; else None."""
         done = self._close(frame)
         if done is not None and not done.broken:
-            done.seen = self.window.since(done.begin)
+            done.resampled = self.window.since(done.begin)
         self.window.add(frame)
-        if self.take is None:
-            self.take = self._begin(frame)
-        if self.take is not None:
+        if self.gesture is None:
+            self.gesture = self._begin(frame)
+        if self.gesture is not None:
             # The first frame's loss lies before the window.
-            self.take.lost += frame.lost if self.take.frames else 0
-            self.take.frames.append(frame)
+            self.gesture.lost += frame.lost if self.gesture.frames else 0
+            self.gesture.frames.append(frame)
         return done
 
-    def _close(self, frame: Frame) -> Take | None:
-        take = self.take
-        if take is None:
+    def _close(self, frame: Frame) -> RecordedGesture | None:
+        gesture = self.gesture
+        if gesture is None:
             return None
-        take.broken = frame.segment != take.segment
-        if not take.broken and frame.t < take.begin + self._length - 1e-7:
+        gesture.broken = frame.segment != gesture.segment
+        if not gesture.broken and frame.t < gesture.begin + self._length - 1e-7:
             return None
-        self.take = None
-        return take
+        self.gesture = None
+        return gesture
 
     @abstractmethod
-    def _begin(self, frame: Frame) -> Take | None:
-        """Return a window that begins with this frame, if one does."""
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
+        """Return the gesture that begins with this frame, or None."""
 
 
-class Announced(AbstractDirector):
-    """Takes the windows and labels that an emulated skin announces.
+class AnnouncedSegmenter(AbstractSegmenter):
+    """Segments by the windows and labels that an emulated skin announces.
 
     Args:
-        window: as in :class:`AbstractDirector`.
-        tap: what hears the announcements.
-        task: the labels that are wanted; ``touch`` is always true.
+        window: as in :class:`AbstractSegmenter`.
+        listener: collects the announcements.
+        task: the required labels; ``touch`` is always 1.
 
     Raises:
-        InputError: on a frame without a number, or an announcement without a label.
+        InputError: a frame without a number, or an announcement without a required label.
     """
 
-    def __init__(self, window: Window, tap: Tap, task: Task) -> None:
+    def __init__(self, window: Window, listener: AnnouncementListener, task: Task) -> None:
         super().__init__(window)
-        self._heard, self._task = tap.heard, task
+        self._announcements, self._task = listener.announcements, task
 
-    def _begin(self, frame: Frame) -> Take | None:
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
             raise InputError("announcements need frames with numbers: give device.labels=prompted")
-        while self._heard:
-            said = self._heard[0]
-            if frame.seq < said.seq:
+        while self._announcements:
+            announced = self._announcements[0]
+            if frame.seq < announced.seq:
                 return None
-            self._heard.popleft()
-            # Of one that began long before somebody listened the rest is no gesture.
-            if frame.seq <= said.seq + _LATE * said.frames:
-                begin = frame.t - (frame.seq - said.seq) * self._length / said.frames
-                labels = {"touch": 1} | dict(said.labels)
+            self._announcements.popleft()
+            # Most of a gesture that began long before the port was opened is missing.
+            if frame.seq <= announced.seq + _LATE * announced.frames:
+                late = frame.seq - announced.seq
+                begin = frame.t - late * self._length / announced.frames
+                labels = {"touch": 1} | dict(announced.labels)
                 if missing := [name for name in self._task.names if name not in labels]:
                     raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
                 known = {name: labels[name] for name in self._task.names}
-                return Take(said.number, known, begin, frame.segment, lost=frame.seq - said.seq)
+                return RecordedGesture(announced.number, known, begin, frame.segment, lost=late)
         return None
 
 
-class Prompted(AbstractDirector):
-    """Asks a person for each gesture and begins when Enter is pressed: s skips one, q ends.
+class PromptedSegmenter(AbstractSegmenter):
+    """Prompts for each gesture, which begins when Enter is pressed: s skips one, q ends.
 
     Args:
-        window: as in :class:`AbstractDirector`.
+        window: as in :class:`AbstractSegmenter`.
         wanted: (number, labels) of the gestures.
-        tell: says a sentence to the person.
-        lines: what the person types; None: standard input. What is typed before it is asked for counts,
-            unless it comes from a keyboard.
+        notify: called with each message for the user.
+        lines: typed lines; None: standard input. Lines typed before a prompt count, unless they come from a
+            keyboard.
     """
 
     def __init__(
         self,
         window: Window,
         wanted: Iterator[tuple[int, Labels]],
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
         lines: Iterator[str] | None = None,
     ) -> None:
         super().__init__(window)
-        self._wanted, self._tell = wanted, tell
+        self._wanted, self._notify = wanted, notify
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
         self._over_now = False
         self._hasty = lines is None and sys.stdin.isatty()
-        # A thread, because frames come while a person thinks.
-        Thread(target=self._listen, args=(lines or typed(sys.stdin.fileno()),), daemon=True).start()
+        # A thread, because frames arrive while the program waits for a line.
+        Thread(target=self._listen, args=(lines or typed_lines(sys.stdin.fileno()),), daemon=True).start()
 
     def _listen(self, lines: Iterator[str]) -> None:
         for line in lines:
@@ -183,21 +184,21 @@ class Prompted(AbstractDirector):
         self._hasty = False
         self._typed.put("q")
 
-    def _close(self, frame: Frame) -> Take | None:
+    def _close(self, frame: Frame) -> RecordedGesture | None:
         done = super()._close(frame)
-        # The next one is asked for a frame later, so that what is said of this one is said before.
+        # Prompt one frame later, so that the message about this gesture is printed first.
         self._over_now = done is not None
         return done
 
-    def show(self, frame: Frame) -> Take | None:
-        """As above; a gesture that broke off is asked for again."""
-        done = super().show(frame)
+    def add(self, frame: Frame) -> RecordedGesture | None:
+        """As in the base class; prompts again for a broken gesture."""
+        done = super().add(frame)
         if done is not None and done.broken and done.labels is not None:
-            self._tell("that one broke off: the skin was unplugged or started anew")
+            self._notify("the gesture was interrupted: the skin was unplugged or restarted")
             self._ask((done.number, done.labels))
         return done
 
-    def _begin(self, frame: Frame) -> Take | None:
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
         if self._over_now:
             return None
         if self._asked is None:
@@ -207,32 +208,32 @@ class Prompted(AbstractDirector):
                 return None
             self._ask(following)
         try:
-            said = self._typed.get_nowait()
+            line = self._typed.get_nowait()
         except Empty:
             return None
         number, labels = self._asked or (0, {})
         self._asked = None
-        self.over = said == "q"
-        if said in ("q", "s"):
+        self.over = line == "q"
+        if line in ("q", "s"):
             return None
-        self._tell(f"  now: {self._length:g} s")
-        return Take(number, labels, frame.t, frame.segment)
+        self._notify(f"  now: {self._length:g} s")
+        return RecordedGesture(number, labels, frame.t, frame.segment)
 
-    def _ask(self, asked: tuple[int, Labels]) -> None:
-        self._asked = asked
-        # Enter pressed twice is no second gesture.
+    def _ask(self, gesture: tuple[int, Labels]) -> None:
+        self._asked = gesture
+        # Pressing Enter twice must not start the next gesture.
         while self._hasty and not self._typed.empty():
             self._typed.get_nowait()
-        self._tell(f"next: {sentence(asked[1])} - press Enter, then touch; s skips it, q ends")
+        self._notify(f"next: {label_text(gesture[1])} - press Enter, then touch; s skips it, q ends")
 
 
-class Continuous(AbstractDirector):
-    """Takes windows one after the other, without labels.
+class ContinuousSegmenter(AbstractSegmenter):
+    """Segments into consecutive windows without labels.
 
     Args:
-        window: as in :class:`AbstractDirector`.
+        window: as in :class:`AbstractSegmenter`.
         first: number of the first.
-        wanted: asked of every frame that could begin a window; None: each does.
+        wanted: whether a frame's values may begin a window; None: any frame may.
     """
 
     def __init__(
@@ -241,8 +242,8 @@ class Continuous(AbstractDirector):
         super().__init__(window)
         self._number, self._wanted = first, wanted
 
-    def _begin(self, frame: Frame) -> Take | None:
+    def _begin(self, frame: Frame) -> RecordedGesture | None:
         if self._wanted is not None and not self._wanted(frame.values):
             return None
         self._number += 1
-        return Take(self._number - 1, None, frame.t, frame.segment)
+        return RecordedGesture(self._number - 1, None, frame.t, frame.segment)

@@ -11,7 +11,7 @@ _WRAP_GAP = 60_000_000  # microseconds that may be missing where the clock wraps
 
 
 class Place(NamedTuple):
-    """Where a frame belongs; as in :class:`skin.signal.frame.Frame`."""
+    """Time, segment and losses of a frame, as in :class:`skin.signal.frame.Frame`."""
 
     t: float
     segment: int
@@ -19,7 +19,7 @@ class Place(NamedTuple):
     after: After
 
 
-def steps(before: int, seq: int) -> int:
+def frames_ahead(before: int, seq: int) -> int:
     """Return by how many frames ``seq`` is ahead of ``before``, u16 or u32 wrapped; 0 if it is not."""
     if seq > before:
         return seq - before
@@ -29,8 +29,8 @@ def steps(before: int, seq: int) -> int:
     return 0
 
 
-class Order:
-    """Follows seq and the device's clock from frame to frame."""
+class SequenceTracker:
+    """Tracks seq and the device's clock from frame to frame."""
 
     def __init__(self) -> None:
         self.segment = 0
@@ -39,16 +39,16 @@ class Order:
         self._wrapped = 0
 
     def cut(self, after: After) -> None:
-        """Begin another segment with the next frame, for the reason given."""
+        """Start a new segment with the next frame; ``after`` is the reason."""
         self._after = after
 
     def place(self, seq: int | None, t_us: float, missing: int) -> Place:
-        """Return where a frame belongs.
+        """Return the time, segment and losses of a frame.
 
         Args:
-            seq: its number; None where the device gives none.
+            seq: its number; None if the device sends none.
             t_us: the device's clock, microseconds.
-            missing: bad frames since the last good one, all that is known without seq.
+            missing: number of bad frames since the last good one, used without seq.
 
         Raises:
             FrameError: ``repeat``: the same number at the same time once more.
@@ -60,7 +60,7 @@ class Order:
             return self._begin(t_us)
         if last == (seq, t_us):
             raise FrameError("repeat")
-        ahead, elapsed = steps(last[0], seq), t_us - last[1]
+        ahead, elapsed = frames_ahead(last[0], seq), t_us - last[1]
         if elapsed < 0 and last[1] < _WRAP and elapsed + _WRAP <= _WRAP_GAP:
             elapsed += _WRAP
             self._wrapped += _WRAP
@@ -81,9 +81,9 @@ class Order:
 class HostClock:
     """Maps the device's clock to the host's by the least delayed frames of the last seconds.
 
-    A frame waits in buffers, some less than others: the smallest difference between its arrival and the
-    device's clock is nearest to the truth. It is looked for anew every few seconds, so a device's clock that
-    is wrong by 0.5 % (a ceramic resonator) puts t_host wrong by 20 ms at most.
+    Frames are buffered for different times: the smallest difference between arrival and the device's clock
+    is the best estimate. It is updated every few seconds, so a clock error of 0.5 % (a ceramic resonator)
+    causes an error of t_host of 20 ms at most.
     """
 
     _SPAN = 2.0  # s
@@ -93,7 +93,7 @@ class HostClock:
         self.restart()
 
     def restart(self) -> None:
-        """Forget how the clocks are related: the device started anew."""
+        """Reset the relation of the clocks after a restart of the device."""
         self._least = self._before = float("inf")
         self._since: float | None = None
 

@@ -8,29 +8,29 @@ import numpy as np
 
 from skin.errors import InputError
 from skin.signal.frame import Counters, Frame
-from skin.wire.baseline import median, rest
+from skin.wire.baseline import median_baseline, quiet_baseline
 from skin.wire.decoder import Decoder
 from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.health import State
+from skin.wire.health import ChannelState
 from skin.wire.reader import Reader
 from skin.wire.text import Header
 
 
 @dataclass(frozen=True)
 class Stats:
-    """What became of the bytes so far.
+    """Statistics of the bytes received so far.
 
     Attributes:
-        frames: good ones that came.
-        bad_frames: dropped because something was wrong; ``bad`` has the reasons.
-        dropped: good ones that nobody took in time.
-        resyncs: how often a good frame followed bad ones.
-        reconnects: how often the skin was plugged in again.
+        frames: number of good frames.
+        bad_frames: number of frames that could not be decoded; ``bad`` has the reasons.
+        dropped: number of good frames dropped from a full queue.
+        resyncs: number of good frames after bad ones.
+        reconnects: number of reconnections.
         rate_hz: frames per second by the device's clock, Hz; 0 if unknown.
         bytes, bad, skipped, gaps, lost, resets, weak: as in :class:`skin.signal.frame.Counters`.
-        format: ``text`` or ``binary``; empty if not known yet, or if there are no bytes.
+        format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
         check: ``crc16``, ``xor`` or ``none``; empty likewise.
-        trouble: what a person should look at; empty if all is well.
+        trouble: a message about the current problem; empty if there is none.
     """
 
     frames: int
@@ -54,10 +54,10 @@ class Stats:
 class Skin:
     """Frames from an open skin; iterate over it, or :meth:`read` a block.
 
-    Values are what the device sends; ``frame.values - skin.baseline`` is what a touch adds.
+    Values are in the device's unit; ``frame.values - skin.baseline`` is the change due to touch.
 
     Attributes:
-        baseline: (S,), what the untouched skin reads, in the device's units; None before the first tare.
+        baseline: (S,), values of the untouched skin, in the device's unit; None before the first tare.
     """
 
     def __init__(
@@ -74,16 +74,15 @@ class Skin:
         self.close()
 
     def close(self) -> None:
-        """End the thread and let go of the port."""
+        """End the thread and close the port."""
         self._reader.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames as they come, to the end of a recording.
+        """Yield frames as they arrive, to the end of a recording.
 
         Raises:
-            SkinTimeout: none came within the timeout the skin was opened with, though it was plugged in all
-                the time.
-            SkinDisconnected: it was unplugged and is not tried again.
+            SkinTimeout: no frame arrived within the timeout, though the skin was not disconnected.
+            SkinDisconnected: it was unplugged, and ``reconnect`` is not set.
         """
         while True:
             back = self._reader.reconnects
@@ -103,10 +102,10 @@ class Skin:
 
         Args:
             count: how many.
-            timeout: s for all of them; None: as the skin was opened with.
+            timeout: s for all of them; None: the timeout that the skin was opened with.
 
         Raises:
-            SkinTimeout: fewer came; they are in its ``frames``.
+            SkinTimeout: fewer arrived; they are in its ``frames``.
             SkinDisconnected: it was unplugged, or the recording has ended; likewise.
             InputError: nothing can be read: another format, baud rate or number of sensors.
         """
@@ -118,16 +117,16 @@ class Skin:
         return frames
 
     def tare(self, seconds: float = 1.0, force: bool = False, touch: float | None = None) -> np.ndarray:
-        """Take the untouched skin's readings for the baseline, and return it, (S,).
+        """Set the baseline to the readings of the untouched skin, and return it, (S,).
 
         Args:
             seconds: of frames from now on.
-            force: even if the skin seems touched.
+            force: set it even if the skin seems touched.
             touch: smallest shift against the old baseline that is a touch, in the device's units; None: 2 %
-                of the range, where the device tells its bits.
+                of the range, if the header gives the bits.
 
         Raises:
-            InputError: the skin is touched or started anew meanwhile, or too few frames came; the old
+            InputError: the skin is touched or was restarted meanwhile, or too few frames arrived; the old
                 baseline is kept.
         """
         frames, start = list[Frame](), monotonic()
@@ -136,54 +135,56 @@ class Skin:
             if frame.t_host >= start:
                 frames.append(frame)
         if len({frame.segment for frame in frames}) > 1:
-            raise InputError("the skin started anew meanwhile: tare again; the old baseline is kept")
+            raise InputError("the skin was restarted meanwhile: tare again; the old baseline is kept")
         if touch is None:
             touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
-        self.baseline = median(values) if force else rest(values, valid, self.baseline, touch)
+        self.baseline = (
+            median_baseline(values) if force else quiet_baseline(values, valid, self.baseline, touch)
+        )
         return self.baseline
 
     @property
     def header(self) -> Header | None:
-        """What the device tells of itself."""
+        """The header that the device sent; None if it sent none."""
         return self._decoder.header if self._decoder else None
 
     @property
-    def channels(self) -> tuple[State, ...]:
-        """What is wrong with each channel, as of the last frame that came; empty if nobody judges."""
+    def channels(self) -> tuple[ChannelState, ...]:
+        """State of each channel at the last frame; empty if channels are not checked."""
         return self._reader.feed.states()
 
     @property
     def stats(self) -> Stats:
-        """What became of the bytes so far."""
+        """Statistics of the bytes received so far."""
         reader, decoder = self._reader, self._decoder
         counters = decoder.counters if decoder else Counters(frames=self._taken)
         known = vars(counters) | {"bad": tuple(sorted(counters.bad.items()))}
-        speech = decoder.speech if decoder else None
+        frame_format = decoder.frame_format if decoder else None
         return Stats(
             bad_frames=counters.bad.total(),
             dropped=reader.dropped,
             reconnects=reader.reconnects,
             rate_hz=reader.rate,
-            format=speech.name if speech else "",
-            check=speech.check if speech else "",
+            format=frame_format.name if frame_format else "",
+            check=frame_format.check if frame_format else "",
             trouble=decoder.quality.trouble if decoder else "",
             **known,
         )
 
     def _explain(self, count: int, timeout: float, frames: list[Frame]) -> None:
-        """Raise why there are not ``count`` frames."""
+        """Raise the error that explains why ``count`` frames are not available."""
         error, stats = self._reader.error, self.stats
         if isinstance(error, SkinDisconnected | EOFError):
             raise SkinDisconnected(str(error), frames) from error
         if error is not None:
             raise error
-        came = f"{len(frames)} of {count} frames came within {timeout:g} s"
+        message = f"{len(frames)} of {count} frames arrived within {timeout:g} s"
         if self._reader.away:
-            raise SkinTimeout(f"{came}: the skin is unplugged; trying again", frames)
+            raise SkinTimeout(f"{message}: the skin is unplugged; trying again", frames)
         if not stats.bytes and not stats.frames:
-            raise SkinTimeout(f"{came}: port open, nothing received; is the device sending?", frames)
+            raise SkinTimeout(f"{message}: port open, nothing received; is the device sending?", frames)
         if not stats.frames:
             reason = stats.trouble or "no format shows yet; wrong baud rate?"
-            raise SkinTimeout(f"{came}: {stats.bytes} bytes but no frame: {reason}", frames)
-        raise SkinTimeout(f"{came}: {stats.trouble or 'the device has fallen silent'}", frames)
+            raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)
+        raise SkinTimeout(f"{message}: {stats.trouble or 'the device stopped sending'}", frames)

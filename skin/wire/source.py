@@ -1,20 +1,20 @@
-"""A stream of frames that can be watched, with the tare that says what its values mean."""
+"""A stream of frames for the live view, with its tare."""
 
 from dataclasses import dataclass
 
-from skin.wire.conversion import newtons
+from skin.wire.conversion import unit_conversion
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where frames come from.
+    """An open stream of frames and its tare.
 
     Attributes:
-        name: of it, for a person.
+        name: shown in the live view.
         skin: open.
-        tare: finds out what its values mean.
+        tare: gives the conversion of values to N.
     """
 
     name: str
@@ -23,7 +23,7 @@ class Source:
 
     @classmethod
     def of_newtons(cls, name: str, skin: Skin, sensors: int) -> "Source":
-        """Return one whose values are N already, of so many sensors."""
-        # No baseline is taken: a run that learned from such values expects their offsets.
-        meaning = newtons(sensors, None, 1.0, None, None)
-        return cls(name, skin, Tare(lambda baseline, header: meaning, 0.0, 1.0))
+        """Return a source whose values are already in N."""
+        # No baseline is taken: a run trained on such values expects their offsets.
+        conversion = unit_conversion(sensors, None, 1.0, None, None)
+        return cls(name, skin, Tare(lambda baseline, header: conversion, 0.0, 1.0))

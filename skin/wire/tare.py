@@ -9,103 +9,103 @@ import numpy as np
 from skin.errors import InputError
 from skin.signal.frame import Frame
 from skin.signal.resampling import Window, check_rate
-from skin.wire.baseline import rest
-from skin.wire.conversion import Newtons
+from skin.wire.baseline import quiet_baseline
+from skin.wire.conversion import UnitConversion
 from skin.wire.errors import SkinTouched
 from skin.wire.skin import Skin
 from skin.wire.text import Header
 
-Meaning = Callable[[np.ndarray | None, Header | None], Newtons]
-"""From a baseline (S,), or None, and what a device tells of itself to what its values mean; InputError where
-nobody knows."""
+MakeConversion = Callable[[np.ndarray | None, Header | None], UnitConversion]
+"""Returns the conversion for a baseline (S,), or None, and a header, or None; InputError if the scale is
+unknown."""
 
-_HEADER = 3.0  # s in which a device must tell its unit
-_OFTEN = 0.2  # s between two attempts at a baseline
+_HEADER = 3.0  # s within which a device must send its header
+_OFTEN = 0.2  # s between two attempts to take a baseline
 _PATIENCE = 60.0  # s for which a touch may delay the baseline
-_LEAST = 1.0  # s in which the rate shows
+_LEAST = 1.0  # s over which the rate is measured
 _UNTOUCHED = "taking the baseline: do not touch the skin"
 
 
 class Tare:
-    """Takes the baseline from the first quiet stretch of a stream, and again when an operator asks.
+    """Takes the baseline from the first quiet stretch of a stream, and again on request.
 
     The baseline is that of values resampled to the model's rate: the maximum of noise is not 0. It is kept
     over restarts of the device, because the restart may have happened under a touch. A sensor that is at its
-    limit during the whole stretch is pressed or broken: it is unknown until the next tare.
+    limit during the whole stretch is pressed or broken: it is invalid until the next tare.
 
     Args:
-        meaning: what values mean.
-        seconds: s without touch that give the baseline; 0: there is none.
+        conversion: makes the conversion of values to N.
+        seconds: s without touch from which the baseline is taken; 0: no baseline.
         rate: of the model, Hz.
-        header: what the device tells of itself, once it does.
+        header: returns the header of the device, None until it has sent one.
 
     Attributes:
-        newtons: what values mean; None until unit and baseline are known.
-        waiting: what is being waited for; empty if nothing is.
-        count: how many baselines were taken.
+        conversion: of values to N; None until unit and baseline are known.
+        status: message about what the tare is waiting for; empty if nothing.
+        count: number of baselines taken.
     """
 
     def __init__(
         self,
-        meaning: Meaning,
+        conversion: MakeConversion,
         seconds: float,
         rate: float,
         header: Callable[[], Header | None] = lambda: None,
     ) -> None:
-        self._meaning, self._header = meaning, header
+        self._conversion, self._header = conversion, header
         self._seconds, self._rate = seconds, rate
-        self.newtons: Newtons | None = None
-        self.waiting = "waiting for the first frame"
+        self.conversion: UnitConversion | None = None
+        self.status = "waiting for the first frame"
         self.count = 0
         self._quiet: list[Frame] = []
         self._first: float | None = None
         self._tried = -inf
         self._deadline: float | None = None
 
-    def again(self) -> None:
-        """Take a new baseline from the next quiet stretch: an operator says that nothing touches the skin.
+    def restart(self) -> None:
+        """Take a new baseline from the next quiet stretch, during which nothing may touch the skin.
 
         After a minute without a quiet stretch the old baseline stays.
         """
-        if self._seconds and self.newtons is not None:
+        if self._seconds and self.conversion is not None:
             self._quiet.clear()
             self._deadline = inf
-            self.waiting = _UNTOUCHED
+            self.status = _UNTOUCHED
 
     def add(self, frame: Frame) -> None:
-        """Look at a frame.
+        """Add a frame.
 
         Raises:
-            InputError: nobody knows what values mean, or too short a tare.
+            InputError: the scale is unknown, or the tare is too short.
         """
-        if self.newtons is not None and self._deadline is None:
+        if self.conversion is not None and self._deadline is None:
             return
         if self._deadline is not None:
             self._deadline = min(self._deadline, frame.t_host + _PATIENCE)
             if frame.t_host > self._deadline:
-                self._deadline, self.waiting = None, ""
+                self._deadline, self.status = None, ""
                 return
-        if not self._told(frame.t_host):
+        if not self._conversion_known(frame.t_host):
             return
         if self._seconds:
-            self._settle(frame)
+            self._collect(frame)
         else:
-            self.newtons, self.waiting = self._meaning(None, self._header()), ""
+            self.conversion, self.status = self._conversion(None, self._header()), ""
 
-    def _told(self, now: float) -> bool:
-        """Return whether it is known what values mean; a device may tell a little late."""
+    def _conversion_known(self, now: float) -> bool:
+        """Return whether unit and scale are known; the header may arrive a little late."""
         self._first = now if self._first is None else self._first
         header = self._header()
         try:
-            self._meaning(None, header)
+            self._conversion(None, header)
         except InputError:
             if header is not None or now - self._first > _HEADER:
                 raise
-            self.waiting = "waiting for the device to tell its unit"
+            self.status = "waiting for the header of the device"
             return False
         return True
 
-    def _settle(self, frame: Frame) -> None:
+    def _collect(self, frame: Frame) -> None:
         """Take the baseline from the latest frames if they are long enough and quiet."""
         if self._quiet and self._quiet[-1].segment != frame.segment:
             self._quiet.clear()
@@ -114,12 +114,12 @@ class Tare:
         while frame.t - self._quiet[0].t > 1.5 * self._seconds:
             self._quiet.pop(0)
         if frame.t - self._quiet[0].t < self._seconds:
-            self.waiting = _UNTOUCHED
+            self.status = _UNTOUCHED
         elif frame.t - self._tried >= _OFTEN:
             self._tried = frame.t
-            self._rest()
+            self._try_baseline()
 
-    def _rest(self) -> None:
+    def _try_baseline(self) -> None:
         intervals = int(self._seconds * self._rate + 1e-6)
         window = Window(max(1, intervals), self._rate, len(self._quiet[-1].values))
         for frame in self._quiet:
@@ -127,35 +127,37 @@ class Tare:
         seen = window.read()
         if seen is None:
             return
-        # Where all frames of an interval were lost, it tells nothing about the baseline.
-        come = seen.valid.any(axis=1)
+        # Intervals in which all frames were lost have no baseline.
+        known = seen.valid.any(axis=1)
         try:
-            baseline = rest(seen.values[come], seen.valid[come])
+            baseline = quiet_baseline(seen.values[known], seen.valid[known])
         except SkinTouched as touched:
-            self.waiting = f"no baseline yet: {str(touched).split(';')[0]}"
+            self.status = f"no baseline yet: {str(touched).split(';')[0]}"
             return
-        known = self._meaning(baseline, self._header())
-        self.newtons = replace(known, broken=known.broken | seen.saturated[come].all(axis=0))
-        self.count, self.waiting, self._deadline = self.count + 1, "", None
+        found = self._conversion(baseline, self._header())
+        self.conversion = replace(found, broken=found.broken | seen.saturated[known].all(axis=0))
+        self.count, self.status, self._deadline = self.count + 1, "", None
         self._quiet.clear()
 
 
-def settle(skin: Skin, tare: Tare, rate: float, seconds: float, tell: Callable[[str], None]) -> list[Frame]:
-    """Read until the rate has shown and the tare knows what values mean; return all frames that came.
+def warm_up(
+    skin: Skin, tare: Tare, rate: float, seconds: float, notify: Callable[[str], None]
+) -> list[Frame]:
+    """Read frames until rate and conversion are known; return all frames read.
 
     Args:
         skin: just opened.
-        tare: looks at every frame.
+        tare: gets every frame.
         rate: of the model, Hz: a slower device is refused.
         seconds: of the tare.
-        tell: says a sentence to the person.
+        notify: called with each message for the user.
 
     Raises:
-        InputError: too slow a device, or values of unknown meaning.
+        InputError: the device is too slow, or the scale is unknown.
         SkinTouched: the skin was still touched after a minute.
     """
-    tell("reading the untouched skin: keep off" if seconds else "reading the rate")
-    frames, least, told = list[Frame](), max(seconds, _LEAST), False
+    notify("reading the untouched skin: keep off" if seconds else "reading the rate")
+    frames, least, measured = list[Frame](), max(seconds, _LEAST), False
     while True:
         frames += skin.read(1)
         if frames[-1].segment != frames[0].segment:
@@ -164,19 +166,19 @@ def settle(skin: Skin, tare: Tare, rate: float, seconds: float, tell: Callable[[
         passed = frames[-1].t - frames[0].t
         if len(frames) < 3 or passed < least:
             continue
-        if not told:
+        if not measured:
             check_rate(_rate(frames), rate)
-        if tare.newtons is not None:
+        if tare.conversion is not None:
             return frames
-        if not told and tare.waiting.startswith("no baseline"):
-            tell("the skin is touched: let go")
-        told = True
+        if not measured and tare.status.startswith("no baseline"):
+            notify("the skin is touched: let go")
+        measured = True
         if passed > least + _PATIENCE:
-            raise SkinTouched(tare.waiting)
+            raise SkinTouched(tare.status)
 
 
 def _rate(frames: list[Frame]) -> float:
-    """Return the rate of a device by its clock, Hz, lost frames counted in; 0 if it cannot be told."""
+    """Return the rate of a device by its clock, Hz, lost frames included; 0 if unknown."""
     passed = frames[-1].t - frames[0].t
     count = len(frames) - 1 + sum(frame.lost for frame in frames[1:])
     return count / passed if passed > 0 else 0.0

@@ -29,7 +29,7 @@ def xor8(data: bytes) -> int:
 
 
 class Line(NamedTuple):
-    """The numbers of a line, and what protects them."""
+    """The numbers of a line, and the kind of its checksum."""
 
     fields: list[float]
     check: Check
@@ -37,7 +37,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Header:
-    """What a device tells of itself.
+    """Description of a device, sent in a comment line.
 
     Attributes:
         proto: version of the protocol.
@@ -63,7 +63,7 @@ def encode_line(values: Sequence[float], seq: int, t_us: int, check: Check = "cr
         values: (S,), whole numbers or floats.
         seq: number of the frame.
         t_us: the device's clock, microseconds, modulo 2**32.
-        check: what protects the line.
+        check: kind of checksum.
     """
     return _checked(",".join(map(_number, (seq, t_us, *values))), check)
 
@@ -76,14 +76,14 @@ def encode_header(header: Header, check: Check = "crc16") -> bytes:
 
 
 def parse_line(line: bytes) -> Line:
-    """Return what a line without its end says; comma, semicolon, tab or blanks separate, one may trail.
+    """Parse a line without its end; fields are separated by comma, semicolon, tab or blanks.
 
     Raises:
         FrameError: ``checksum`` is wrong or unknown, or a field is no finite ``number``.
     """
     body, check = _verified(line)
     try:
-        if b"_" in body:  # Python's own grammar, which no device means
+        if b"_" in body:  # valid in Python's grammar only
             raise ValueError
         fields = [float(field) for field in _split(body.strip())]
     except ValueError:
@@ -102,14 +102,14 @@ def parse_header(line: bytes) -> Header | None:
     words = body.decode("ascii", "replace").lstrip("#").split()
     if words[:1] != ["skin"]:
         return None
-    told = dict(word.split("=", 1) for word in words[1:] if "=" in word)
+    words_by_name = dict(word.split("=", 1) for word in words[1:] if "=" in word)
     return Header(
-        _whole(told.get("proto")) or 1,
-        _whole(told.get("n")),
-        _positive(told.get("rate")),
-        told.get("unit"),
-        _whole(told.get("bits")),
-        told.get("id"),
+        _whole(words_by_name.get("proto")) or 1,
+        _whole(words_by_name.get("n")),
+        _positive(words_by_name.get("rate")),
+        words_by_name.get("unit"),
+        _whole(words_by_name.get("bits")),
+        words_by_name.get("id"),
     )
 
 
@@ -117,7 +117,7 @@ def _verified(line: bytes) -> tuple[bytes, Check]:
     body, star, tail = line.rpartition(b"*")
     if not star:
         return line, "none"
-    # Written out and compared: int() takes blanks, signs and underscores for hex.
+    # Compared as text, because int() accepts blanks, signs and underscores.
     if len(tail) == 4 and tail.upper() == b"%04X" % crc16(body):
         return body, "crc16"
     if len(tail) == 2 and tail.upper() == b"%02X" % xor8(body):

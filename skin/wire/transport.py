@@ -16,26 +16,26 @@ else:
 
 _WAIT = 0.1  # s
 _CONNECT = 5.0  # s
-# Who only reads never notices that the other side lost its power; by default the system asks after two hours.
+# A reader does not notice that the other side lost its power; by default the system checks after two hours.
 _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, attempts
 _MOST = 65536  # bytes at once
 
 
 class ByteStream(Protocol):
-    """Where bytes come from; an opener of one's own returns such an object."""
+    """A source of bytes; a custom ``opener`` returns such an object."""
 
     def read(self) -> bytes:
-        """Return what came, after 0.1 s at the latest, even if it is nothing; OSError once it is gone."""
+        """Return the received bytes, possibly none, within 0.1 s; OSError once the stream is closed."""
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
 
 
-def open_wire(port: str, baudrate: int) -> ByteStream:
+def open_stream(port: str, baudrate: int) -> ByteStream:
     """Open a serial port, or ``socket://host:number``.
 
     Raises:
-        InputError: there is no such port, it may not be opened, is in use, or is no port.
+        InputError: there is no such port, it cannot be opened, or it is in use.
     """
     return _Socket(port) if port.startswith("socket://") else _Serial(port, baudrate)
 
@@ -83,7 +83,7 @@ class _Socket:
         try:
             data = self._socket.recv(_MOST)
         except TimeoutError as error:
-            if error.errno is not None:  # ETIMEDOUT: nobody answers to keepalive
+            if error.errno is not None:  # ETIMEDOUT: no answer to keepalive
                 raise
             return b""
         if not data:
@@ -98,13 +98,13 @@ def _refused(port: str, baudrate: int, error: Exception) -> InputError:
     number, text = getattr(error, "errno", None), str(error)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
         return InputError(f"no port {port}: {_existing()}")
-    # Windows says "access is denied" of a port that another program holds.
+    # Windows reports "access is denied" for a port in use.
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "PermissionError" in text:
-        return InputError(f"{port} is in use: close the serial monitor, or whatever else reads it")
+        return InputError(f"{port} is in use: close the serial monitor or any other program that reads it")
     if number in (errno.EACCES, errno.EPERM):
         return InputError(
             f"{port} may not be opened: add your user to dialout with "
-            "sudo usermod -a -G dialout $USER, and log in anew"
+            "sudo usermod -a -G dialout $USER, and log in again"
         )
     if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
         return InputError(f"{port} is no serial port: {_existing()}")

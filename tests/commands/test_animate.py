@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 from skin.build import build_device
-from skin.storage import write
+from skin.recording_file import write_recording
 
 NAIVE = ("animate", "simulator=naive")
 
@@ -14,7 +14,9 @@ def test_a_drawn_touch_and_a_recorded_one(run, tmp_path, configured):
     done = run(tmp_path, *NAIVE, "out=hand.gif", "labels=[big,dynamic]", "shape=hand", "seed=3", store=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "hand.gif: hand: big, dynamic, 30 frames at 10 Hz\n"
-    write(build_device(configured("simulator=naive", "data.gestures=16")).recording(), tmp_path / "x.parquet")
+    write_recording(
+        build_device(configured("simulator=naive", "data.gestures=16")).recording(), tmp_path / "x.parquet"
+    )
     recording = ["device=recording", "device.path=x.parquet", "index=5", "out=five.gif"]
     done = run(tmp_path, *NAIVE, *recording, store=False)
     assert done.returncode == 0, done.stderr

@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.signal.calibration import read
+from skin.signal.calibration import read_calibration
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
 
@@ -24,7 +24,7 @@ def test_from_a_bench_to_touches_of_the_calibrated_device(run, tmp_path):
     assert "Warning" not in done.stderr
     assert "8 presses" in done.stdout
     assert "RMSE on 2 held-out presses" in done.stdout
-    assert len(read(out)) == 4
+    assert len(read_calibration(out)) == 4
     touches = tmp_path / "touches.csv"
     made = run(
         tmp_path,

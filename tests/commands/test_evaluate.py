@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from skin.storage import read, write
+from skin.recording_file import read_recording, write_recording
 
 SMALL = [
     "data.gestures=160",
@@ -59,8 +59,10 @@ def test_bad_input_is_one_sentence(run, folder):
 def test_touches_without_labels_get_verdicts(run, folder, tmp_path):
     done = run(tmp_path, "generate", "simulator=naive", "n=12", "out=x.parquet", store=False)
     assert done.returncode == 0, done.stderr
-    known = read(tmp_path / "x.parquet")
-    path = write(replace(known, touches=replace(known.touches, labels=None)), tmp_path / "y.parquet")
+    known = read_recording(tmp_path / "x.parquet")
+    path = write_recording(
+        replace(known, touches=replace(known.touches, labels=None)), tmp_path / "y.parquet"
+    )
     done = run(folder, "evaluate", "device=recording", f"device.path={path}", "device.test=all")
     assert done.returncode == 0, done.stderr
     (written,) = (folder / "results").glob("evaluation_recording_*.csv")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.storage import read
+from skin.recording_file import read_recording
 
 NAIVE = ("generate.py", "simulator=naive")
 
@@ -11,7 +11,7 @@ def test_writes_a_recording(run, tmp_path):
     done = run(tmp_path, *NAIVE, "n=32", "out=x.csv", store=False, fresh=True)
     assert done.returncode == 0, done.stderr
     assert "x.csv: 32 gestures" in done.stdout
-    recording = read(tmp_path / "x.csv")
+    recording = read_recording(tmp_path / "x.csv")
     assert len(recording) == 32
     assert recording.metadata["config"]["data"]["gestures"] == 32
     assert len(recording.metadata["config_hash"]) >= 16
@@ -24,18 +24,18 @@ def test_tells_the_balance_and_warns_where_a_shape_is_the_label(run, tmp_path):
     """Bars have no room as big touches unless they are stretched."""
     done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, store=False)
     assert done.returncode == 0, done.stderr
-    told, header, big, small = done.stderr.splitlines()[:4]
-    assert told.startswith("balance: ")
-    assert header.split()[:3] == ["told", "disc", "bar"]
+    title, header, big, small = done.stderr.splitlines()[:4]
+    assert title.startswith("balance: ")
+    assert header.split()[:3] == ["accuracy", "disc", "bar"]
     assert [big.split()[0], *big.split()[2:4]] == ["big", "100", "0"]
     assert small.split()[0] == "small"
-    assert "warning: the shape alone tells big (" in done.stderr
+    assert "warning: the shape alone predicts big (" in done.stderr
 
 
 def test_refuses_such_gestures_if_strict(run, tmp_path):
     done = run(tmp_path, *NAIVE, "n=160", "out=x.csv", *ONE_SIZE, "touch.strict=true", store=False)
     assert done.returncode == 2
-    assert "the shape alone tells big" in done.stderr.splitlines()[-1]
+    assert "the shape alone predicts big" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.glob("x.*"))
 

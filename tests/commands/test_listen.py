@@ -47,7 +47,7 @@ def test_it_says_what_comes(address):
     assert "text, checksum crc16, 3 sensors" in first
     assert "1 skipped" in first
     assert "checksum)" in first
-    assert "the device says: proto=1 n=3 rate=100 bits=10" in done.stdout
+    assert "header: proto=1 n=3 rate=100 bits=10" in done.stdout
     assert [line.split()[:4] + line.split()[5:] for line in done.stdout.splitlines()[-3:]] == [
         ["0", "512", "512", "512", "ok"],
         ["1", "500", "500", "501", "ok"],

@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.hardware.record.log import read as read_session
-from skin.storage import read
+from skin.hardware.record.session_reader import read_session
+from skin.recording_file import read_recording
 from skin.wire.text import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
@@ -106,9 +106,9 @@ def test_recording_with_enter_s_q_and_going_on_after_a_kill(person_at, address, 
         person.until("next: ")
         person.types("q")
         assert ended(person) == (0, "s.parquet: 3 gestures\n")
-    takes = read_session(tmp_path / "s.csv").takes
-    assert sorted(takes) == [0, 1, 2]
-    stored = read(tmp_path / "s.parquet")
+    gestures = read_session(tmp_path / "s.csv").gestures
+    assert sorted(gestures) == [0, 1, 2]
+    stored = read_recording(tmp_path / "s.parquet")
     words = [re.split(r"[ ,]+", line)[1:5] for line in (first, skipped, third)]
     yes = ("big", "dynamic", "press", "dangerous")
     assert stored.touches.labels.int().tolist() == [[int(yes[n] == w[n]) for n in range(4)] for w in words]
@@ -131,11 +131,11 @@ def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, add
     with person_at(tmp_path, *command) as person:
         person.until("2 of any gestures")
         person.process.kill()
-    done = len(read_session(tmp_path / "f.csv").takes)
+    done = len(read_session(tmp_path / "f.csv").gestures)
     assert done >= 2
     with person_at(tmp_path, *command, "seconds=5") as person:
         code, said = ended(person)
-    stored = read(tmp_path / "f.parquet")
+    stored = read_recording(tmp_path / "f.parquet")
     assert (code, said) == (0, f"f.parquet: {len(stored)} gestures\n")
     assert len(stored) > done
     assert stored.touches.labels is None

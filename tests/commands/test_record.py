@@ -13,9 +13,9 @@ import pytest
 
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
-from skin.hardware.record.lines import locked
-from skin.hardware.record.log import read as read_session
-from skin.storage import read
+from skin.hardware.record.line_writer import locked
+from skin.hardware.record.session_reader import read_session
+from skin.recording_file import read_recording
 from skin.wire.text import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
@@ -102,14 +102,14 @@ def test_a_full_disk_is_one_sentence_and_there_is_room_again(record, begin, tmp_
         before = path.read_bytes()
         assert 19_800 < len(before) <= 20_001
         assert before.endswith(b"\n")
-        done = len(read_session(path).takes)
+        done = len(read_session(path).gestures)
         assert done >= 2
         assert not (tmp_path / "s.parquet").exists()
         again = record(*FREE, port, "seconds=3")
     assert again.returncode == 0, again.stderr
     assert f"s.csv has {done} gestures: going on" in again.stderr
     assert path.read_bytes().startswith(before)
-    assert len(read(tmp_path / "s.parquet")) > done
+    assert len(read_recording(tmp_path / "s.parquet")) > done
 
 
 def test_a_session_that_is_being_recorded_is_left_alone(record, tmp_path):
@@ -151,7 +151,7 @@ def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, rec
 
 
 def test_damaged_lines_are_skipped_and_named(record, recorded):
-    lines, whole = recorded.read_bytes().split(b"\n"), len(read_session(recorded).takes)
+    lines, whole = recorded.read_bytes().split(b"\n"), len(read_session(recorded).gestures)
     begins = [place for place, line in enumerate(lines) if b'"event": "begin"' in line]
     lines[begins[1] + 5] = b"\xff" + lines[begins[1] + 5]
     lines[begins[2]] = lines[begins[2]][:30]
@@ -160,24 +160,24 @@ def test_damaged_lines_are_skipped_and_named(record, recorded):
     assert (done.returncode, done.stdout) == (0, f"s.parquet: {whole - 1} gestures\n"), done.stderr
     named = f"{begins[1] + 6}, {begins[2] + 1}, {len(lines)}"
     assert done.stderr.splitlines()[0] == f"s.csv: 3 damaged lines skipped: {named}"
-    assert read(recorded.with_suffix(".parquet")).metadata["lost"][1] == 1
+    assert read_recording(recorded.with_suffix(".parquet")).metadata["lost"][1] == 1
 
 
 def test_a_half_open_socket_is_opened_anew(record, tmp_path):
     with skin({"frames": 400}, {}) as port:
         done = record(*FREE, port, "seconds=8", "device.silence=0.5")
     assert done.returncode == 0, done.stderr
-    assert "the skin was unplugged (nothing came for 0.5 s); trying again" in done.stderr
+    assert "the skin was unplugged (nothing received for 0.5 s); trying again" in done.stderr
     text = (tmp_path / "s.csv").read_text()
     assert text.count('"event": "gap", "after": "reconnect"') == 1
-    whole = len(read(tmp_path / "s.parquet"))
+    whole = len(read_recording(tmp_path / "s.parquet"))
     assert text.count('"event": "end"') == whole >= 8
 
 
 @pytest.mark.parametrize(
     ("lives", "reason"),
     [
-        ([{"frames": 0}], r"^socket://\S+: 0 of 1 frames came within 1 s: port open, nothing received"),
+        ([{"frames": 0}], r"^socket://\S+: 0 of 1 frames arrived within 1 s: port open, nothing received"),
         ([{"period": 0}], "the device's clock stands still: t_us was 0 in all of"),
         ([{"frames": 400}, {"sensors": 3}], "sends 3 values per frame, the layout has 4 sensors"),
     ],

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from skin.build import build_device
-from skin.config import checked
+from skin.config import validate_config
 from skin.errors import InputError
 from skin.paths import CONF
 
@@ -15,7 +15,7 @@ SMALL = ("body.cells=[16,16]", "layout=grid", "data.gestures=40", "device.test_g
 
 @pytest.fixture(scope="module", params=OPTIONS)
 def device(request, configured):
-    return build_device(checked(configured(f"contact={request.param}", "simulator=solid", *SMALL)))
+    return build_device(validate_config(configured(f"contact={request.param}", "simulator=solid", *SMALL)))
 
 
 def test_touches_are_made_of_pressures_that_carry_their_force(device):
@@ -38,7 +38,7 @@ def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
     with pytest.raises(
         InputError, match=f"simulator={simulator}: set simulator=solid, or contact=prescribed"
     ):
-        build_device(checked(configured("contact=rigid", f"simulator={simulator}")))
+        build_device(validate_config(configured("contact=rigid", f"simulator={simulator}")))
 
 
 def test_the_command_line_says_so_too(run, tmp_path):

@@ -6,8 +6,8 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from skin.balance import announce
 from skin.build import build_device
+from skin.class_balance import report_balance
 from skin.config import Evaluation
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
@@ -16,7 +16,7 @@ from skin.evaluation.margins import margins
 from skin.evaluation.operating_point import OperatingPoint, threshold_gestures
 from skin.evaluation.report import columns
 from skin.evaluation.sliding_windows import evaluate_windows
-from skin.storage import write
+from skin.recording_file import write_recording
 
 CONF = Path(__file__).parents[2] / "conf"
 POINT = OperatingPoint.default(0.02)
@@ -36,7 +36,7 @@ def device(request, tmp_path_factory) -> AbstractDevice:
     if request.param == "simulated":
         return build(*SMALL)
     path = tmp_path_factory.mktemp("recording") / "x.parquet"
-    write(build(*SMALL).recording(), path)
+    write_recording(build(*SMALL).recording(), path)
     return build("device=recording", f"device.path={path}")
 
 
@@ -89,7 +89,7 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     assert torch.equal(
         threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )
-    announce(made_up_device)
+    report_balance(made_up_device)
     assert not capsys.readouterr().err
     assert made_up_device.blank() is made_up_device
     assert torch.equal(made_up_device.all_touches().readings, made_up_device.touches("test").readings)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import checked
+from skin.config import validate_config
 from skin.device.cost import GESTURES, VARIANTS, Cost
 from skin.errors import InputError
 
@@ -298,7 +298,7 @@ def overrides(path: Path | str) -> list[str]:
     ],
 )
 def test_rows_learn_from_a_sparse_view(configured, report, row, setting):
-    config = checked(
+    config = validate_config(
         configured(
             f"experiment={row}",
             *overrides(report),
@@ -318,7 +318,7 @@ def test_rows_learn_from_a_sparse_view(configured, report, row, setting):
 
 
 def test_rules_say_that_they_know_other_labels(configured, report):
-    config = checked(configured("experiment=rules", *overrides(report)))
+    config = validate_config(configured("experiment=rules", *overrides(report)))
     with pytest.raises(InputError, match=r"learner=rules knows the labels big.*got grab, hit"):
         build_learner(config).fit(build_data(config, build_device(config)))
 

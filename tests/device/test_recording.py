@@ -9,8 +9,8 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
+from skin.recording_file import write_recording
 from skin.simulator.naive import Naive
-from skin.storage import write
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 BODY = Sheet([0.16, 0.16], [16, 16], LAYER)
@@ -24,7 +24,7 @@ def simulated():
 
 @pytest.fixture(scope="module", params=["parquet", "csv"])
 def path(request, simulated, tmp_path_factory) -> str:
-    return str(write(simulated, tmp_path_factory.mktemp("files") / f"x.{request.param}"))
+    return str(write_recording(simulated, tmp_path_factory.mktemp("files") / f"x.{request.param}"))
 
 
 def test_yields_what_was_written(path, simulated):
@@ -62,6 +62,6 @@ def test_another_skin_is_refused(path, body, layout, message):
 def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
     with pytest.raises(InputError, match=r"add device.path=x.parquet"):
         Recorded(BODY, LAYOUT)
-    few = write(simulated[:9], tmp_path / "few.parquet")
+    few = write_recording(simulated[:9], tmp_path / "few.parquet")
     with pytest.raises(InputError, match=r"has 9 touches: 80/10/10 needs at least 10"):
         Recorded(BODY, LAYOUT, str(few))

@@ -12,14 +12,14 @@ from skin.body.sheet import Sheet
 from skin.device.serial import Serial
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.emulator.emulator import Emulator, Settings
+from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
 from skin.hardware.emulator.faults import Faults
-from skin.hardware.emulator.gestures import gestures
-from skin.hardware.emulator.outlet import outlet
+from skin.hardware.emulator.gestures import emulated_gestures
+from skin.hardware.emulator.port import open_port
 from skin.layout.grid import Grid
 from skin.signal.calibration import Calibration
 from skin.simulator.naive import Naive
-from skin.wire.conversion import newtons
+from skin.wire.conversion import unit_conversion
 from skin.wire.text import Header
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
@@ -39,8 +39,8 @@ def emulate():
     playing = []
 
     def begin(device, faults=None, binary=False, **settings):
-        port = outlet("tcp:0", None)
-        chosen = Settings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
+        port = open_port("tcp:0", None)
+        chosen = EmulatorSettings(**{"speed": 40.0, "idle": 4.0, "rate": 40.0} | settings)
         emulator = Emulator(device, port, chosen, faults or Faults(), binary)
         thread = Thread(target=emulator.run, kwargs={"count": COUNT + 1})
         thread.start()
@@ -52,7 +52,7 @@ def emulate():
         emulator.stop()
         thread.join(20)
         assert not thread.is_alive()
-        emulator.outlet.unplug()
+        emulator.port.unplug()
 
 
 def serial(port, layout=LAYOUT, **settings):
@@ -62,7 +62,7 @@ def serial(port, layout=LAYOUT, **settings):
 def test_it_reads_what_was_played(emulate):
     device = skin(**PERFECT)
     touches = serial(emulate(device, bits=None)).touches("test")
-    played = [one for one, _ in zip(gestures(device), range(COUNT), strict=False)]
+    played = [one for one, _ in zip(emulated_gestures(device), range(COUNT), strict=False)]
     assert touches.labels.int().tolist() == [list(one.labels.values()) for one in played]
     expected = torch.from_numpy(np.stack([one.force for one in played])).float()
     assert torch.allclose(touches.readings, expected, atol=1e-4, rtol=1e-5)
@@ -76,7 +76,7 @@ def test_counts_offsets_and_lost_frames_change_little(emulate):
     touches = serial(port, scale=20 / 512).touches("test")
     played = {
         str(list(one.labels.values())): one
-        for one, _ in zip(gestures(device), range(COUNT + 1), strict=False)
+        for one, _ in zip(emulated_gestures(device), range(COUNT + 1), strict=False)
     }
     for labels, readings, valid in zip(
         touches.labels.int().tolist(), *(touches.readings, touches.valid), strict=True
@@ -119,13 +119,13 @@ def test_a_calibration_undoes_gain_and_offset():
     )
     true = np.array([[3.0, 4.0]])
     raw = (true * [2.0, 0.5] + [0.1, -0.1]) / 0.01 + 500.0
-    readings, valid = newtons(2, None, None, known, None)(raw, np.ones((1, 2), dtype=bool))
+    readings, valid = unit_conversion(2, None, None, known, None)(raw, np.ones((1, 2), dtype=bool))
     assert readings[0, 0] == pytest.approx(3.0)
     assert valid.tolist() == [[True, False]]
-    tared = newtons(2, raw[0], None, known, None)(raw + 50.0, np.ones((1, 2), dtype=bool))[0]
+    tared = unit_conversion(2, raw[0], None, known, None)(raw + 50.0, np.ones((1, 2), dtype=bool))[0]
     assert tared[0, 0] == pytest.approx(0.25)
 
 
 def test_newtons_are_newtons():
-    found = newtons(1, None, None, None, Header(unit="N"))
+    found = unit_conversion(1, None, None, None, Header(unit="N"))
     assert found(np.array([1.5]), np.array([True]))[0].tolist() == [1.5]

@@ -8,7 +8,7 @@ from experiments.studies.motion import motion_change
 from skin.body.arm import Arm
 from skin.build import build_data, build_device
 from skin.errors import InputError
-from skin.storage import read, write
+from skin.recording_file import read_recording, write_recording
 
 SOLID = (
     "simulator=solid",
@@ -25,7 +25,7 @@ def test_generated_touches_train_and_are_evaluated(run, tmp_path):
     arm = "body=arm", "body.angle=2.5", "layout=grid"
     made = run(tmp_path, "generate.py", *arm, "simulator=naive", "n=48", "out=arm.parquet", store=False)
     assert made.returncode == 0, made.stderr
-    assert read(tmp_path / "arm.parquet").size == pytest.approx((0.125, 0.16))
+    assert read_recording(tmp_path / "arm.parquet").size == pytest.approx((0.125, 0.16))
     recording = *arm, "device=recording", "device.path=arm.parquet"
     done = run(tmp_path, "train.py", *recording, "experiment=temporal_graph", "trainer.max_epochs=1")
     assert done.returncode == 0, done.stderr
@@ -59,7 +59,7 @@ def test_without_mechanics_an_arm_shows_what_a_sheet_of_its_size_shows(configure
 @pytest.mark.parametrize("name", ["x.parquet", "x.csv"])
 def test_a_recording_keeps_the_size_of_the_arm(configured, tmp_path, name):
     arm = "body=arm", "body.angle=2.5", "layout=grid", "simulator=naive", "data.gestures=12"
-    path = write(build_device(configured(*arm)).recording(), tmp_path / name)
+    path = write_recording(build_device(configured(*arm)).recording(), tmp_path / name)
     recorded = "device=recording", f"device.path={path}", *arm[:3]
     assert build_device(configured(*recorded)).size == pytest.approx((0.125, 0.16))
     with pytest.raises(InputError, match=r"of 0.125 x 0.16 m, the body is 0.1 x 0.16 m: add body.angle=2.5 "):

@@ -14,7 +14,7 @@ from sklearn.frozen import FrozenEstimator
 
 from experiments.peers.exchange import export_touches
 from skin.build import build_device
-from skin.config import Evaluation, Tracking, checked, fingerprint
+from skin.config import Evaluation, Tracking, fingerprint, validate_config
 from skin.paths import ROOT
 from skin.tracking import Store
 
@@ -96,7 +96,7 @@ def test_a_peer_is_a_run_that_the_table_finds(ran, configured):
     folder, first, _ = ran
     assert first.returncode == 0, first.stderr
     store = Store.open(Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None))
-    config = checked(configured("row=ridge", "simulator=naive", "seed=0", *SMALL))
+    config = validate_config(configured("row=ridge", "simulator=naive", "seed=0", *SMALL))
     (run,) = store.find("FINISHED", fingerprint=fingerprint(config))
     assert {"row": "ridge", "simulator": "naive", "seed": "0"}.items() <= run.data.tags.items()
     for column in ("same", "holdout", "device_shift", "unseen_layout"):

@@ -11,7 +11,7 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.serial import Serial
 from skin.layout.grid import Grid
-from skin.storage import read
+from skin.recording_file import read_recording
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 SMALL = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
@@ -59,7 +59,7 @@ def test_a_skin_at_a_port_and_its_recording_are_judged_alike(run, begin, played,
     sheet = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
     direct = Serial(body=sheet, layout=Grid(3, 3), port=port, scale=float(scale), gestures=COUNT)
     felt = direct.touches("test")
-    stored = read(tmp_path / "s.parquet").touches
+    stored = read_recording(tmp_path / "s.parquet").touches
     assert torch.equal(felt.readings, stored.readings)
     assert torch.equal(felt.valid, stored.valid)
     assert torch.equal(felt.labels, stored.labels)

@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.hardware.record.log import read as read_session
-from skin.storage import read
+from skin.hardware.record.session_reader import read_session
+from skin.recording_file import read_recording
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 PATIENCE = 300  # s: machines are busy at times
@@ -53,12 +53,12 @@ def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulat
             killed.kill()
         before = path.read_text()
         assert before.endswith("\n")
-        done = len(read_session(path).takes)
+        done = len(read_session(path).gestures)
         assert done >= 1
         resumed = run(tmp_path, *command, f"device.gestures={done + 2}", store=False)
     assert resumed.returncode == 0, resumed.stderr
     assert path.read_text().startswith(before)
-    stored = read(tmp_path / "s.parquet")
+    stored = read_recording(tmp_path / "s.parquet")
     assert len(stored) == done + 2
     assert stored.touches.readings.shape[1:] == (30, 4)
     assert (stored.touches.readings.flatten(1).amax(1) > 0.3).all()

@@ -13,11 +13,11 @@ from omegaconf import OmegaConf
 
 from skin.body.sheet import Sheet
 from skin.build import build_device, build_learner
-from skin.config import Tracking, checked, plain
+from skin.config import Tracking, plain, validate_config
 from skin.errors import InputError
-from skin.reload import configuration, find
 from skin.simulator._elastic import Elastic
 from skin.simulator.solid import hexahedra
+from skin.stored_run import find_run, load_configuration
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -68,7 +68,7 @@ def put(store, configured, tmp_path):
     """Return a function that stores a finished run and returns its id."""
 
     def put(change=None, *overrides, text=None, learned=None):
-        config = plain(checked(configured(*SKIN, "learner=rules", *overrides)))
+        config = plain(validate_config(configured(*SKIN, "learner=rules", *overrides)))
         config.pop("tracking")
         config |= change or {}
         path = tmp_path / "rules.json" if learned is None else learned
@@ -122,11 +122,11 @@ def test_a_run_builds_only_parts_of_the_package(case, run, folder, put, bait, ma
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_refused_would_have_run(case, store, put, bait, marker):
     """Trust proves that the payloads work."""
-    found = find(store, put(CASES[case][1](bait, marker)))
+    found = find_run(store, put(CASES[case][1](bait, marker)))
     with pytest.raises(InputError, match="trust=true"):
-        configuration(store, found)
+        load_configuration(store, found)
     assert not marker.exists()
-    trusted = configuration(store, found, trust=True)
+    trusted = load_configuration(store, found, trust=True)
     for build in (build_device, build_learner):
         with suppress(Exception):
             build(trusted)
@@ -151,16 +151,16 @@ def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, 
     ],
 )
 def test_yaml_makes_no_objects_and_does_not_grow(text, store, put, marker):
-    found = find(store, put(text=text.replace("MARKER", str(marker))))
+    found = find_run(store, put(text=text.replace("MARKER", str(marker))))
     with pytest.raises(InputError, match=found.info.run_id):
-        configuration(store, found)
+        load_configuration(store, found)
     assert not marker.exists()
 
 
 def test_what_a_run_is_called_leads_out_of_no_folder(store, put):
-    found = find(store, put({"row": "x/../../marker"}))
+    found = find_run(store, put({"row": "x/../../marker"}))
     with pytest.raises(InputError, match="row"):
-        configuration(store, found)
+        load_configuration(store, found)
 
 
 @pytest.mark.parametrize("learner", ["boosted_trees", "network"])

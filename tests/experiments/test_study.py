@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from experiments.studies.study import SMOKE
-from skin.config import checked, fingerprint
+from skin.config import fingerprint, validate_config
 from skin.paths import ROOT
 from skin.tracking import Store
 
@@ -42,7 +42,7 @@ def folder(tmp_path_factory, configured):
     for activation, gain in (("silu", 0.0), ("relu", -0.1), ("elu", 0.1)):
         for seed in range(3):
             own = [f"model.activation={activation}", f"learner.activation={activation}", f"seed={seed}"]
-            config = checked(configured(*row, *own))
+            config = validate_config(configured(*row, *own))
             store = Store.open(config.tracking)
             # 0.002 more or less, that the differences have a spread
             value = 0.8 + gain * (1 + 0.02 * seed) + 0.01 * seed

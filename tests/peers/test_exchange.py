@@ -11,8 +11,8 @@ from experiments.peers.exchange import PeerPredictions, export_touches
 from skin.build import build_device
 from skin.config import Evaluation
 from skin.evaluation.report import columns
-from skin.recording import digest
-from skin.storage import read
+from skin.recording import touches_hash
+from skin.recording_file import read_recording
 
 SETTINGS = Evaluation(devices=2, layouts=1, gestures=24, false_alarm_rate=0.02, safe_gestures=16)
 NAMES = (
@@ -45,7 +45,7 @@ def answer(folder, known, device):
     """Write answers of a peer that tells sets apart: everywhere the number of the set, by a hundred."""
     (folder / "peer").mkdir(exist_ok=True)
     for number, name in enumerate(known):
-        count = len(read(folder / "touches" / f"{name}.parquet"))
+        count = len(read_recording(folder / "touches" / f"{name}.parquet"))
         table = {label: [number / 100] * count for label in device.task.names}
         pq.write_table(pa.table(table), folder / "peer" / f"{name}.parquet")
     (folder / "peer" / "about.json").write_text('{"seconds": 1.0, "parameters": 7}')
@@ -59,11 +59,11 @@ def test_every_set_of_learning_and_evaluating_is_written(folder):
 
 def test_touches_read_back_as_the_device_felt_them(device, folder):
     for name, touches in (("train", device.touches("train")), ("same_0", device.touches("test"))):
-        stored = read(folder / "touches" / f"{name}.parquet").touches
+        stored = read_recording(folder / "touches" / f"{name}.parquet").touches
         assert torch.equal(stored.readings, touches.readings)
         assert torch.equal(stored.valid, touches.valid)
         assert torch.equal(stored.labels, touches.labels)
-    moved = read(folder / "touches" / "unseen_layout_0.parquet").touches.positions
+    moved = read_recording(folder / "touches" / "unseen_layout_0.parquet").touches.positions
     assert (moved - device.touches("test").positions).norm(dim=1).max() > 1e-3
 
 
@@ -72,7 +72,7 @@ def test_features_have_one_row_per_touch(folder):
     assert table.num_rows == 6
     assert table.num_columns > 100
     # a feature that is easy to compute again: the largest reading of each touch
-    readings = read(folder / "touches" / "holdout_0.parquet").touches.readings
+    readings = read_recording(folder / "touches" / "holdout_0.parquet").touches.readings
     assert table["raw sensor maximum 1"].to_pylist() == readings.amax(dim=(1, 2)).tolist()
 
 
@@ -105,12 +105,14 @@ def test_what_lies_there_stays_and_what_changed_is_written_anew(device, tmp_path
     other = device.replace(seed=5)
     export_touches(other, SETTINGS, tmp_path / "x")
     known = json.loads((tmp_path / "x" / "sets.json").read_text())
-    assert known["train"] == digest(other.touches("train"))
+    assert known["train"] == touches_hash(other.touches("train"))
     assert not (tmp_path / "x" / "peer").exists()
 
 
 def test_a_digest_tells_readings_and_labels_apart(device):
     touches = device.touches("test")
     again = device.replace().touches("test")
-    assert digest(touches) == digest(again)
-    assert len({digest(touches), digest(touches[:31]), digest(device.touches("train"))}) == 3
+    assert touches_hash(touches) == touches_hash(again)
+    assert (
+        len({touches_hash(touches), touches_hash(touches[:31]), touches_hash(device.touches("train"))}) == 3
+    )

@@ -9,7 +9,7 @@ from skin.build import build_device
 from skin.errors import InputError
 from skin.plot.animation import VIEWS, Scene, thinning, write_animation
 from skin.plot.touches import recorded, simulated
-from skin.storage import write as store
+from skin.recording_file import write_recording as store
 
 
 def made(frames=6, sensors=7, rate=10.0, **more):

@@ -9,8 +9,8 @@ import pytest
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.emulator.gestures import gestures, in_time
-from skin.hardware.record.log import Log
+from skin.hardware.emulator.gestures import emulated_gestures, upsample
+from skin.hardware.record.session_log import SessionLog
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
 from skin.plot import gesture_comparison as compared
@@ -18,8 +18,8 @@ from skin.plot.gesture_page import gestures_markdown, plot_gestures
 from skin.plot.press_comparison import Verdicts
 from skin.signal.frame import Frame
 from skin.simulator.naive import Naive
-from skin.wire.conversion import Newtons
-from skin.wire.segmentation import Take
+from skin.wire.conversion import UnitConversion
+from skin.wire.segmentation import RecordedGesture
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8
@@ -34,20 +34,20 @@ def device():
 def session(device, path, labels):
     """Write what a skin of another gain says of the emulator's gestures, in counts above 500."""
     about = {"positions": device.sensors.positions.tolist(), "unit": "adc", "labels": labels}
-    log = Log(path, about | {"window": device.window, "rate": device.rate}, 9)
-    log.meaning(Newtons(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
+    log = SessionLog(path, about | {"window": device.window, "rate": device.rate}, 9)
+    log.meaning(UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
     number, now = 0, time.monotonic()
-    for one, gesture in enumerate(islice(gestures(device), COUNT)):
-        rows = 500 + GAIN * in_time(gesture.force, device.rate, RATE) / 0.01
-        take = Take(one, gesture.labels, number / RATE, 0)
+    for one, gesture in enumerate(islice(emulated_gestures(device), COUNT)):
+        rows = 500 + GAIN * upsample(gesture.force, device.rate, RATE) / 0.01
+        gesture = RecordedGesture(one, gesture.labels, number / RATE, 0)
         for place, row in enumerate(rows):
             t = number / RATE
             frame = Frame(number, t, now + t, row, np.ones(9, dtype=bool))
             if not place:
-                log.begin(take, frame)
+                log.begin(gesture, frame)
             log.frame(frame)
             number += 1
-        log.end(take)
+        log.end(gesture)
     log.close()
     return str(path)
 
@@ -57,7 +57,7 @@ def test_a_gain_between_session_and_simulation_is_found(device, tmp_path):
     assert compared.marked(path)
     found = compared.read_gestures(device, path, 0)
     assert (found.same, len(found.pairs)) == (True, COUNT)
-    for pair, played in zip(found.pairs, gestures(device), strict=False):
+    for pair, played in zip(found.pairs, emulated_gestures(device), strict=False):
         assert pair.slope == pytest.approx(GAIN, rel=1e-3)
         assert pair.rmse == pytest.approx((1 - GAIN) * np.sqrt((played.force**2).mean()), rel=2e-3)
         # The applied force is the sum of the pressure, told by the movie and not by any sensor.
@@ -82,7 +82,7 @@ def test_verdicts_are_counted(device, tmp_path):
 def test_what_a_person_did_is_compared_with_gestures_of_the_same_labels(device, tmp_path):
     found = compared.read_gestures(device, session(device, tmp_path / "s.csv", "prompted"), 0)
     assert not found.same
-    played = list(islice(gestures(device), COUNT))
+    played = list(islice(emulated_gestures(device), COUNT))
     assert [pair.labels for pair in found.pairs] == [one.labels for one in played]
     assert not np.allclose(found.pairs[0].simulated, played[0].force)
     said = gestures_markdown(found, None, "Here.")

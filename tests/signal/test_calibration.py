@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.signal.calibration import Calibration, read, write
+from skin.signal.calibration import Calibration, read_calibration, write_calibration
 
 WHOLE = Calibration(
     {
@@ -22,14 +22,14 @@ WHOLE = Calibration(
 
 
 def test_a_file_keeps_everything(tmp_path):
-    assert read(write(WHOLE, tmp_path / "folder" / "mine.yaml")) == WHOLE
+    assert read_calibration(write_calibration(WHOLE, tmp_path / "folder" / "mine.yaml")) == WHOLE
     assert [path.name for path in (tmp_path / "folder").iterdir()] == ["mine.yaml"]
 
 
 def test_a_person_may_write_little(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("format: 1\ncount: 4\nsensors: {noise: 1e-2}\nranges: {dead: [0, 3]}\n")
-    values = read(path).values()
+    values = read_calibration(path).values()
     assert values["noise"].tolist() == [0.01] * 4
     assert values["gain"].tolist() == [1.0] * 4
     assert np.isinf(values["clip"]).all()
@@ -68,9 +68,9 @@ def test_what_cannot_be_used_is_refused(tmp_path, text, reason):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=reason):
-        read(path)
+        read_calibration(path)
 
 
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no calibration .*skin calibrate"):
-        read(tmp_path / "none.yaml")
+        read_calibration(tmp_path / "none.yaml")

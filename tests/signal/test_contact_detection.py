@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.signal.contact_detection import DRIFT, Contact
+from skin.signal.contact_detection import DRIFT, ContactDetector
 
 RATE, WINDOW = 10.0, 30
 THRESHOLD = 0.25  # N
@@ -31,7 +31,7 @@ def on(first, *levels, sensors=3):
 @pytest.mark.parametrize("seconds", [1, 10, 600])
 @pytest.mark.parametrize("load", [0.3, 5.0])
 def test_a_held_press_is_a_contact_until_it_is_released(seconds, load):
-    contact, frames = Contact(3, RATE, THRESHOLD), int(seconds * RATE)
+    contact, frames = ContactDetector(3, RATE, THRESHOLD), int(seconds * RATE)
     said = follow(contact, on((0, 40), (load, frames), (0, 20)), noise=0.02)
     assert not any(said[:40])
     assert all(said[40 : 40 + frames])
@@ -41,18 +41,18 @@ def test_a_held_press_is_a_contact_until_it_is_released(seconds, load):
 
 
 def test_it_tells_since_when():
-    contact = Contact(3, RATE, THRESHOLD)
+    contact = ContactDetector(3, RATE, THRESHOLD)
     follow(contact, on((0, 40), (1.0, 50)))
     assert contact.since == pytest.approx(4.0)
     # A view that looks late finds the beginning in its window.
-    late = Contact(3, RATE, THRESHOLD)
+    late = ContactDetector(3, RATE, THRESHOLD)
     rows = on((0, 10), (1.0, 20))
     late.update(rows, rows >= 0, 2.9)
     assert late.since == pytest.approx(1.0, abs=0.11)
 
 
 def test_a_slow_ramp_does_not_become_the_baseline():
-    contact = Contact(3, RATE, THRESHOLD)
+    contact = ContactDetector(3, RATE, THRESHOLD)
     ramp = np.zeros((140, 3))
     ramp[40:, 1] = np.linspace(0, 5, 100)
     said = follow(contact, ramp)
@@ -62,7 +62,7 @@ def test_a_slow_ramp_does_not_become_the_baseline():
 
 
 def test_the_baseline_follows_drift_up_to_the_bound_and_no_faster():
-    slow, fast = (Contact(1, RATE, THRESHOLD) for _ in range(2))
+    slow, fast = (ContactDetector(1, RATE, THRESHOLD) for _ in range(2))
     frames = int(1800 * RATE)
     drift = DRIFT * np.arange(frames)[:, None] / RATE  # 0.6 N in half an hour
     assert not any(follow(slow, 0.95 * drift, noise=0.02))
@@ -70,7 +70,7 @@ def test_the_baseline_follows_drift_up_to_the_bound_and_no_faster():
 
 
 def test_nothing_moves_while_something_touches():
-    contact = Contact(2, RATE, THRESHOLD)
+    contact = ContactDetector(2, RATE, THRESHOLD)
     force = np.zeros((int(120 * RATE), 2))
     force[:, 0] = 1.0
     force[:, 1] = np.linspace(0, 0.2, len(force))  # drifts beside the touch
@@ -79,7 +79,7 @@ def test_nothing_moves_while_something_touches():
 
 
 def test_a_tare_under_a_load_does_not_hide_the_next_touch():
-    contact = Contact(3, RATE, THRESHOLD)
+    contact = ContactDetector(3, RATE, THRESHOLD)
     # A weight of 2 N lay there while the tare was taken; it is lifted, then something presses with 1.5 N.
     said = follow(contact, on((0, 40), (-2.0, 100), (-0.5, 20)), noise=0.02)
     assert not any(said[:140])
@@ -87,7 +87,7 @@ def test_a_tare_under_a_load_does_not_hide_the_next_touch():
 
 
 def test_a_sensor_that_fails_in_a_contact_does_not_end_it():
-    contact, force = Contact(3, RATE, THRESHOLD), on((0, 40), (5.0, 20), (5.0, 100), (0, 20))
+    contact, force = ContactDetector(3, RATE, THRESHOLD), on((0, 40), (5.0, 20), (5.0, 100), (0, 20))
     valid = np.ones(force.shape, dtype=bool)
     valid[60:160, 1] = False
     said = follow(contact, force, valid=valid)
@@ -96,8 +96,8 @@ def test_a_sensor_that_fails_in_a_contact_does_not_end_it():
 
 
 def test_a_new_tare_ends_a_contact():
-    contact = Contact(3, RATE, THRESHOLD)
+    contact = ContactDetector(3, RATE, THRESHOLD)
     follow(contact, on((0, 40), (1.0, 50)))
-    contact.tared()
+    contact.reset()
     assert contact.since is None
     assert not any(follow(contact, on((0, 40))))

@@ -7,7 +7,7 @@ from sklearn.metrics import balanced_accuracy_score
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.recording import Touches
-from skin.signal.contact_threshold import Threshold, gates, rise
+from skin.signal.contact_threshold import ContactThreshold, gates, rise
 
 
 def touches(readings, valid=None):
@@ -31,8 +31,8 @@ def test_a_press_that_is_held_all_through_the_window_rises(noisy):
     pressed = noisy.clone()
     pressed[:, :, 2] += 1.5
     assert (rise(touches(pressed)) > 1.3).all()
-    assert Threshold(0.5).touched(touches(pressed)).all()
-    assert not Threshold(0.5).touched(touches(noisy)).any()
+    assert ContactThreshold(0.5).touched(touches(pressed)).all()
+    assert not ContactThreshold(0.5).touched(touches(noisy)).any()
 
 
 def test_a_sensor_that_means_nothing_does_not_rise(noisy):
@@ -48,20 +48,20 @@ def test_no_threshold_tells_better_than_the_tuned_one(seed):
     generator = torch.Generator().manual_seed(seed)
     touched = torch.rand(80, generator=generator) < 0.8
     rises = (torch.rand(80, generator=generator) + 0.6 * touched).round(decimals=2)  # with ties
-    tuned = Threshold.tuned(rises, touched)
+    tuned = ContactThreshold.tuned(rises, touched)
     best = max(balanced_accuracy_score(touched, rises >= cut) for cut in rises.tolist())
     assert balanced_accuracy_score(touched, rises >= tuned.least) == pytest.approx(best)
 
 
 def test_windows_that_are_all_alike_tune_nothing():
     with pytest.raises(InputError, match=r"data.gestures"):
-        Threshold.tuned(torch.rand(5), torch.ones(5, dtype=torch.bool))
+        ContactThreshold.tuned(torch.rand(5), torch.ones(5, dtype=torch.bool))
 
 
 def test_only_a_task_with_a_gate_has_a_learned_one(noisy):
-    assert list(gates(Threshold(0.3), TOUCH)) == ["none", "threshold"]
+    assert list(gates(ContactThreshold(0.3), TOUCH)) == ["none", "threshold"]
     noisy[3, 5, 1] += 2
-    found = gates(Threshold(0.5), TOUCH_OR_NOT)
+    found = gates(ContactThreshold(0.5), TOUCH_OR_NOT)
     chances = torch.zeros(40, 5)
     chances[7, 4] = 0.6
     said = {name: gate(touches(noisy), chances).nonzero().flatten().tolist() for name, gate in found.items()}

@@ -8,7 +8,7 @@ import torch
 from experiments.studies import row_ensembles
 from experiments.studies.row_ensembles import average, combine, disagreement, vote
 from experiments.studies.runs import newest_finished
-from skin.config import checked, fingerprint
+from skin.config import fingerprint, validate_config
 from skin.console import quiet
 from skin.errors import InputError
 from skin.labels import TOUCH, Task
@@ -60,7 +60,7 @@ def trained(configured, tmp_path_factory):
     own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
 
     def compose(*overrides):
-        return checked(configured(*SMALL, *own, *overrides))
+        return validate_config(configured(*SMALL, *own, *overrides))
 
     quiet()
     members = [compose(f"experiment={row}", "trainer.max_epochs=1") for row in ROWS]

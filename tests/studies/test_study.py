@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from experiments.studies.comparison import Paired, verdict
 from experiments.studies.study import Study, variants
-from skin.config import checked, fingerprint
+from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
 
@@ -28,7 +28,7 @@ def composed():
                 config = compose("study", list(words), return_hydra_config=True)
                 HydraConfig.instance().set_config(config)
                 own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-                study = Study.of(checked(own))
+                study = Study.of(validate_config(own))
                 made[words] = study, variants(study)
         return made[words]
 

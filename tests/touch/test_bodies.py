@@ -8,8 +8,8 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.metrics import balanced_accuracy_score
 from sklearn.model_selection import cross_val_predict
 
-from skin.balance import check, told_by
 from skin.body.sheet import Sheet
+from skin.class_balance import accuracy_from_shape, check_label_leakage
 from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
 from skin.layout.grid import Grid
@@ -97,7 +97,7 @@ def test_a_sheet_of_nine_sensors_and_three_to_one_has_all_gestures():
     assert source.fit
     shape, big = movie.parameters["shape"].numpy().astype(int), movie.labels[:, 0].numpy() > 0.5
     assert np.bincount(shape[big], minlength=7).min() >= 15
-    told, error = told_by(shape, big)
+    told, error = accuracy_from_shape(shape, big)
     assert told - 2 * error < 0.6
 
 
@@ -133,6 +133,6 @@ def test_a_shape_that_has_room_only_as_a_small_one_is_small():
     shape = fit.draw(big, np.random.default_rng(0))
     assert (shape[big] == 0).all()
     assert 200 < (shape[~big] == 1).sum() < 300
-    told, error = told_by(shape, big)
+    told, error = accuracy_from_shape(shape, big)
     with pytest.warns(RuntimeWarning, match="tells big"):
-        check({"labels": {"big": {"told": told, "error": error}}}, GestureSettings())
+        check_label_leakage({"labels": {"big": {"told": told, "error": error}}}, GestureSettings())

@@ -9,8 +9,8 @@ from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.labels import TOUCH_OR_NOT, movie_labels
 from skin.layout.scattered import Scattered
+from skin.recording_file import read_recording, write_recording
 from skin.simulator.naive import Naive
-from skin.storage import read, write
 from skin.touch.gesture import GestureSettings
 from skin.touch.stream import Timeline
 
@@ -202,7 +202,7 @@ def test_ranges_are_whole_frames(wrong):
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])
 def test_a_file_keeps_windows_and_their_gate(plain, tmp_path, suffix):
-    stored = read(write(plain.recording("holdout"), tmp_path / f"windows.{suffix}"))
+    stored = read_recording(write_recording(plain.recording("holdout"), tmp_path / f"windows.{suffix}"))
     assert stored.task == TOUCH_OR_NOT
     assert torch.equal(stored.touches.labels, plain.touches("holdout").labels)
     torch.testing.assert_close(stored.parameters, plain.recording("holdout").parameters, rtol=0, atol=0)

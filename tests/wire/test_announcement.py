@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.wire.announcement import Announcement, encode, parse
+from skin.wire.announcement import Announcement, encode_announcement, parse_announcement
 from skin.wire.decoder import Decoder
 from skin.wire.text import encode_line
 
@@ -10,24 +10,24 @@ SAID = Announcement(3, 650, 300, {"big": 1, "dynamic": 0})
 
 
 def test_it_comes_back():
-    assert parse(encode(SAID).rstrip(b"\n")) == SAID
+    assert parse_announcement(encode_announcement(SAID).rstrip(b"\n")) == SAID
 
 
-@pytest.mark.parametrize("place", range(len(encode(SAID)) - 1))
+@pytest.mark.parametrize("place", range(len(encode_announcement(SAID)) - 1))
 def test_a_changed_byte_is_noticed(place):
-    line = bytearray(encode(SAID).rstrip(b"\n"))
+    line = bytearray(encode_announcement(SAID).rstrip(b"\n"))
     line[place] ^= 1
-    assert parse(bytes(line)) is None
+    assert parse_announcement(bytes(line)) is None
 
 
 @pytest.mark.parametrize("line", [b"", b"1,2,3", b"# skin proto=1 n=3", b"# gesture number=1*0000"])
 def test_other_lines_are_none(line):
-    assert parse(line) is None
+    assert parse_announcement(line) is None
 
 
 def test_a_reader_takes_it_for_a_comment():
     decoder = Decoder(2)
     lines = [encode_line([1, number], number, 10_000 * number) for number in range(6)]
-    frames = decoder.feed(b"".join([*lines[:3], encode(SAID), *lines[3:]]))
+    frames = decoder.feed(b"".join([*lines[:3], encode_announcement(SAID), *lines[3:]]))
     assert len(frames) == 6
     assert not decoder.counters.bad

@@ -11,9 +11,9 @@ import pytest
 
 from skin.body.sheet import Sheet
 from skin.device.serial import Serial
-from skin.hardware.live.loop import Session
-from skin.hardware.record.log import read
-from skin.hardware.record.recorder import record
+from skin.hardware.live.loop import LiveLoop
+from skin.hardware.record.recorder import record_session
+from skin.hardware.record.session_reader import read_session
 from skin.layout.grid import Grid
 from skin.wire.open import open_skin
 from skin.wire.tare import Tare
@@ -37,7 +37,9 @@ def test_a_port_in_use_ends_a_command_with_code_2(plug, tmp_path, verb):
             check=False,
         )
     assert done.returncode == 2
-    assert done.stderr == f"{plug.port} is in use: close the serial monitor, or whatever else reads it\n"
+    assert (
+        done.stderr == f"{plug.port} is in use: close the serial monitor or any other program that reads it\n"
+    )
     assert not list(tmp_path.glob("s.csv*"))
 
 
@@ -60,7 +62,7 @@ def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
         plug.send(encode_header(Header(n=6, bits=10)))
         plug.send(*(encode_line(row.tolist(), n, 10_000 * n) for n, row in enumerate(values)))
         frames = skin.read(800, timeout=PATIENT)
-        line = Session(skin, Tare(None, 0.0, 10.0), None, None).line
+        line = LiveLoop(skin, Tare(None, 0.0, 10.0), None, None).line
     assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
     assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in line
 
@@ -103,12 +105,14 @@ def test_an_unplugged_skin_is_recorded_on_with_a_gap_marker(new_plug, tmp_path):
         sleep(0.001)
     settings = {"window": 10, "tare": 1.0, "timeout": PATIENT, "backoff": (0.01, 0.05)}
     device = Serial(body=SHEET, layout=Grid(2, 2), port=str(link), **settings)
-    record(device, path, 8.0, True, said.append)
+    record_session(device, path, 8.0, True, said.append)
     over.append(True)
     thread.join(PATIENT)
     text = path.read_text()
     assert text.count('"event": "gap", "after": "reconnect"') == 1
     assert events("broken") == 1
     assert events("end") >= 3
-    takes = read(path).takes
-    assert all(np.diff([frame.t for frame in take.frames]).max() < 0.02 for take, _ in takes.values())
+    gestures = read_session(path).gestures
+    assert all(
+        np.diff([frame.t for frame in gesture.frames]).max() < 0.02 for gesture, _ in gestures.values()
+    )

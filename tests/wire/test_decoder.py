@@ -36,7 +36,7 @@ def test_lines_are_recognised(check, end, sensors):
     assert numbers(frames) == list(range(check != "crc16", 12))
     assert frames[-1].values.tolist() == [11, 111, 211, 311]
     assert (frames[-1].t, frames[-1].valid.all()) == (0.011, True)
-    assert (decoder.speech.check, decoder.counters.weak) == (check, 0 if check == "crc16" else 11)
+    assert (decoder.frame_format.check, decoder.counters.weak) == (check, 0 if check == "crc16" else 11)
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " ", ", "])
@@ -53,7 +53,11 @@ def test_binary_is_recognised_at_the_second_frame(kind, sensors):
     decoder = Decoder(sensors)
     assert decoder.feed(b"\x07\x00" + encode_frame([1, 0, 3, 4], 0, 0, kind)) == []
     assert numbers(decoder.feed(encode_frame([1, 0, 3, 4], 1, 500, kind))) == [0, 1]
-    assert (decoder.speech.name, decoder.speech.check, decoder.counters.skipped) == ("binary", "crc16", 1)
+    assert (decoder.frame_format.name, decoder.frame_format.check, decoder.counters.skipped) == (
+        "binary",
+        "crc16",
+        1,
+    )
 
 
 def test_a_header_tells_the_number_of_sensors_at_the_third_line():
@@ -94,30 +98,30 @@ def test_another_number_of_sensors_is_refused_with_both_counts(spoken):
     while decoder.counters.bytes < 5000:
         assert decoder.feed(encode([number % 7] * 16, number, number * 10)) == []
         number += 1
-    assert "16 values per frame, the layout has 25 sensors" in str(decoder.refusal())
-    assert "layout.path" in str(decoder.refusal())
+    assert "16 values per frame, the layout has 25 sensors" in str(decoder.error())
+    assert "layout.path" in str(decoder.error())
 
 
 def test_a_wrong_baud_rate_is_refused_with_64_bytes_in_hex():
     decoder, noise = Decoder(25), np.random.default_rng(0).bytes(5000)
     for start in range(0, 4000, 100):
         decoder.feed(noise[start : start + 100])
-        assert decoder.refusal() is None
+        assert decoder.error() is None
     decoder.feed(noise[4000:])
-    assert noise[:64].hex(" ") in str(decoder.refusal())
-    assert "device.baudrate" in str(decoder.refusal())
+    assert noise[:64].hex(" ") in str(decoder.error())
+    assert "device.baudrate" in str(decoder.error())
 
 
 def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
     decoder = Decoder(4)
     decoder.feed(b"ets Jun  8 2016 00:22:57\nrst:0x1\n", now=0.0)
     decoder.feed(b"wifi\n", now=6.0)  # seconds of silence while the board starts
-    assert decoder.refusal() is None
+    assert decoder.error() is None
     for step in range(12):
         decoder.feed(b"hello\n", now=6.2 + 0.2 * step)
-    assert "no frame in" in str(decoder.refusal())
+    assert "no frame in" in str(decoder.error())
     assert numbers(decoder.feed(b"".join(lines(3)), now=9)) == [0, 1, 2]
-    assert decoder.refusal() is None
+    assert decoder.error() is None
 
 
 @pytest.mark.parametrize(
@@ -188,7 +192,7 @@ def test_after_a_restart_the_number_of_sensors_is_demanded_again():
     decoder.restart()
     for number in range(0, 400, 40):
         decoder.feed(b"".join(lines(40, sensors=3, first=number)))
-    assert "3 values per frame, the layout has 4" in str(decoder.refusal())
+    assert "3 values per frame, the layout has 4" in str(decoder.error())
 
 
 def test_a_long_first_piece_is_read_from_its_first_frame():

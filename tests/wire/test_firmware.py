@@ -49,7 +49,7 @@ def test_every_frame_of_the_sketch_is_read(said):
     decoder = Decoder(6)
     frames = decoder.feed(said)
     assert [frame.seq for frame in frames] == list(range(1200))
-    assert decoder.speech.check == "crc16"
+    assert decoder.frame_format.check == "crc16"
     assert decoder.header == Header(1, 6, 100.0, "adc", 10, "uno")
     assert decoder.counters.bad.total() + decoder.counters.gaps + decoder.counters.resets == 0
     values = np.stack([frame.values for frame in frames])

@@ -40,7 +40,7 @@ def test_nothing_raises(format, pieces, sensors):
     for now, piece in enumerate(pieces):
         for frame in decoder.feed(piece, float(now)):
             assert np.isfinite(frame.values).all()
-    decoder.refusal()
+    decoder.error()
 
 
 @pytest.mark.parametrize("spoken", ["text", "binary"])

@@ -17,7 +17,7 @@ from skin.wire.binary import encode_frame
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.open import open_skin
 from skin.wire.text import Header, encode_header, encode_line
-from skin.wire.transport import open_wire
+from skin.wire.transport import open_stream
 
 LAYOUT = range(4)
 PATIENT = 60.0  # s: machines are busy at times
@@ -188,7 +188,9 @@ def test_silence_is_told_apart_from_nonsense_and_carries_what_came(plug):
             skin.read(1)
         plug.send(lines(0, 1, 2))
         wait_for(lambda: skin.stats.frames == 3)
-        with pytest.raises(SkinTimeout, match=r"3 of 100 frames came within 0.2 s: .* silent") as caught:
+        with pytest.raises(
+            SkinTimeout, match=r"3 of 100 frames arrived within 0.2 s: .* stopped sending"
+        ) as caught:
             skin.read(100, timeout=0.2)
         assert numbers(caught.value.frames) == [0, 1, 2]
 
@@ -207,7 +209,7 @@ def test_unplugging_is_an_error_after_what_came_before(plug):
 def test_two_hundred_times_unplugged_and_plugged_in_again(new_plug):
     def opener():
         cable = new_plug()
-        stream = open_wire(cable.port, 115200)
+        stream = open_stream(cable.port, 115200)
         cable.send(b"77,5", b"\n", lines(*range(4)))
         cables.append(cable)
         return stream
@@ -226,7 +228,7 @@ def test_two_hundred_times_unplugged_and_plugged_in_again(new_plug):
 def test_while_it_is_away_it_is_tried_again_and_said(plug, new_plug):
     ports = [plug.port]
     with open_skin(
-        "x", LAYOUT, opener=lambda: open_wire(ports[-1], 115200), reconnect=True, backoff=(0.01, 0.02)
+        "x", LAYOUT, opener=lambda: open_stream(ports[-1], 115200), reconnect=True, backoff=(0.01, 0.02)
     ) as skin:
         plug.send(lines(0, 1, 2))
         skin.read(3, timeout=PATIENT)
@@ -329,7 +331,7 @@ def test_tare_and_a_touch(plug):
         assert baseline == pytest.approx([500] * 4, abs=1.01)
         pressed.append(True)
         sleep(0.3)
-        with pytest.raises(InputError, match="channel 2 rests away from its old baseline by 300"):
+        with pytest.raises(InputError, match="channel 2 differs from its old baseline by 300"):
             skin.tare(0.5)
         assert skin.baseline is baseline
         assert skin.tare(0.5, force=True)[2] == pytest.approx(800, abs=1.01)
@@ -337,7 +339,7 @@ def test_tare_and_a_touch(plug):
 
 def test_tare_while_the_device_starts_anew_is_refused(plug):
     with open_skin(plug.port, LAYOUT, timeout=PATIENT) as skin:
-        with plug.sending(lambda number: [500] * 4, restart=20), pytest.raises(InputError, match="anew"):
+        with plug.sending(lambda number: [500] * 4, restart=20), pytest.raises(InputError, match="restarted"):
             skin.tare(0.5)
         assert skin.baseline is None
 

@@ -6,21 +6,23 @@ import numpy as np
 import pytest
 
 from skin.build import build_device
-from skin.config import checked
+from skin.config import validate_config
 from skin.errors import InputError
-from skin.storage import write
+from skin.recording_file import write_recording
 from skin.wire.errors import SkinDisconnected
 from skin.wire.open import open_skin
 
 
 @pytest.fixture(scope="module")
 def device(configured):
-    return build_device(checked(configured("simulator=naive", "device.dead=1")))
+    return build_device(validate_config(configured("simulator=naive", "device.dead=1")))
 
 
 @pytest.fixture(scope="module")
 def recording(device, tmp_path_factory):
-    return write(device.replace(gestures=12).recording(), tmp_path_factory.mktemp("skin") / "touches.parquet")
+    return write_recording(
+        device.replace(gestures=12).recording(), tmp_path_factory.mktemp("skin") / "touches.parquet"
+    )
 
 
 def test_a_recording_is_played_to_its_end(device, recording):

@@ -11,8 +11,8 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.signal.frame import Frame
 from skin.signal.resampling import Window
-from skin.wire.announcement import Announcement, Tap, encode
-from skin.wire.segmentation import Announced, Continuous, Prompted, plan
+from skin.wire.announcement import Announcement, AnnouncementListener, encode_announcement
+from skin.wire.segmentation import AnnouncedSegmenter, ContinuousSegmenter, PromptedSegmenter, label_plan
 
 LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}
 
@@ -25,99 +25,103 @@ def window(seconds):
     return Window(round(10 * seconds), 10.0, 1)
 
 
-def heard(*said):
+def announcements(*said):
     """Return a tap that has heard announcements among other bytes, cut anywhere."""
-    data = b"1,2*00\n" + b"".join(map(encode, said)) + b"half a li"
+    data = b"1,2*00\n" + b"".join(map(encode_announcement, said)) + b"half a li"
     pieces = [data[:20], data[20:]]
-    tap = Tap(lambda: SimpleNamespace(read=lambda: pieces.pop(0), close=lambda: None))()
-    assert tap.read() + tap.read() == data
-    return tap
+    listener = AnnouncementListener(lambda: SimpleNamespace(read=lambda: pieces.pop(0), close=lambda: None))()
+    assert listener.read() + listener.read() == data
+    return listener
 
 
-def shown(director, sequence):
-    return [take for frame in sequence if (take := director.show(frame))]
+def shown(segmenter, sequence):
+    return [gesture for frame in sequence if (gesture := segmenter.add(frame))]
 
 
 def test_an_announced_gesture_is_its_frames():
-    director = Announced(window(0.3), heard(Announcement(0, 10, 30, LABELS)), TOUCH)
-    (take,) = shown(director, frames(range(60)))
-    assert [frame.seq for frame in take.frames] == list(range(10, 40))
-    assert (take.labels, take.lost, take.broken) == (LABELS, 0, False)
+    segmenter = AnnouncedSegmenter(window(0.3), announcements(Announcement(0, 10, 30, LABELS)), TOUCH)
+    (gesture,) = shown(segmenter, frames(range(60)))
+    assert [frame.seq for frame in gesture.frames] == list(range(10, 40))
+    assert (gesture.labels, gesture.lost, gesture.broken) == (LABELS, 0, False)
 
 
 def test_a_window_keeps_its_place_where_its_first_frames_are_lost():
-    director = Announced(window(0.3), heard(Announcement(0, 10, 30, LABELS)), TOUCH)
-    (take,) = shown(director, frames([*range(10), *range(14, 60)]))
-    assert take.begin == pytest.approx(0.1)
-    assert (take.frames[0].seq, take.frames[-1].seq, take.lost) == (14, 39, 4)
+    segmenter = AnnouncedSegmenter(window(0.3), announcements(Announcement(0, 10, 30, LABELS)), TOUCH)
+    (gesture,) = shown(segmenter, frames([*range(10), *range(14, 60)]))
+    assert gesture.begin == pytest.approx(0.1)
+    assert (gesture.frames[0].seq, gesture.frames[-1].seq, gesture.lost) == (14, 39, 4)
 
 
 def test_a_gesture_that_was_half_over_is_none():
-    director = Announced(
-        window(0.3), heard(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH
+    segmenter = AnnouncedSegmenter(
+        window(0.3), announcements(Announcement(0, 0, 30, LABELS), Announcement(1, 30, 30, LABELS)), TOUCH
     )
-    assert [take.number for take in shown(director, frames(range(15, 70)))] == [1]
+    assert [gesture.number for gesture in shown(segmenter, frames(range(15, 70)))] == [1]
 
 
 def test_windows_that_touch_each_other_are_two():
-    director = Announced(
-        window(0.1), heard(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH
+    segmenter = AnnouncedSegmenter(
+        window(0.1), announcements(Announcement(0, 0, 10, LABELS), Announcement(1, 10, 10, LABELS)), TOUCH
     )
-    assert [take.number for take in shown(director, frames(range(25)))] == [0, 1]
+    assert [gesture.number for gesture in shown(segmenter, frames(range(25)))] == [0, 1]
 
 
 def test_a_restart_breaks_a_gesture_off():
-    director = Announced(window(0.3), heard(Announcement(0, 0, 30, LABELS)), TOUCH)
-    (take,) = shown(director, frames(range(10)) + frames(range(5), segment=1))
-    assert take.broken
+    segmenter = AnnouncedSegmenter(window(0.3), announcements(Announcement(0, 0, 30, LABELS)), TOUCH)
+    (gesture,) = shown(segmenter, frames(range(10)) + frames(range(5), segment=1))
+    assert gesture.broken
 
 
 def test_a_label_that_is_not_announced_is_missed():
     with pytest.raises(InputError, match="no press"):
         shown(
-            Announced(window(0.3), heard(Announcement(0, 0, 30, {"big": 1, "dynamic": 1})), TOUCH),
+            AnnouncedSegmenter(
+                window(0.3), announcements(Announcement(0, 0, 30, {"big": 1, "dynamic": 1})), TOUCH
+            ),
             frames(range(3)),
         )
 
 
 def test_a_touch_is_always_a_touch():
-    director = Announced(window(0.1), heard(Announcement(0, 0, 10, LABELS)), TOUCH_OR_NOT)
-    (take,) = shown(director, frames(range(20)))
-    assert take.labels["touch"] == 1
+    segmenter = AnnouncedSegmenter(window(0.1), announcements(Announcement(0, 0, 10, LABELS)), TOUCH_OR_NOT)
+    (gesture,) = shown(segmenter, frames(range(20)))
+    assert gesture.labels["touch"] == 1
 
 
 def test_every_combination_once_per_repetition_in_another_order():
-    wanted = [tuple(labels.values()) for labels in plan(TOUCH.names, 3, seed=1)]
+    wanted = [tuple(labels.values()) for labels in label_plan(TOUCH.names, 3, seed=1)]
     assert set(Counter(wanted).values()) == {3}
     assert len(set(wanted[:16])) == 16
     assert wanted[:16] != wanted[16:32]
-    assert wanted == [tuple(labels.values()) for labels in plan(TOUCH.names, 3, seed=1)]
+    assert wanted == [tuple(labels.values()) for labels in label_plan(TOUCH.names, 3, seed=1)]
 
 
 def test_a_person_begins_skips_and_ends():
     said = []
-    director = Prompted(
-        window(0.1), enumerate(plan(TOUCH.names, 1, 0)), said.append, iter(["\n", "s\n", "\n"])
+    segmenter = PromptedSegmenter(
+        window(0.1), enumerate(label_plan(TOUCH.names, 1, 0)), said.append, iter(["\n", "s\n", "\n"])
     )
-    takes = []
+    gestures = []
     for frame in frames(range(2000)):
-        if take := director.show(frame):
-            takes.append(take)
-        if director.over:
+        if gesture := segmenter.add(frame):
+            gestures.append(gesture)
+        if segmenter.over:
             break
         # Frames come while the person types.
         sleep(0.001)
-    assert [take.number for take in takes] == [0, 2]
-    assert [len(take.frames) for take in takes] == [10, 10]
+    assert [gesture.number for gesture in gestures] == [0, 2]
+    assert [len(gesture.frames) for gesture in gestures] == [10, 10]
     assert sum(line.startswith("next: ") for line in said) == 4
-    assert takes[0].labels == next(plan(TOUCH.names, 1, 0))
+    assert gestures[0].labels == next(label_plan(TOUCH.names, 1, 0))
 
 
 def test_windows_one_after_the_other():
-    takes = shown(Continuous(window(0.1), first=5), frames(range(35)))
-    assert [(take.number, take.frames[0].seq) for take in takes] == [(5, 0), (6, 10), (7, 20)]
+    gestures = shown(ContinuousSegmenter(window(0.1), first=5), frames(range(35)))
+    assert [(gesture.number, gesture.frames[0].seq) for gesture in gestures] == [(5, 0), (6, 10), (7, 20)]
 
 
 def test_windows_that_wait_for_a_touch():
-    takes = shown(Continuous(window(0.1), wanted=lambda values: values[0] % 50 > 40), frames(range(120)))
-    assert [take.frames[0].seq for take in takes] == [41, 91]
+    gestures = shown(
+        ContinuousSegmenter(window(0.1), wanted=lambda values: values[0] % 50 > 40), frames(range(120))
+    )
+    assert [gesture.frames[0].seq for gesture in gestures] == [41, 91]

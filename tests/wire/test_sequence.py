@@ -3,7 +3,7 @@
 import pytest
 
 from skin.signal.frame import FrameError
-from skin.wire.sequence import HostClock, Order, steps
+from skin.wire.sequence import HostClock, SequenceTracker, frames_ahead
 
 
 @pytest.mark.parametrize(
@@ -20,11 +20,11 @@ from skin.wire.sequence import HostClock, Order, steps
     ],
 )
 def test_steps_across_the_wraps_of_firmware(before, after, expected):
-    assert steps(before, after) == expected
+    assert frames_ahead(before, after) == expected
 
 
 def test_a_missing_number_is_a_gap_and_no_segment():
-    order = Order()
+    order = SequenceTracker()
     placed = [order.place(seq, 1000 * seq, 0) for seq in (7, 8, 11, 12)]
     assert [(place.lost, place.after, place.segment) for place in placed] == [
         (0, "", 0), (0, "", 0), (2, "gap", 0), (0, "", 0),
@@ -32,7 +32,7 @@ def test_a_missing_number_is_a_gap_and_no_segment():
 
 
 def test_the_clock_wraps_after_71_6_minutes_and_time_goes_on():
-    order, period = Order(), 10_000
+    order, period = SequenceTracker(), 10_000
     first = 2**32 - 3 * period
     placed = [order.place(seq, (first + seq * period) % 2**32, 0) for seq in range(8)]
     assert [place.t for place in placed] == pytest.approx([(first + seq * period) * 1e-6 for seq in range(8)])
@@ -43,7 +43,7 @@ def test_the_clock_wraps_after_71_6_minutes_and_time_goes_on():
     ("seq", "t_us"), [(0, 0), (0, 5_000_000), (102, 4_000), (3, 900_000)], ids=["both", "seq", "time", "back"]
 )
 def test_going_back_is_a_new_segment(seq, t_us):
-    order = Order()
+    order = SequenceTracker()
     order.place(100, 1_000_000, 0)
     order.place(101, 1_010_000, 0)
     placed = order.place(seq, t_us, 0)
@@ -52,7 +52,7 @@ def test_going_back_is_a_new_segment(seq, t_us):
 
 
 def test_the_same_frame_once_more_is_refused():
-    order = Order()
+    order = SequenceTracker()
     order.place(1, 10, 0)
     with pytest.raises(FrameError, match="repeat"):
         order.place(1, 10, 0)
@@ -60,7 +60,7 @@ def test_the_same_frame_once_more_is_refused():
 
 
 def test_without_numbers_bad_frames_are_what_is_known_to_be_missing():
-    order = Order()
+    order = SequenceTracker()
     assert order.place(None, 0, 0).after == ""
     assert order.place(None, 1e6, 2) == (1.0, 0, 2, "gap")
 

@@ -56,7 +56,7 @@ def test_a_peer_that_stops_sending_is_left_and_found_again(server, caplog):
     assert [frame.seq for frame in frames] == [0, 1, 2, 3, 4, 0, 1, 2]
     assert [frame.after for frame in frames] == [""] * 5 + ["reconnect", "", ""]
     assert [frame.segment for frame in frames] == [0] * 5 + [1] * 3
-    assert "unplugged (nothing came for 0.3 s)" in caplog.text
+    assert "unplugged (nothing received for 0.3 s)" in caplog.text
 
 
 def test_a_peer_that_accepts_and_never_sends_is_tried_less_and_less_often(server):
@@ -165,7 +165,7 @@ with open_skin(port, range(4), reconnect=True, silence=float(sys.argv[1]), backo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("silence", "reason"), [(0.5, "nothing came for 0.5 s"), (0, "timed out")])
+@pytest.mark.parametrize(("silence", "reason"), [(0.5, "nothing received for 0.5 s"), (0, "timed out")])
 def test_a_cable_that_is_cut_in_between(silence, reason):
     # A network of its own whose only link goes down: no segment tells of it, as where a router fails.
     if shutil.which("unshare") is None or subprocess.call(

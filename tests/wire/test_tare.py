@@ -6,9 +6,9 @@ import pytest
 from skin.errors import InputError
 from skin.signal.calibration import Calibration
 from skin.signal.frame import Frame
-from skin.wire.conversion import newtons
+from skin.wire.conversion import unit_conversion
 from skin.wire.errors import SkinTouched
-from skin.wire.tare import Tare, settle
+from skin.wire.tare import Tare, warm_up
 from skin.wire.text import Header
 
 REST = np.array([512.0, 300.0, 40.0])
@@ -33,12 +33,12 @@ class Watch:
         self.tare = tare
 
     @property
-    def waiting(self):
-        return self.tare.waiting
+    def status(self):
+        return self.tare.status
 
     def __call__(self, frame):
         self.tare.add(frame)
-        known = self.tare.newtons
+        known = self.tare.conversion
         if known is None:
             return None
         values, valid = known(frame.values, frame.valid)
@@ -47,8 +47,8 @@ class Watch:
 
 def watched(scale=None, tare=1.0, known=None, header=None):
     """Return what turns the frames of three sensors into N."""
-    meaning = lambda baseline, told: newtons(3, baseline, scale, known, told)  # noqa: E731
-    return Watch(Tare(meaning, tare, RATE, lambda: header))
+    conversion = lambda baseline, told: unit_conversion(3, baseline, scale, known, told)  # noqa: E731
+    return Watch(Tare(conversion, tare, RATE, lambda: header))
 
 
 def test_force_is_counted_from_the_first_quiet_second():
@@ -56,11 +56,11 @@ def test_force_is_counted_from_the_first_quiet_second():
     touched = noisy(150)
     touched[:, 1] += np.linspace(0, 400, 150)
     assert all(watch(one) is None for one in frames(touched))
-    assert "touched: channel 1" in watch.waiting
+    assert "touched: channel 1" in watch.status
     quiet = [watch(one) for one in frames(noisy(300), start=1.5)]
     first = next(number for number, one in enumerate(quiet) if one is not None)
     assert 90 <= first <= 180
-    assert watch.waiting == ""
+    assert watch.status == ""
     pressed = watch(frames([REST + 200])[0])
     np.testing.assert_allclose(pressed.values, 2.0, atol=0.021)
 
@@ -81,14 +81,14 @@ def test_a_device_that_sends_newtons_says_so():
 def test_a_device_may_tell_its_unit_a_little_late():
     told = []
     tare = Tare(
-        lambda baseline, header: newtons(3, baseline, None, None, header),
+        lambda baseline, header: unit_conversion(3, baseline, None, None, header),
         0.0,
         RATE,
         lambda: told[0] if told else None,
     )
     watch = Watch(tare)
     assert watch(frames(noisy(1))[0]) is None
-    assert watch.waiting == "waiting for the device to tell its unit"
+    assert watch.status == "waiting for the header of the device"
     told.append(Header(unit="N"))
     assert watch(frames(noisy(1), start=0.5)[0]) is not None
 
@@ -140,9 +140,9 @@ class Played:
 
 def settled(played, seconds, said=None):
     """Return the frames that settling took, and the baseline."""
-    tare = Tare(lambda baseline, header: newtons(2, baseline, 1.0, None, header), seconds, RATE)
+    tare = Tare(lambda baseline, header: unit_conversion(2, baseline, 1.0, None, header), seconds, RATE)
     tell = (lambda _: None) if said is None else said.append
-    return settle(played, tare, RATE, seconds, tell), tare.newtons.zero
+    return warm_up(played, tare, RATE, seconds, tell), tare.conversion.zero
 
 
 def test_an_untouched_skin_gives_its_baseline_at_once():

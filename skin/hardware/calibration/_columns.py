@@ -21,7 +21,7 @@ _NUMBERS = b"0123456789+-.e,"
 _log = logging.getLogger("skin.hardware.record")
 
 
-def load(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
+def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
     """Return a table and what is known about it: JSON in a Parquet schema, or in ``x.csv.json`` beside it.
 
     Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of skin record are
@@ -71,8 +71,8 @@ def _rows(path: Path) -> bytes:
     return b"".join(line + b"\n" for _, line in rows)
 
 
-def save(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
-    """Write what :func:`load` reads, under a temporary name first.
+def save_table(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
+    """Write what :func:`load_table` reads, under a temporary name first.
 
     Raises:
         InputError: another ending, or the file cannot be written.

@@ -9,7 +9,7 @@ from annotated_types import Ge, Le
 
 from skin.errors import InputError
 from skin.hardware.calibration import gauge as gauges
-from skin.hardware.calibration._columns import load, numbers, save
+from skin.hardware.calibration._columns import load_table, numbers, save_table
 from skin.hardware.calibration.gauge import GAUGE, Gauge
 from skin.settings import checked
 
@@ -18,7 +18,7 @@ _OTHER = ("time", "t_us", "seq", *GAUGE)
 
 @checked("session")
 @dataclass(frozen=True)
-class Session:
+class BenchSession:
     """What a skin said, and what pressed it meanwhile.
 
     Attributes:
@@ -54,7 +54,9 @@ class Session:
             )
 
 
-def read(path: str | Path, indenter: str, radius: float, unit: str | None = None) -> Session:
+def read_bench_session(
+    path: str | Path, indenter: str, radius: float, unit: str | None = None
+) -> BenchSession:
     """Read a session.
 
     It has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, whatever
@@ -70,7 +72,7 @@ def read(path: str | Path, indenter: str, radius: float, unit: str | None = None
     Raises:
         InputError: a file that cannot be used.
     """
-    table, about = load(path, "session")
+    table, about = load_table(path, "session")
     names = [name for name in table.column_names if name not in _OTHER]
     if not names:
         raise InputError(f"{path}: no column of a sensor beside {', '.join(table.column_names)}")
@@ -81,15 +83,15 @@ def read(path: str | Path, indenter: str, radius: float, unit: str | None = None
     inside = "force" in table.column_names
     if inside and in_microseconds:
         table = table.append_column("time", [time])
-    rows = gauges.of_table(table, str(path), indenter, radius) if inside else None
+    rows = gauges.gauge_from_table(table, str(path), indenter, radius) if inside else None
     try:
         known: Any = unit or about.get("unit", "N")
-        return Session(time, raw, known, rows, about.get("bits"))
+        return BenchSession(time, raw, known, rows, about.get("bits"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def write(session: Session, path: str | Path) -> Path:
+def write_bench_session(session: BenchSession, path: str | Path) -> Path:
     """Write a session with its gauge, whole; single precision is enough for what a converter says.
 
     Raises:
@@ -101,10 +103,10 @@ def write(session: Session, path: str | Path) -> Path:
     for number, values in enumerate(session.raw.T):
         columns[f"raw_{number:0{digits}d}"] = values.astype(np.int32 if counts else np.float32)
     about = {"unit": session.unit, "bits": session.bits}
-    return save(columns | _gauge_columns(session), about, path)
+    return save_table(columns | _gauge_columns(session), about, path)
 
 
-def _gauge_columns(session: Session) -> dict[str, np.ndarray]:
+def _gauge_columns(session: BenchSession) -> dict[str, np.ndarray]:
     """Return the gauge's columns at the session's times, masked outside of presses."""
     if session.gauge is None:
         return {}

@@ -9,8 +9,8 @@ import torch
 from skin.errors import InputError
 from skin.hardware.calibration import _channel
 from skin.hardware.calibration._channel import Idle
-from skin.hardware.calibration.bench import Bench
-from skin.lag import lagged, peaks
+from skin.hardware.calibration.bench_data import BenchData
+from skin.sensor_dynamics import first_order_lag, running_peak
 from skin.signal.calibration import Calibration
 
 _PRESSED = 0.05  # of the largest true reading: less tells no gain
@@ -33,7 +33,7 @@ class _Channel:
     broken: str | None = None
 
 
-def fit(bench: Bench, presses: Collection[int] | None = None) -> Calibration:
+def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
     """Fit every channel to the simulated true readings of presses, never to the gauge's force.
 
     Idle frames give offset, drift and noise; the release the time constant; the loading branch the gain and
@@ -66,7 +66,7 @@ def fit(bench: Bench, presses: Collection[int] | None = None) -> Calibration:
     return _calibration(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
 
 
-def _at_rest(bench: Bench, number: int) -> _Channel:
+def _at_rest(bench: BenchData, number: int) -> _Channel:
     """Describe a channel's idle frames; one that never moves is broken."""
     raw = bench.session.raw
     said = raw[:, number]
@@ -86,11 +86,11 @@ def _at_rest(bench: Bench, number: int) -> _Channel:
     return _Channel(_channel.idle(bench.session.time[quiet], said[quiet], step), step)
 
 
-def _rest_taken(bench: Bench, number: int, channel: _Channel) -> np.ndarray:
+def _rest_taken(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
     return bench.session.raw[:, number] - channel.idle.offset - channel.idle.drift * bench.session.time
 
 
-def _time_constant(bench: Bench, used: np.ndarray, number: int, channel: _Channel) -> float:
+def _time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
     """Return the weighted mean over releases of presses that reach the channel, s."""
     said, time = _rest_taken(bench, number, channel), bench.session.time
     # Until it has come down from its plateau a reading says nothing of the lag.
@@ -110,16 +110,16 @@ def _time_constant(bench: Bench, used: np.ndarray, number: int, channel: _Channe
 def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return true readings behind the lag, and what a hysteresis of 1 would add to them, each (T, S), N."""
     force = torch.from_numpy(true)[None]
-    peak = peaks(force)
+    peak = running_peak(force)
     bend = torch.where(peak > 0, 6 * force * (1 - force.abs() / peak.clamp(min=1e-30)), 0.0)
-    both = lagged(
+    both = first_order_lag(
         torch.cat([force, bend], -1), torch.tensor(constants).double().repeat(2), torch.from_numpy(time)
     )[0].numpy()
     return both[:, : true.shape[1]], both[:, true.shape[1] :]
 
 
 def _answer(
-    bench: Bench, used: np.ndarray, number: int, channel: _Channel, felt: np.ndarray, bend: np.ndarray
+    bench: BenchData, used: np.ndarray, number: int, channel: _Channel, felt: np.ndarray, bend: np.ndarray
 ) -> None:
     """Fit gain and clip on the loading branch, hysteresis on the way back."""
     said = _rest_taken(bench, number, channel)
@@ -142,7 +142,7 @@ def _answer(
     channel.hysteresis = share if share > 2 * error else 0.0
 
 
-def _calibration(bench: Bench, channels: list[_Channel], scale: float) -> Calibration:
+def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Calibration:
     """Bring channels to N, and span ranges over those that live."""
     alive = [channel.broken is None for channel in channels]
     # Counts have a zero of their own, common to all; in N a zero has been agreed on.

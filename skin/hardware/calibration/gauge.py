@@ -11,7 +11,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.hardware.calibration._columns import load, numbers
+from skin.hardware.calibration._columns import load_table, numbers
 from skin.simulator.base import AbstractSimulator
 from skin.touch.shapes import Shapes
 
@@ -60,7 +60,7 @@ class Gauge:
         return np.where(press >= 0, np.interp(time, self.time, self.force), 0.0), press
 
 
-def read(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
     """Read a gauge's file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
 
     Args:
@@ -72,12 +72,12 @@ def read(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> 
     Raises:
         InputError: a file that cannot be used.
     """
-    table, _ = load(path, "gauge file")
-    return of_table(table, str(path), indenter, radius, delay)
+    table, _ = load_table(path, "gauge file")
+    return gauge_from_table(table, str(path), indenter, radius, delay)
 
 
-def of_table(table: pa.Table, where: str, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
-    """Return the rows of a table that have a place; see :func:`read`."""
+def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+    """Return the rows of a table that have a place; see :func:`read_gauge`."""
     columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
     for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
         known = name in table.column_names

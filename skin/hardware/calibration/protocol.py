@@ -9,7 +9,7 @@ import torch
 from pydantic import PositiveFloat
 
 from skin.device.base import AbstractSimulated
-from skin.hardware.calibration.bench_session import Session, write
+from skin.hardware.calibration.bench_session import BenchSession, write_bench_session
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.settings import configured
 
@@ -70,13 +70,13 @@ class Protocol:
         return np.clip(np.concatenate([home, beside]), 0, device.size)
 
 
-def emulate(
+def emulate_session(
     device: AbstractSimulated,
     gauge: Gauge,
     protocol: Protocol,
     generator: np.random.Generator,
     bits: int | None = None,
-) -> Session:
+) -> BenchSession:
     """Return what a simulated device says while a gauge presses it, in N, or, given bits, in counts.
 
     Counts are of a converter whose middle is at 0 N and whose ends are at twice the device's clip.
@@ -88,10 +88,10 @@ def emulate(
         torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
     )[0].numpy()
     if bits is None:
-        return Session(time, said.astype(float), "N", gauge)
+        return BenchSession(time, said.astype(float), "N", gauge)
     middle = 2 ** (bits - 1)
     counts = np.clip(np.round(middle + said * middle / (2 * device.imperfection.clip)), 0, 2**bits - 1)
-    return Session(time, counts, "adc", gauge, bits)
+    return BenchSession(time, counts, "adc", gauge, bits)
 
 
 def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarra
     return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
 
 
-def demo(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
+def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
     """Write what an emulated device says to the protocol, and return a line about it.
 
     Args:
@@ -114,5 +114,5 @@ def demo(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> s
     protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
     randomness = np.random.default_rng(device.seed)
     rows = protocol.gauge(protocol.places(device, randomness))
-    session = emulate(device, rows, protocol, randomness, settings["bits"])
-    return f"{write(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"
+    session = emulate_session(device, rows, protocol, randomness, settings["bits"])
+    return f"{write_bench_session(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"

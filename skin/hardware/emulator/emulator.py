@@ -14,13 +14,13 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from skin.device.base import AbstractSimulated
 from skin.hardware.emulator.faults import BANNER, KINDS, Faults
-from skin.hardware.emulator.gestures import Converter, Gesture, gestures, in_time
-from skin.hardware.emulator.outlet import AbstractOutlet
+from skin.hardware.emulator.gestures import Converter, Gesture, emulated_gestures, upsample
+from skin.hardware.emulator.port import AbstractPort
 from skin.rng import Stream, generator
 from skin.signal.frame import Check
-from skin.wire.announcement import Announcement, encode
+from skin.wire.announcement import Announcement, encode_announcement
 from skin.wire.binary import encode_comment, encode_frame
-from skin.wire.segmentation import sentence
+from skin.wire.segmentation import label_text
 from skin.wire.text import Header, encode_header, encode_line
 
 _HEADER = 1.0  # s from one header to the next
@@ -28,7 +28,7 @@ _LOOK = 0.05  # s between two looks whether somebody came
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class EmulatorSettings:
     """How an emulated skin plays.
 
     Attributes:
@@ -61,11 +61,11 @@ class Emulator:
 
     Args:
         device: the skin; its rate is the model's.
-        outlet: where it is plugged in.
+        port: where it is plugged in.
         settings: how it plays.
         faults: what goes wrong.
         binary: COBS frames instead of lines; there are no announcements among them.
-        told: is given a sentence about what happens, with the device's time, s.
+        on_event: is given a sentence about what happens, with the device's time, s.
 
     Attributes:
         converter: from N to what is sent.
@@ -75,16 +75,16 @@ class Emulator:
     def __init__(
         self,
         device: AbstractSimulated,
-        outlet: AbstractOutlet,
-        settings: Settings,
+        port: AbstractPort,
+        settings: EmulatorSettings,
         faults: Faults,
         binary: bool = False,
-        told: Callable[[float, str], None] = lambda t, text: None,
+        on_event: Callable[[float, str], None] = lambda t, text: None,
     ) -> None:
         faults.fits(len(device.sensors))
-        self.device, self.outlet, self.settings, self.faults = device, outlet, settings, faults
+        self.device, self.port, self.settings, self.faults = device, port, settings, faults
         self.converter = Converter(settings.bits, float(device.constants.clip.max()))
-        self._told, self.binary, self.frames = told, binary, 0
+        self._on_event, self.binary, self.frames = on_event, binary, 0
         self._number = self._zero = 0
         self._held: np.ndarray | None = None
         self._silent_until = -1
@@ -111,7 +111,7 @@ class Emulator:
 
     def await_reader(self) -> None:
         """Wait until somebody opens the port."""
-        while not self.outlet.connected() and not self._over.wait(_LOOK):
+        while not self.port.connected() and not self._over.wait(_LOOK):
             pass
 
     def _pieces(self, count: int | None) -> Iterator[tuple[np.ndarray, tuple[int, Gesture] | None]]:
@@ -119,8 +119,8 @@ class Emulator:
         settings, sensors = self.settings, len(self.device.sensors)
         yield self._felt(np.zeros((round(settings.idle * settings.rate), sensors))), None
         gap = np.zeros((round(settings.gap * settings.rate), sensors))
-        for number, gesture in enumerate(islice(gestures(self.device, settings.seed), count)):
-            true = in_time(gesture.force, self.device.rate, settings.rate)
+        for number, gesture in enumerate(islice(emulated_gestures(self.device, settings.seed), count)):
+            true = upsample(gesture.force, self.device.rate, settings.rate)
             yield self._felt(np.concatenate([true, gap])), (number, gesture)
 
     def _felt(self, true: np.ndarray) -> np.ndarray:
@@ -166,7 +166,7 @@ class Emulator:
 
     def _send(self, data: bytes) -> None:
         if self._number >= self._silent_until:
-            self.outlet.write(self.faults.damaged(data, self._chance))
+            self.port.write(self.faults.damaged(data, self._chance))
 
     def _broken(self, row: np.ndarray) -> np.ndarray:
         faults = self.faults
@@ -195,26 +195,30 @@ class Emulator:
 
     def _announce(self, number: int, gesture: Gesture) -> None:
         t, frames = self._number / self.settings.rate, len(gesture.force) * self.settings.rate
-        self._told(t, f"gesture {number}: {sentence(gesture.labels)}")
+        self._on_event(t, f"gesture {number}: {label_text(gesture.labels)}")
         if self.settings.announce and not self.binary:
             seq = self._number - self._zero
-            self._send(encode(Announcement(number, seq, round(frames / self.device.rate), gesture.labels)))
+            self._send(
+                encode_announcement(
+                    Announcement(number, seq, round(frames / self.device.rate), gesture.labels)
+                )
+            )
 
     def _silence(self) -> None:
-        self._told(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")
+        self._on_event(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")
         self._silent_until = self._number + round(self.faults.silent * self.settings.rate)
 
     def _reset(self) -> None:
-        self._told(self._number / self.settings.rate, "reset")
+        self._on_event(self._number / self.settings.rate, "reset")
         self._begin()
 
     def _unplug(self) -> None:
         """Vanish, with the power: the clock stands still and begins anew."""
-        self._told(self._number / self.settings.rate, f"unplugged for {self.faults.away:g} s")
-        self.outlet.unplug()
+        self._on_event(self._number / self.settings.rate, f"unplugged for {self.faults.away:g} s")
+        self.port.unplug()
         if self._over.wait(self.faults.away / self.settings.speed):
             return
-        self.outlet.plug()
-        self._told(self._number / self.settings.rate, f"plugged in again: {self.outlet.address}")
+        self.port.plug()
+        self._on_event(self._number / self.settings.rate, f"plugged in again: {self.port.address}")
         self._start += self.faults.away / self.settings.speed
         self._begin()

@@ -59,7 +59,7 @@ class Converter:
         return np.clip(np.round(middle + newtons / self.scale), 0, 2**self.bits - 1).astype(np.float64)
 
 
-def gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
+def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
     """Yield gestures that no training can draw, in an order of ``seed`` alone, balanced in sixteens."""
     with ThreadPoolExecutor(1, "skin-gestures") as ahead:
         # Drawn while the ones before are played: a device does not pause.
@@ -70,7 +70,7 @@ def gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
             yield from ready
 
 
-def alike(device: AbstractSimulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
+def gestures_with_labels(device: AbstractSimulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
     """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``skin.labels.TOUCH``."""
     return _drawn(device, labels, generator(Stream.TEST, 5, seed))
 
@@ -91,7 +91,7 @@ def _drawn(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Genera
     ]
 
 
-def in_time(force: np.ndarray, model_rate: float, rate: float) -> np.ndarray:
+def upsample(force: np.ndarray, model_rate: float, rate: float) -> np.ndarray:
     """Return true readings (F, S), N, at a device's rate.
 
     A frame of the model stands for what happened since the one before, so it is held for its interval, and

@@ -8,14 +8,14 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from skin.evaluation.report import Predictor
-from skin.hardware.live.verdict import Debounce, Patience, Verdict
+from skin.hardware.live.verdict import Debounce, DebounceSettings, Verdict
 from skin.labels import Task
 from skin.recording import Touches
 from skin.settings import checked
-from skin.signal.contact_detection import DRIFT, Contact
+from skin.signal.contact_detection import DRIFT, ContactDetector
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.conversion import Newtons
+from skin.wire.conversion import UnitConversion
 
 
 @checked("detection")
@@ -67,21 +67,21 @@ class Engine:
         frames: int,
         rate: float,
         detection: Detection,
-        patience: Patience | None = None,
+        patience: DebounceSettings | None = None,
     ) -> None:
         self.window = Window(frames, rate, len(positions))
         self.task = task
         self._learner, self._positions, self._detection = learner, positions, detection
-        self._patience = patience or Patience()
-        self._contact = Contact(len(positions), rate, detection.threshold, detection.drift)
+        self._patience = patience or DebounceSettings()
+        self._contact = ContactDetector(len(positions), rate, detection.threshold, detection.drift)
         self._held = min(max(1, round(detection.longest * rate)), max(1, frames - 2))
         self._above = 0.5 if self._patience.above is None else self._patience.above
         self._segment: int | None = None
-        self.tared()
+        self.reset()
 
-    def tared(self) -> None:
+    def reset(self) -> None:
         """Forget alarm and contact: the operator says that nothing touches the skin."""
-        self._contact.tared()
+        self._contact.reset()
         shape = self.window.frames, self.window.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
         self.alarm, self._highest = False, 0.0
@@ -105,12 +105,12 @@ class Engine:
             self._restart()
         self.window.add(frame)
 
-    def push(self, frame: Frame, newtons: Newtons) -> Verdict | None:
+    def push(self, frame: Frame, conversion: UnitConversion) -> Verdict | None:
         """Return what the window that ends with this frame is said to show.
 
         Args:
             frame: as the device sent it.
-            newtons: what its values mean.
+            conversion: what its values mean.
 
         Returns:
             None while the window is not full, unless an alarm is latched.
@@ -120,14 +120,14 @@ class Engine:
         """
         self.add(frame)
         seen = self.window.read()
-        return self._waiting(frame, newtons) if seen is None else self._verdict(seen, frame, newtons)
+        return self._waiting(frame, conversion) if seen is None else self._verdict(seen, frame, conversion)
 
-    def _waiting(self, frame: Frame, newtons: Newtons) -> Verdict | None:
+    def _waiting(self, frame: Frame, conversion: UnitConversion) -> Verdict | None:
         """Keep a latched alarm while the window fills again after a restart of the device."""
         if not self.alarm:
             return None
         seen = self.window.read(partial=True)
-        if seen is not None and not self._contact.update(*newtons(seen.values, seen.valid), frame.t_host):
+        if seen is not None and not self._contact.update(*conversion(seen.values, seen.valid), frame.t_host):
             self.alarm = False
             return None
         chances, said = {"dangerous": self._highest}, {"dangerous": True}
@@ -138,8 +138,8 @@ class Engine:
         since = self._contact.since
         return None if since is None else frame.t_host - since
 
-    def _verdict(self, seen: Resampled, frame: Frame, newtons: Newtons) -> Verdict:
-        readings, valid = newtons(seen.values, seen.valid)
+    def _verdict(self, seen: Resampled, frame: Frame, conversion: UnitConversion) -> Verdict:
+        readings, valid = conversion(seen.values, seen.valid)
         contact = self._contact.update(readings, valid, frame.t_host)
         risen = bool(self._contact.rises(readings, valid).any())
         if not contact and not risen:

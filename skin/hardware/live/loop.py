@@ -5,7 +5,7 @@ from time import monotonic
 
 import numpy as np
 
-from skin.hardware.live.board import Board
+from skin.hardware.live.display import Display
 from skin.hardware.live.engine import Engine
 from skin.signal.frame import Frame
 from skin.wire.errors import SkinDisconnected, SkinTimeout
@@ -18,7 +18,7 @@ _TOLD = 0.5  # s between two lines about the state
 _DELAYS = 2000  # verdicts over which the delay is taken
 
 
-class Session:
+class LiveLoop:
     """Watches a skin until its recording ends, the time is over, or Ctrl-C.
 
     Frames that came while another was classified slide through the window unasked, so the verdict is always
@@ -28,16 +28,16 @@ class Session:
         skin: open.
         tare: finds out what its values mean.
         engine: what gives verdicts.
-        board: where they are shown.
+        display: where they are shown.
 
     Attributes:
         verdicts: how many there were.
     """
 
-    def __init__(self, skin: Skin, tare: Tare, engine: Engine, board: Board) -> None:
-        self._skin, self._tare, self._engine, self._board = skin, tare, engine, board
+    def __init__(self, skin: Skin, tare: Tare, engine: Engine, display: Display) -> None:
+        self._skin, self._tare, self._engine, self._display = skin, tare, engine, display
         self._delays: deque[float] = deque(maxlen=_DELAYS)
-        self._told = -np.inf
+        self._updated_at = -np.inf
         self.verdicts = 0
 
     def run(self, seconds: float | None = None) -> None:
@@ -51,12 +51,12 @@ class Session:
             try:
                 frames = self._skin.read(1, _PATIENCE)
             except SkinTimeout as silent:
-                self._board.say(None, str(silent).split(": ", 1)[-1], self._engine.alarm)
+                self._display.set_verdict(None, str(silent).split(": ", 1)[-1], self._engine.alarm)
             except SkinDisconnected:
                 return
             else:
                 self._take(frames + self._waiting())
-            self._tell()
+            self._update_status()
 
     @property
     def p99(self) -> float:
@@ -71,36 +71,36 @@ class Session:
             return few.frames
 
     def _take(self, frames: list[Frame]) -> None:
-        if self._board.tare.is_set():
-            self._board.tare.clear()
-            self._tare.again()
+        if self._display.tare.is_set():
+            self._display.tare.clear()
+            self._tare.restart()
         taken = self._tare.count
         for frame in frames:
             self._tare.add(frame)
-        newtons = self._tare.newtons
+        conversion = self._tare.conversion
         for frame in frames[:-1]:
             self._engine.add(frame)
-        if newtons is None:
+        if conversion is None:
             self._engine.add(frames[-1])
-            self._board.say(None, self._tare.waiting)
+            self._display.set_verdict(None, self._tare.status)
             return
         if self._tare.count > taken:
-            self._engine.tared()
+            self._engine.reset()
         for frame in frames:
-            self._board.show(frame, newtons)
-        verdict = self._engine.push(frames[-1], newtons)
+            self._display.add_frame(frame, conversion)
+        verdict = self._engine.push(frames[-1], conversion)
         if verdict is None:
-            self._board.say(None, f"filling the window: {100 * self._engine.window.filled:.0f} %")
+            self._display.set_verdict(None, f"filling the window: {100 * self._engine.window.filled:.0f} %")
         else:
             self._delays.append(monotonic() - verdict.t_host)
             self.verdicts += 1
-            self._board.say(verdict)
+            self._display.set_verdict(verdict)
 
-    def _tell(self) -> None:
+    def _update_status(self) -> None:
         now = monotonic()
-        if now - self._told >= _TOLD:
-            self._told = now
-            self._board.tell(self.line)
+        if now - self._updated_at >= _TOLD:
+            self._updated_at = now
+            self._display.set_status(self.line)
 
     @property
     def line(self) -> str:
@@ -117,7 +117,7 @@ class Session:
             f"sensor {number} {state}" for number, state in enumerate(self._skin.channels) if state != "ok"
         ]
         parts = [
-            self._tare.waiting if self._tare.newtons is not None else "",
+            self._tare.status if self._tare.conversion is not None else "",
             f"{stats.rate_hz:.1f} Hz",
             *(f"{count} {name}" for name, count in counts.items() if count),
             *sick[:3],

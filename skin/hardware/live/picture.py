@@ -10,7 +10,7 @@ _FEWEST = 3
 _INWARDS = 1e-6
 
 
-class Picture:
+class SkinPicture:
     """Interpolates between the sensors: to look at, not to measure.
 
     Linear inside the sensors' hull, as ``representation=interp`` does; outside, as at the nearest point of

@@ -16,10 +16,10 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from skin.hardware.live.board import Board, Look
-from skin.hardware.live.picture import Picture
+from skin.hardware.live.display import Display, DisplayState
+from skin.hardware.live.picture import SkinPicture
 from skin.hardware.live.verdict import Verdict
-from skin.wire.segmentation import typed
+from skin.wire.segmentation import typed_lines
 
 _HERTZ = 8
 _PIXELS = 24
@@ -36,23 +36,23 @@ _COLOURS = ["#{:02x}{:02x}{:02x}".format(*rgb) for rgb in np.round(_MIXED).astyp
 
 
 @contextmanager
-def shown(board: Board, console: Console) -> Iterator[None]:
+def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
     """Show the board while the block runs, and hear what the operator types."""
     with suppress(AttributeError, ValueError):  # Windows; another thread than the main one
         # Where the program is sent to the background, keys are no longer heard; it must not be stopped.
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
-    Thread(target=_hear, args=(board,), name="skin-keys", daemon=True).start()
-    live = Live(get_renderable=_Screen(board), console=console, refresh_per_second=_HERTZ, transient=True)
-    with live if console.is_terminal else _printed(board, console):
+    Thread(target=_hear, args=(display,), name="skin-keys", daemon=True).start()
+    live = Live(get_renderable=_Screen(display), console=console, refresh_per_second=_HERTZ, transient=True)
+    with live if console.is_terminal else _printed(display, console):
         try:
             yield
         finally:
-            board.closed.set()
+            display.closed.set()
 
 
 @contextmanager
-def _printed(board: Board, console: Console) -> Iterator[None]:
-    thread = Thread(target=lines, args=(board, console), name="skin-lines", daemon=True)
+def _printed(display: Display, console: Console) -> Iterator[None]:
+    thread = Thread(target=print_changes, args=(display, console), name="skin-lines", daemon=True)
     thread.start()
     try:
         yield
@@ -60,30 +60,30 @@ def _printed(board: Board, console: Console) -> Iterator[None]:
         thread.join(2)
 
 
-def _hear(board: Board) -> None:
+def _hear(display: Display) -> None:
     """Ask for a new tare at every line ``t``, until the input ends."""
     with suppress(OSError, ValueError):  # no input, or a closed one
-        for text in typed(sys.stdin.fileno()):
+        for text in typed_lines(sys.stdin.fileno()):
             if text.strip().lower() == "t":
-                board.tare.set()
+                display.tare.set()
 
 
-def lines(board: Board, console: Console) -> None:
+def print_changes(display: Display, console: Console) -> None:
     """Print what is said whenever it changes, until the board is closed."""
     before = ""
     while True:
-        said = _sentence(board.look())
+        said = _sentence(display.state())
         if said != before:
             console.print(said, markup=False, highlight=False, soft_wrap=True)
             before = said
-        if board.closed.wait(1 / (4 * _HERTZ)):
+        if display.closed.wait(1 / (4 * _HERTZ)):
             return
 
 
-def _sentence(look: Look) -> str:
-    verdict, alarm = look.verdict, "DANGEROUS: " if look.alarm else ""
+def _sentence(state: DisplayState) -> str:
+    verdict, alarm = state.verdict, "DANGEROUS: " if state.alarm else ""
     if verdict is None:
-        return alarm + look.trouble.split(":")[0]
+        return alarm + state.trouble.split(":")[0]
     if not verdict.touched:
         return "no touch"
     return alarm + " ".join(word for word, _ in verdict.words())
@@ -92,24 +92,24 @@ def _sentence(look: Look) -> str:
 class _Screen:
     """Renders the board anew each time it is asked."""
 
-    def __init__(self, board: Board) -> None:
-        facts = board.facts
-        self._board, self._number = board, 0
-        self._picture = Picture(facts.positions, facts.size, _PIXELS, facts.top)
+    def __init__(self, display: Display) -> None:
+        info = display.info
+        self._display, self._number = display, 0
+        self._picture = SkinPicture(info.positions, info.size, _PIXELS, info.top)
 
     def __call__(self) -> RenderableType:
-        look = self._board.look(self._number)
-        self._number = look.number
-        return screen(self._board, look, self._picture)
+        state = self._display.state(self._number)
+        self._number = state.number
+        return screen(self._display, state, self._picture)
 
 
-def screen(board: Board, look: Look, picture: Picture) -> RenderableType:
+def screen(display: Display, state: DisplayState, picture: SkinPicture) -> RenderableType:
     """Return the skin beside what is said of it, and the line about the stream below."""
-    facts, beside = board.facts, Table.grid(padding=(0, 3))
-    beside.add_row(_map(picture(look.values, look.valid)), _said(look))
-    border = "bold red" if look.alarm else "dim"
-    panel = Panel(beside, title=f"{facts.title} on {facts.port}", border_style=border, expand=False)
-    return Group(panel, Text(look.line or " ", style="dim"), Text(_KEYS, style="dim"))
+    info, beside = display.info, Table.grid(padding=(0, 3))
+    beside.add_row(_map(picture(state.values, state.valid)), _said(state))
+    border = "bold red" if state.alarm else "dim"
+    panel = Panel(beside, title=f"{info.title} on {info.port}", border_style=border, expand=False)
+    return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
 def _map(image: Any) -> Text:
@@ -122,20 +122,20 @@ def _map(image: Any) -> Text:
     return text
 
 
-def _said(look: Look) -> RenderableType:
-    verdict, alarm = look.verdict, Text("DANGEROUS", "bold white on red")
+def _said(state: DisplayState) -> RenderableType:
+    verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
     if verdict is None:
-        trouble = Text(look.trouble or "waiting", style="yellow")
-        return Group(alarm, Text(), trouble) if look.alarm else trouble
+        trouble = Text(state.trouble or "waiting", style="yellow")
+        return Group(alarm, Text(), trouble) if state.alarm else trouble
     if not verdict.touched:
         return Text("no touch", style="dim")
-    head, notes = alarm if verdict.dangerous else Text("touch", "bold"), [since(verdict.contact)]
-    notes += [f"{count} sensors at their limit"] if (count := int(look.saturated.sum())) else []
+    head, notes = alarm if verdict.dangerous else Text("touch", "bold"), [contact_text(verdict.contact)]
+    notes += [f"{count} sensors at their limit"] if (count := int(state.saturated.sum())) else []
     notes += ["frames are missing"] * verdict.gap
     return Group(head, Text(), _bars(verdict), Text("\n".join(notes), "yellow"))
 
 
-def since(contact: float | None) -> str:
+def contact_text(contact: float | None) -> str:
     """Return since when something touches the skin, by the clock on the wall; empty if nothing does.
 
     Args:

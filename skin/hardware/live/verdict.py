@@ -20,7 +20,7 @@ class Verdict:
         chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
             raised, as long as it lasts.
         touched: debounced; False: nothing touches the skin, and the labels mean nothing.
-        said: label -> debounced answer; empty without touch.
+        labels: label -> debounced answer; empty without touch.
         dangerous: what alarms, until the contact ends; never without touch.
         gap: frames are missing in the window.
         masked: sensors that say nothing in the whole window.
@@ -31,7 +31,7 @@ class Verdict:
     t_host: float
     chances: dict[str, float]
     touched: bool
-    said: dict[str, bool]
+    labels: dict[str, bool]
     dangerous: bool
     gap: bool
     masked: tuple[int, ...] = ()
@@ -41,14 +41,14 @@ class Verdict:
         """Return what is said in words, each with its probability in this window; nothing without touch."""
         pairs = [
             (name, self.chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - self.chances[name])
-            for name, yes in self.said.items()
+            for name, yes in self.labels.items()
         ]
         return [(word, chance) for word, chance in pairs if word]
 
 
 @checked("live.patience")
 @dataclass(frozen=True)
-class Patience:
+class DebounceSettings:
     """How long an answer must hold before it is said, and be gone before it is taken back, s.
 
     Attributes:

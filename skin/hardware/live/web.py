@@ -20,9 +20,9 @@ from starlette.responses import FileResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 from skin.errors import InputError
-from skin.hardware.live.board import Board, Look
-from skin.hardware.live.picture import Picture
-from skin.hardware.live.terminal import since
+from skin.hardware.live.display import Display, DisplayState
+from skin.hardware.live.picture import SkinPicture
+from skin.hardware.live.terminal import contact_text
 
 HERTZ = 33  # pictures a second: 30, and what a busy machine costs
 _PIXELS = 64
@@ -31,11 +31,11 @@ _PAGE = Path(__file__).with_name("page.html")
 
 
 @contextmanager
-def served(board: Board, port: int) -> Iterator[str]:
+def serve_page(display: Display, port: int) -> Iterator[str]:
     """Serve the page while the block runs; give its address.
 
     Args:
-        board: what is shown.
+        display: what is shown.
         port: 0 takes a free one.
 
     Raises:
@@ -46,7 +46,7 @@ def served(board: Board, port: int) -> Iterator[str]:
     except (OSError, OverflowError) as error:
         raise InputError(f"no page on port {port}: {error}; give live.web_port=0, or another") from error
     settings = uvicorn.Config(
-        _application(board), log_config=None, access_log=False, lifespan="off", timeout_graceful_shutdown=1
+        _application(display), log_config=None, access_log=False, lifespan="off", timeout_graceful_shutdown=1
     )
     server = uvicorn.Server(settings)
     thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="skin-page", daemon=True)
@@ -54,57 +54,57 @@ def served(board: Board, port: int) -> Iterator[str]:
     try:
         yield f"http://{_HOST}:{listening.getsockname()[1]}"
     finally:
-        board.closed.set()
+        display.closed.set()
         server.should_exit = True
         thread.join(5)
         listening.close()
 
 
-def message(look: Look, picture: Picture) -> dict[str, Any]:
+def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
     """Return what a page is sent for each picture: forces in N, the picture as base64 of uint8 row by row."""
-    verdict = look.verdict
+    verdict = state.verdict
     said = None
     if verdict is not None:
         said = {
             "touched": verdict.touched,
             "dangerous": verdict.dangerous,
             "gap": verdict.gap,
-            "since": since(verdict.contact),
+            "since": contact_text(verdict.contact),
             "words": verdict.words(),
         }
     return {
-        "number": look.number,
-        "values": [round(value, 3) for value in look.values.tolist()],
-        "valid": look.valid.tolist(),
-        "saturated": look.saturated.tolist(),
-        "picture": base64.b64encode(picture(look.values, look.valid).tobytes()).decode(),
+        "number": state.number,
+        "values": [round(value, 3) for value in state.values.tolist()],
+        "valid": state.valid.tolist(),
+        "saturated": state.saturated.tolist(),
+        "picture": base64.b64encode(picture(state.values, state.valid).tobytes()).decode(),
         "verdict": said,
-        "trouble": look.trouble,
-        "alarm": look.alarm,
-        "line": look.line,
+        "trouble": state.trouble,
+        "alarm": state.alarm,
+        "line": state.line,
     }
 
 
-def _application(board: Board) -> Starlette:
-    facts = board.facts
-    picture = Picture(facts.positions, facts.size, _PIXELS, facts.top)
+def _application(display: Display) -> Starlette:
+    info = display.info
+    picture = SkinPicture(info.positions, info.size, _PIXELS, info.top)
 
     async def page(request: Request) -> Response:
         return FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})
 
     async def skin(request: Request) -> Response:
-        known = {"positions": facts.positions.tolist(), "size": list(facts.size), "pixels": _PIXELS}
-        named = {"title": facts.title, "port": facts.port, "top": facts.top, "window": facts.window}
+        known = {"positions": info.positions.tolist(), "size": list(info.size), "pixels": _PIXELS}
+        named = {"title": info.title, "port": info.port, "top": info.top, "window": info.window}
         return JSONResponse(known | named)
 
     async def pictures(request: Request) -> Response:
-        return StreamingResponse(_events(board, picture), media_type="text/event-stream")
+        return StreamingResponse(_events(display, picture), media_type="text/event-stream")
 
     async def tare(request: Request) -> Response:
         # Another site's page can send a plain POST here, but not with a header of its own.
         if request.headers.get("x-skin") != "tare":
             return Response(status_code=403)
-        board.tare.set()
+        display.tare.set()
         return Response(status_code=204)
 
     # Names that lead here from elsewhere are refused: another site's page must not read the skin.
@@ -114,12 +114,12 @@ def _application(board: Board) -> Starlette:
     return Starlette(routes=routes, middleware=[here])
 
 
-async def _events(board: Board, picture: Picture) -> AsyncIterator[str]:
+async def _events(display: Display, picture: SkinPicture) -> AsyncIterator[str]:
     number, due = 0, monotonic()
-    while not board.closed.is_set():
-        look = board.look(number)
-        number = look.number
-        yield f"data: {json.dumps(message(look, picture))}\n\n"
+    while not display.closed.is_set():
+        state = display.state(number)
+        number = state.number
+        yield f"data: {json.dumps(message(state, picture))}\n\n"
         # A picture that is a little late does not delay the next; those that are very late are left out.
         due = max(due + 1 / HERTZ, monotonic() - 1 / HERTZ)
         await asyncio.sleep(max(0.0, due - monotonic()))

@@ -7,13 +7,13 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench import Bench, bench
-from skin.hardware.calibration.fit import fit
+from skin.hardware.calibration.bench_data import BenchData, build_bench_data
+from skin.hardware.calibration.fit import fit_calibration
 from skin.hardware.calibration.gauge import Gauge, per_newton
-from skin.hardware.calibration.outcome import estimate, judge
-from skin.hardware.calibration.protocol import Protocol, emulate
+from skin.hardware.calibration.held_out import estimate_force, evaluate_held_out
+from skin.hardware.calibration.protocol import Protocol, emulate_session
 from skin.layout.grid import Grid
-from skin.signal.calibration import Calibration, write
+from skin.signal.calibration import Calibration, write_calibration
 from skin.signal.imperfection import Imperfection
 from skin.simulator.fem import PlatesAndBeams
 
@@ -29,20 +29,20 @@ def device(**hidden) -> Simulated:
     return Simulated(body=BODY, layout=Grid(2, 3), simulator=PlatesAndBeams, gain_spread=0.2, **hidden)
 
 
-def session_of(skin: Simulated, bits: int | None = None) -> Bench:
+def session_of(skin: Simulated, bits: int | None = None) -> BenchData:
     randomness = np.random.default_rng(0)
     rows = PROTOCOL.gauge(PROTOCOL.places(skin, randomness))
-    return bench(skin, emulate(skin, rows, PROTOCOL, randomness, bits), None)
+    return build_bench_data(skin, emulate_session(skin, rows, PROTOCOL, randomness, bits), None)
 
 
 SLOW = {"hysteresis": 0.05, "time_constant": 0.08, "drift": 0.002, "quantum": 0.01}
 
 
 @pytest.fixture(scope="module", params=[{}, SLOW], ids=["plain", "slow"])
-def known(request) -> tuple[Simulated, Bench, Calibration]:
+def known(request) -> tuple[Simulated, BenchData, Calibration]:
     skin = device(**request.param)
     found = session_of(skin)
-    return skin, found, fit(found)
+    return skin, found, fit_calibration(found)
 
 
 def test_hidden_constants_are_found(known):
@@ -61,7 +61,7 @@ def test_hidden_constants_are_found(known):
 
 def test_held_out_presses_are_simulated_down_to_the_noise(known):
     _, found, _ = known
-    outcome = judge(found, 0.25)
+    outcome = evaluate_held_out(found, 0.25)
     assert len(outcome.held_out) == 3
     assert outcome.helps
     assert outcome.calibrated < 0.07 < 0.3 < min(outcome.simulated, outcome.tared)
@@ -70,7 +70,7 @@ def test_held_out_presses_are_simulated_down_to_the_noise(known):
 
 def test_counts_become_newtons():
     skin = device()
-    found = fit(session_of(skin, bits=12))
+    found = fit_calibration(session_of(skin, bits=12))
     per_newton_counts = 2**11 / (2 * 10)
     hidden = skin.constants.gain.numpy() * per_newton_counts
     np.testing.assert_allclose(found.values()["gain"] / found.scale, hidden, rtol=0.02)
@@ -97,11 +97,11 @@ def test_the_press_of_the_report(tmp_path, indenter):
     gains = np.linspace(0.6, 1.6, 6)
     gains[sensor] = 2.0 / (40 * each[sensor])
     hidden = {"gain": gains.tolist(), "offset": [0.3] * 6, "noise": [0.05] * 6, "clip": [10.0] * 6}
-    skin = device(calibration=str(write(Calibration(hidden), tmp_path / "hidden.yaml")))
-    found = fit(session_of(skin))
+    skin = device(calibration=str(write_calibration(Calibration(hidden), tmp_path / "hidden.yaml")))
+    found = fit_calibration(session_of(skin))
     raw = found.values()["offset"].copy()
     raw[sensor] += 2.0
-    assert estimate(raw, each, found) == pytest.approx(40, rel=0.1)
+    assert estimate_force(raw, each, found) == pytest.approx(40, rel=0.1)
     calibrated = Imperfection(noise=0, calibration=found)
     constants = calibrated.constants(6, np.random.default_rng(0))._replace(noise=torch.zeros(()))
     true = torch.from_numpy(40 * each).float()[None, None]
@@ -111,7 +111,7 @@ def test_the_press_of_the_report(tmp_path, indenter):
 
 def test_broken_channels_are_named():
     skin = device(dead=1, stuck=1, saturated=1)
-    found = fit(session_of(skin))
+    found = fit_calibration(session_of(skin))
     levels = skin.constants.level.numpy()[skin.constants.dead.numpy()]
     where = np.flatnonzero(skin.constants.dead.numpy())
     kinds = {0.0: "dead", 10.0: "saturated"}
@@ -123,29 +123,31 @@ def test_broken_channels_are_named():
 def test_a_channel_that_only_hums_is_dead():
     found = session_of(device())
     found.session.raw[:, 4] = 0.3 + 0.05 * np.random.default_rng(1).standard_normal(len(found.session.time))
-    assert fit(found).broken["dead"] == [4]
+    assert fit_calibration(found).broken["dead"] == [4]
 
 
 def test_lost_frames_do_no_harm():
     skin = device()
     found = session_of(skin)
     found.session.raw[np.random.default_rng(1).random(found.session.raw.shape) < 0.1] = np.nan
-    np.testing.assert_allclose(fit(found).values()["gain"], skin.constants.gain.numpy(), rtol=0.02)
+    np.testing.assert_allclose(
+        fit_calibration(found).values()["gain"], skin.constants.gain.numpy(), rtol=0.02
+    )
 
 
 def test_a_sensor_that_nothing_pressed_has_no_gain_of_its_own():
     skin = device()
     found = session_of(skin)
     spared = [n for n in range(len(found.gauge)) if found.each[n].argmax() != 3]
-    assert fit(found, spared).sensors["gain"][3] is None
+    assert fit_calibration(found, spared).sensors["gain"][3] is None
 
 
 def test_what_cannot_be_calibrated_is_refused():
     skin = device()
     found = session_of(skin)
     with pytest.raises(InputError, match=r"6 channels, the layout 4 sensors"):
-        bench(skin.replace(layout=Grid(2, 2)), found.session, None)
-    silent = Bench(found.session, found.gauge, found.each)
+        build_bench_data(skin.replace(layout=Grid(2, 2)), found.session, None)
+    silent = BenchData(found.session, found.gauge, found.each)
     silent.session.raw[:] = 0.05 * np.random.default_rng(0).standard_normal(silent.session.raw.shape)
     with pytest.raises(InputError, match=r"no channel answers to a press|strongest"):
-        fit(silent)
+        fit_calibration(silent)

@@ -8,9 +8,9 @@ import pytest
 
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
-from skin.hardware.emulator.emulator import Emulator, Settings
+from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
 from skin.hardware.emulator.faults import Faults
-from skin.hardware.emulator.outlet import outlet
+from skin.hardware.emulator.port import open_port
 from skin.layout.grid import Grid
 from skin.simulator.naive import Naive
 
@@ -20,10 +20,10 @@ SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness"
 @pytest.mark.parametrize("waits_for", ["a reader", "the next frame", "its power"])
 def test_it_stops_wherever_it_waits(waits_for):
     device = Simulated(body=SHEET, layout=Grid(2, 2), simulator=Naive, gestures=10)
-    port = outlet("tcp:0", None)
+    port = open_port("tcp:0", None)
     rate = 0.005 if waits_for == "the next frame" else 100.0
     faults = Faults(unplug=[0.0], away=600.0) if waits_for == "its power" else Faults()
-    emulator = Emulator(device, port, Settings(rate=rate, idle=600.0), faults)
+    emulator = Emulator(device, port, EmulatorSettings(rate=rate, idle=600.0), faults)
     thread = Thread(target=emulator.run)
     thread.start()
     try:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.hardware.emulator.gestures import Converter, in_time
+from skin.hardware.emulator.gestures import Converter, upsample
 from skin.signal.resampling import resample
 
 RATE = 10.0
@@ -21,7 +21,7 @@ def drawn():
 @pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 1000.0])
 def test_the_maximum_over_each_interval_is_the_frame(rate):
     force = drawn()
-    felt = in_time(force, RATE, rate)
+    felt = upsample(force, RATE, rate)
     time = np.arange(len(felt)) / rate
     known = np.ones_like(felt, dtype=bool)
     back = resample(time, felt, known, ~known, 3.0 - 0.5 / rate, 1 / RATE, 30)
@@ -30,7 +30,7 @@ def test_the_maximum_over_each_interval_is_the_frame(rate):
 
 
 def test_force_rises_and_falls_without_a_jump():
-    felt = in_time(drawn(), RATE, 1000.0)
+    felt = upsample(drawn(), RATE, 1000.0)
     # A quarter of a frame has 25 samples: no step is larger than a 25th of the largest change between frames.
     assert np.abs(np.diff(felt, axis=0)).max() <= 5.0 / 25 + 1e-9
 

@@ -6,13 +6,13 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.verdict import Debounce, Patience
+from skin.hardware.live.verdict import Debounce, DebounceSettings
 from skin.labels import TOUCH, Task
 from skin.recording import Touches
 from skin.signal.frame import Frame
-from skin.wire.conversion import Newtons
+from skin.wire.conversion import UnitConversion
 
-PLAIN = Newtons(np.ones(4), np.zeros(4), np.zeros(4, bool))
+PLAIN = UnitConversion(np.ones(4), np.zeros(4), np.zeros(4, bool))
 
 
 class Loud:
@@ -35,7 +35,9 @@ def frame(t, values, segment=0, valid=None, **more):
 
 def engine(window=5, rate=10.0, sensors=4, task=TOUCH, threshold=0.5, longest=2.0, **patience):
     detection = Detection(threshold, learned=task.gate is not None, longest=longest)
-    return Engine(Loud(), task, torch.zeros(sensors, 3), window, rate, detection, Patience(**patience))
+    return Engine(
+        Loud(), task, torch.zeros(sensors, 3), window, rate, detection, DebounceSettings(**patience)
+    )
 
 
 def play(engine, values, rate=100.0, start=0.0, segment=0):
@@ -91,7 +93,7 @@ def test_an_alarm_is_not_taken_back_by_one_frame():
 
 def test_without_touch_nothing_is_said():
     verdict = play(engine(), np.full((100, 4), 0.2))[-1]
-    assert (verdict.touched, verdict.said, verdict.dangerous) == (False, {}, False)
+    assert (verdict.touched, verdict.labels, verdict.dangerous) == (False, {}, False)
     assert verdict.words() == []
 
 
@@ -167,8 +169,8 @@ def test_a_new_tare_takes_the_alarm_back():
     subject = engine()
     play(subject, np.zeros((60, 4)))
     assert play(subject, np.full((100, 4), 5.0), start=0.6)[-1].dangerous
-    subject.tared()
-    tared = Newtons(np.ones(4), np.full(4, 5.0), np.zeros(4, bool))
+    subject.reset()
+    tared = UnitConversion(np.ones(4), np.full(4, 5.0), np.zeros(4, bool))
     verdict = subject.push(frame(1.61, np.full(4, 5.0)), tared)
     assert (verdict.dangerous, verdict.contact) == (False, None)
 
@@ -176,7 +178,7 @@ def test_a_new_tare_takes_the_alarm_back():
 def test_labels_that_exclude_each_other_have_one_winner():
     task = Task(("grab", "hit", "tap", "pat"), "exclusive")
     verdict = play(engine(task=task), np.full((60, 4), 5.0))[-1]
-    assert sum(verdict.said.values()) <= 1
+    assert sum(verdict.labels.values()) <= 1
     assert not verdict.dangerous
 
 
@@ -192,4 +194,4 @@ def test_labels_that_exclude_each_other_have_one_winner():
 )
 def test_patience_that_would_be_too_late_is_refused(wrong):
     with pytest.raises(InputError, match="patience"):
-        Patience(**wrong)
+        DebounceSettings(**wrong)

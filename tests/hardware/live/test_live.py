@@ -137,8 +137,8 @@ def test_a_skin_that_lost_its_power_is_found_again(begin, store, tmp_path):
         reader = ["device=serial", port, "device.silence=1", "device.backoff=[0.2,0.5]", "device.tare=1"]
         try:
             with begin(tmp_path, "live.py", *reader, *store) as live:
-                until(lambda: "fallen silent" in live.out, live, "silence")
-                after = lambda: live.out.rpartition("fallen silent")[2]  # noqa: E731
+                until(lambda: "stopped sending" in live.out, live, "silence")
+                after = lambda: live.out.rpartition("stopped sending")[2]  # noqa: E731
                 until(lambda: "no touch" in after(), live, "a verdict")
                 live.send_signal(signal.SIGINT)
                 assert live.wait(60) == 0

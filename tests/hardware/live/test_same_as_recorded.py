@@ -10,14 +10,14 @@ import torch
 from skin.body.sheet import Sheet
 from skin.build import build_data, build_device, build_learner
 from skin.device.serial import Serial
-from skin.hardware.live.board import Board, Facts
+from skin.hardware.live.display import Display, DisplayInfo
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.loop import Session
-from skin.hardware.record.recorder import finish, record
+from skin.hardware.live.loop import LiveLoop
+from skin.hardware.record.recorder import convert_session, record_session
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
-from skin.storage import read
-from skin.wire.announcement import Announcement, encode
+from skin.recording_file import read_recording
+from skin.wire.announcement import Announcement, encode_announcement
 from skin.wire.binary import encode_comment, encode_frame
 from skin.wire.text import Header, encode_header, encode_line
 
@@ -51,7 +51,9 @@ def pieces(late=0):
             data += encode_header(Header(n=6, rate=RATE, unit="adc"))
         gesture, place = divmod(number - IDLE, LENGTH + 30)
         if number >= IDLE and place == 0 and gesture < GESTURES:
-            data += encode(Announcement(gesture, number, LENGTH, dict.fromkeys(TOUCH.names, gesture % 2)))
+            data += encode_announcement(
+                Announcement(gesture, number, LENGTH, dict.fromkeys(TOUCH.names, gesture % 2))
+            )
         if number not in lost:
             data += encode_line(row.tolist(), number, number * 1_000_000 // RATE)
         if data:
@@ -113,8 +115,8 @@ def watched(learner, device):
     positions = torch.from_numpy(device.sensors.positions).float()
     asked, found = Asked(learner), {}
     engine = Engine(asked, TOUCH, positions, 30, 10.0, Detection(0.3))
-    facts = Facts("rules", str(device.port), positions.numpy(), device.size, 4.0)
-    return skin, engine, asked, facts, found
+    info = DisplayInfo("rules", str(device.port), positions.numpy(), device.size, 4.0)
+    return skin, engine, asked, info, found
 
 
 def live(learner, stream):
@@ -127,17 +129,17 @@ def live(learner, stream):
 
     listener = Listener(stream, wait)
     device = serial(listener.port)
-    skin, engine, asked, facts, found = watched(learner, device)
+    skin, engine, asked, info, found = watched(learner, device)
 
-    class Taking(Board):
-        def say(self, verdict, trouble="", alarm=False):
-            super().say(verdict, trouble, alarm)
+    class Taking(Display):
+        def set_verdict(self, verdict, trouble="", alarm=False):
+            super().set_verdict(verdict, trouble, alarm)
             if verdict is not None:
                 found[round(verdict.t * RATE)] = asked.windows[-1], verdict
             turn.set()
 
     with skin:
-        Session(skin, device.taring(skin), engine, Taking(facts)).run()
+        LiveLoop(skin, device.taring(skin), engine, Taking(info)).run()
     listener.close()
     return found
 
@@ -146,9 +148,9 @@ def recorded(learner, stream, path):
     """Return the recording of the same stream, and what the learner says of it."""
     listener = Listener(stream, lambda number: None)
     device = serial(listener.port, timeout=5.0)
-    record(device, path, None, False, lambda text: None)
+    record_session(device, path, None, False, lambda text: None)
     listener.close()
-    touches = read(finish(device, path)[0]).touches
+    touches = read_recording(convert_session(device, path)[0]).touches
     return touches, learner.probabilities(touches)
 
 

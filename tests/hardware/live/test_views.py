@@ -16,11 +16,11 @@ from scipy.interpolate import LinearNDInterpolator
 
 from skin.errors import InputError
 from skin.hardware.live import terminal, web
-from skin.hardware.live.board import Board, Facts
-from skin.hardware.live.picture import Picture
+from skin.hardware.live.display import Display, DisplayInfo
+from skin.hardware.live.picture import SkinPicture
 from skin.hardware.live.verdict import Verdict
 from skin.signal.frame import Frame
-from skin.wire.conversion import Newtons
+from skin.wire.conversion import UnitConversion
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
 SIZE = 0.16, 0.12
@@ -28,12 +28,12 @@ AT = """
 const map = document.getElementById("map"), pen = map.getContext("2d");
 return [...pen.getImageData({} * map.width + 7, {} * map.height, 1, 1).data];
 """
-PLAIN = Newtons(np.ones(5), np.zeros(5), np.zeros(5, bool))
+PLAIN = UnitConversion(np.ones(5), np.zeros(5), np.zeros(5, bool))
 PRESSED = Verdict(0, 0, {"big": 0.2, "dangerous": 0.9}, True, {"big": False, "dangerous": True}, True, False)
 
 
-def board():
-    return Board(Facts("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0))
+def display():
+    return Display(DisplayInfo("rules naive 0", "/dev/skin", PLACES, SIZE, 4.0))
 
 
 def frame(values, valid=None):
@@ -63,29 +63,29 @@ def posted(address, **headers):
 
 
 def test_no_peak_between_two_looks_is_missed():
-    subject = board()
-    subject.show(frame(np.zeros(5)), PLAIN)
-    seen = subject.look().number
+    subject = display()
+    subject.add_frame(frame(np.zeros(5)), PLAIN)
+    seen = subject.state().number
     for height in (1, 7, 2):
-        subject.show(frame(height * np.eye(5)[3]), PLAIN)
-    look = subject.look(seen)
-    assert look.values.tolist() == [0, 0, 0, 7, 0]
-    assert subject.look(look.number).values[3] == 2
+        subject.add_frame(frame(height * np.eye(5)[3]), PLAIN)
+    state = subject.state(seen)
+    assert state.values.tolist() == [0, 0, 0, 7, 0]
+    assert subject.state(state.number).values[3] == 2
 
 
 def test_the_picture_interpolates_between_the_sensors():
     values = np.array([1.0, 2.0, 0.5, 3.0, 1.5])
-    image = Picture(PLACES, SIZE, 32, 4.0)(values)
+    image = SkinPicture(PLACES, SIZE, 32, 4.0)(values)
     row, column = 17, 15
     place = (column + 0.5) / 32 * SIZE[0], (row + 0.5) / 32 * SIZE[1]
     expected = LinearNDInterpolator(PLACES[:, :2], values)(*place)
     assert image[row, column] == pytest.approx(255 * expected / 4, abs=1.01)
-    assert Picture(PLACES[:1], SIZE, 8, 4.0)(values[:1]).tolist() == [[63] * 8] * 8
+    assert SkinPicture(PLACES[:1], SIZE, 8, 4.0)(values[:1]).tolist() == [[63] * 8] * 8
 
 
 def test_the_picture_has_no_edge_outside_the_sensors():
     values = np.array([0.0, 4.0, 1.0, 3.0, 2.0])
-    image = Picture(PLACES, SIZE, 64, 4.0)(values).astype(int)
+    image = SkinPicture(PLACES, SIZE, 64, 4.0)(values).astype(int)
     slopes = [
         4 * abs(values[a] - values[b]) / np.linalg.norm(PLACES[a] - PLACES[b])
         for a in range(5)
@@ -100,22 +100,25 @@ def test_the_picture_has_no_edge_outside_the_sensors():
 
 
 def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
-    subject = board()
-    with (tmp_path / "said").open("w") as file, terminal.shown(subject, Console(file=file, width=60)):
+    subject = display()
+    with (
+        (tmp_path / "said").open("w") as file,
+        terminal.show_in_terminal(subject, Console(file=file, width=60)),
+    ):
         for verdict in (None, None, PRESSED, PRESSED):
-            subject.say(verdict, "" if verdict else "taking the baseline: do not touch")
+            subject.set_verdict(verdict, "" if verdict else "taking the baseline: do not touch")
             sleep(0.3)
     said = (tmp_path / "said").read_text().splitlines()
     assert said[-2:] == ["taking the baseline", "DANGEROUS: small dangerous"]
 
 
 def test_the_terminal_shows_the_alarm_and_the_probability():
-    subject = board()
-    subject.say(PRESSED)
-    subject.tell("99.9 Hz")
+    subject = display()
+    subject.set_verdict(PRESSED)
+    subject.set_status("99.9 Hz")
     console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(terminal.screen(subject, subject.look(), Picture(PLACES, SIZE, 24, 4.0)))
+        console.print(terminal.screen(subject, subject.state(), SkinPicture(PLACES, SIZE, 24, 4.0)))
     text = console.export_text()
     assert "DANGEROUS" in text
     assert re.search(r"small .* 80 %", text)
@@ -123,15 +126,15 @@ def test_the_terminal_shows_the_alarm_and_the_probability():
 
 
 def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
-    subject = board()
-    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
-    subject.say(PRESSED)
-    with web.served(subject, 0) as address:
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
+    subject.set_verdict(PRESSED)
+    with web.serve_page(subject, 0) as address:
         code, page = fetch(address)
         assert code == 200
         assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
-        facts = json.loads(fetch(f"{address}/skin.json")[1])
-        assert facts["positions"] == PLACES.tolist()
+        info = json.loads(fetch(f"{address}/skin.json")[1])
+        assert info["positions"] == PLACES.tolist()
         with urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer:
             line = answer.readline().decode()
         picture = json.loads(line.removeprefix("data: "))
@@ -139,53 +142,53 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     assert picture["verdict"]["words"] == [["small", 0.8], ["dangerous", 0.9]]
     assert picture["values"][2] == 2.0
     assert picture["valid"] == [True, True, True, True, False]
-    assert len(b64decode(picture["picture"])) == facts["pixels"] ** 2
+    assert len(b64decode(picture["picture"])) == info["pixels"] ** 2
 
 
 def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
     """A dark hole at the sensor that is pressed hardest would hide the press."""
-    subject = board()
+    subject = display()
     valid, saturated = np.array([True, True, True, True, False]), np.array([False, False, True, False, False])
-    subject.show(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid)._replace(saturated=saturated), PLAIN)
-    look = subject.look()
-    assert look.values.tolist() == [1, 1, 4, 1, 0]
-    assert look.saturated.tolist() == saturated.tolist()
-    picture = Picture(PLACES, SIZE, 64, 4.0)
-    image = picture(look.values, look.valid)
+    subject.add_frame(frame([1.0, 1.0, 4.0, 1.0, 9.0], valid)._replace(saturated=saturated), PLAIN)
+    state = subject.state()
+    assert state.values.tolist() == [1, 1, 4, 1, 0]
+    assert state.saturated.tolist() == saturated.tolist()
+    picture = SkinPicture(PLACES, SIZE, 64, 4.0)
+    image = picture(state.values, state.valid)
     # Where the unknown sensor is, the picture shows what lies around it; the saturated one is brightest.
     row, column = (round(PLACES[4, axis] / SIZE[axis] * 64) for axis in (1, 0))
     assert image[row, column] > 60
     row, column = (round(PLACES[2, axis] / SIZE[axis] * 64) for axis in (1, 0))
     assert image[row - 2 : row + 3, column - 2 : column + 3].max() > 235
-    sent = web.message(look, picture)
+    sent = web.message(state, picture)
     assert (sent["saturated"][2], sent["valid"][4], sent["values"][2]) == (True, False, 4.0)
     assert picture(np.zeros(5), np.zeros(5, dtype=bool)).max() == 0
 
 
 def test_an_alarm_outlives_silence_in_every_view():
-    subject = board()
-    subject.say(PRESSED)
-    subject.say(None, "the device has fallen silent", alarm=True)
-    look = subject.look()
-    assert (look.verdict, look.alarm) == (None, True)
-    assert web.message(look, Picture(PLACES, SIZE, 8, 4.0))["alarm"] is True
+    subject = display()
+    subject.set_verdict(PRESSED)
+    subject.set_verdict(None, "the device has stopped sending", alarm=True)
+    state = subject.state()
+    assert (state.verdict, state.alarm) == (None, True)
+    assert web.message(state, SkinPicture(PLACES, SIZE, 8, 4.0))["alarm"] is True
     console = Console(width=100, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(terminal.screen(subject, look, Picture(PLACES, SIZE, 24, 4.0)))
+        console.print(terminal.screen(subject, state, SkinPicture(PLACES, SIZE, 24, 4.0)))
     text = console.export_text()
     assert "DANGEROUS" in text
-    assert "fallen silent" in text
+    assert "stopped sending" in text
 
 
 def test_the_views_say_since_when_something_touches():
-    assert terminal.since(None) == terminal.since(1.0) == ""
-    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", terminal.since(12.0))
-    assert "take a new tare" in terminal.since(75.0)
+    assert terminal.contact_text(None) == terminal.contact_text(1.0) == ""
+    assert re.fullmatch(r"contact since \d\d:\d\d:\d\d \(12 s\)", terminal.contact_text(12.0))
+    assert "take a new tare" in terminal.contact_text(75.0)
 
 
 def test_the_page_asks_for_a_tare_and_another_site_cannot():
-    subject = board()
-    with web.served(subject, 0) as address:
+    subject = display()
+    with web.serve_page(subject, 0) as address:
         for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
             assert not subject.tare.is_set()
             assert posted(f"{address}/tare", **headers) == code
@@ -196,10 +199,10 @@ def test_the_page_asks_for_a_tare_and_another_site_cannot():
 def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
     pty = pytest.importorskip("pty", reason="pseudo-terminals need a POSIX system")
     master, slave = pty.openpty()
-    subject = board()
+    subject = display()
     with os.fdopen(slave) as typed, (tmp_path / "said").open("w") as file:
         monkeypatch.setattr("sys.stdin", typed)
-        with terminal.shown(subject, Console(file=file)):
+        with terminal.show_in_terminal(subject, Console(file=file)):
             os.write(master, b"x\n")
             assert not subject.tare.wait(0.3)
             os.write(master, b"t\n")
@@ -211,7 +214,7 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
 
 def test_pictures_come_a_little_more_than_thirty_times_a_second():
     with (
-        web.served(board(), 0) as address,
+        web.serve_page(display(), 0) as address,
         urllib.request.urlopen(f"{address}/pictures", timeout=30) as answer,
     ):
         began = monotonic()
@@ -225,15 +228,15 @@ def test_pictures_come_a_little_more_than_thirty_times_a_second():
 
 
 def test_other_sites_and_ports_in_use_are_refused():
-    with web.served(board(), 0) as address:
+    with web.serve_page(display(), 0) as address:
         assert fetch(f"{address}/skin.json", Host="evil.example")[0] == 400
         with pytest.raises(InputError, match=r"live\.web_port="):
-            web.served(board(), int(address.rsplit(":", 1)[1])).__enter__()
+            web.serve_page(display(), int(address.rsplit(":", 1)[1])).__enter__()
 
 
 def test_the_page_goes_when_the_watching_ends():
-    subject = board()
-    with web.served(subject, 0) as address:
+    subject = display()
+    with web.serve_page(subject, 0) as address:
         answer = urllib.request.urlopen(f"{address}/pictures", timeout=30)
         answer.readline()
         reader = Thread(target=answer.read)
@@ -245,11 +248,11 @@ def test_the_page_goes_when_the_watching_ends():
 
 
 def test_the_page_draws_what_it_is_sent(browser):
-    subject = board()
-    subject.show(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
-    subject.say(PRESSED)
-    subject.tell("99.9 Hz")
-    with web.served(subject, 0) as address:
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0], np.array([True, True, True, True, False])), PLAIN)
+    subject.set_verdict(PRESSED)
+    subject.set_status("99.9 Hz")
+    with web.serve_page(subject, 0) as address:
         browser.open(address)
         deadline = monotonic() + 300
         while browser.run("return pictures") < 5:

@@ -1,0 +1,77 @@
+"""Error messages for a command, or one job of a multirun, that cannot continue."""
+
+import errno
+import os
+import sqlite3
+from collections.abc import Iterator
+
+from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
+from omegaconf.errors import OmegaConfBaseException
+
+from skin.errors import InputError
+
+# What a disk or its owner refuses; everything else that the system says is an error of ours.
+_DISK = frozenset(
+    (
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EIO,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.ENOTDIR,
+    )
+)
+
+
+class JobInputError(InputError, CompactHydraException):
+    """Bad input of one job of a multirun: Hydra ends with its sentence, without a traceback."""
+
+
+def to_input_error(error: Exception) -> InputError | None:
+    """Return the sentence for a person, or None where the error is ours and deserves its traceback."""
+    if isinstance(error, InputError):
+        return error
+    for one in _chain(error):
+        if isinstance(one, sqlite3.OperationalError) or type(one) is sqlite3.DatabaseError:
+            return InputError(
+                f"the database of runs refuses: {one}: make room, or give another one, as in "
+                "tracking.uri=sqlite:////FOLDER/runs.db; what has finished is kept"
+            )
+        if isinstance(one, OSError) and one.errno in _DISK:
+            where = one.filename2 or one.filename or "a file"
+            return InputError(
+                f"cannot use {where}: {os.strerror(one.errno)}: make room or give another folder, and run "
+                "the same command again; what has finished is kept"
+            )
+    if not isinstance(error, HydraException | OmegaConfBaseException | TypeError):
+        return None
+    if isinstance(error, OverrideParseException):
+        return InputError(f"{error.override} is no override: {one_line(error)}")
+    cause = error.__cause__ if isinstance(error, InstantiationException) else None
+    if isinstance(cause, InputError):
+        return cause
+    reason = cause or error
+    if isinstance(reason, TypeError) and "argument" not in str(reason):
+        return None
+    if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
+        return None
+    return InputError(one_line(reason))
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error and what it came from: libraries wrap what the system says."""
+    found: BaseException | None = error
+    while found is not None:
+        yield found
+        found = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, on one line; OmegaConf adds lines about its own objects."""
+    told = str(error).split("Config search path:")[0]
+    lines = [line.strip() for line in told.splitlines() if line.strip()]
+    kept = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
+    ends = [" " if line.endswith((".", ":", ",")) else "; " for line in kept[:-1]] + [""]
+    return "".join(line + end for line, end in zip(kept, ends, strict=True))

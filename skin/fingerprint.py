@@ -1,0 +1,94 @@
+"""A hash of what a result depends on: its configuration, the files it names, and the version."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from skin import __version__
+from skin.paths import candidates
+
+RENAMED: dict[str, str] = {
+    "skin.learner.features.Features": "skin.learner.boosted_trees.BoostedTrees",
+    "skin.representation.measured.Measured": "skin.representation.features.Features",
+}
+"""Former name of a class -> its name now. Add a line when you move or rename the class of an option."""
+
+# Group -> settings that were added later. With these values nothing changes, so older runs keep their hash.
+_LATER: dict[str, dict[str, Any]] = {
+    "touch": {"stretch": 4.0, "leak": 0.6, "strict": False},
+    "layout": {"depth": None},
+}
+# Settings of Lightning's Trainer that choose the machine, not the result.
+_MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
+
+
+def config_hash(content: dict[str, Any]) -> str:
+    """Return the hash of a configuration in plain containers, 16 hexadecimal digits.
+
+    Classes count by the first name that they had, so that a renamed module changes no hash.
+    """
+    files = {value: _hash_of(value) for value in _strings(content) if _file(value)}
+    first = renamed(content, {new: old for old, new in RENAMED.items()})
+    text = json.dumps([_relevant(first), files, __version__], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def renamed(value: Any, names: Mapping[str, str] = RENAMED) -> Any:
+    """Return plain containers with other names of classes.
+
+    Args:
+        value: containers, or an entry of one.
+        names: old -> new; by default to the names that the classes have now.
+    """
+    if isinstance(value, dict):
+        return {
+            key: names.get(one, one) if key == "_target_" and isinstance(one, str) else renamed(one, names)
+            for key, one in value.items()
+        }
+    return [renamed(one, names) for one in value] if isinstance(value, list) else value
+
+
+def _relevant(value: Any, group: str = "") -> Any:
+    """Return a configuration without what makes no other run.
+
+    These are later settings that are at their defaults, and the machine, wherever a group is.
+    """
+    if not isinstance(value, dict):
+        return value
+    later = _LATER.get(group, {})
+    kept = {key: _relevant(one, key) for key, one in value.items() if later.get(key, ...) != one}
+    if group != "trainer":
+        return kept
+    # Every run names an accelerator; the CPU stands for all, as in the runs before this was left out.
+    return {key: one for key, one in kept.items() if key not in _MACHINE} | {"accelerator": "cpu"}
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for entry in value.values():
+            yield from _strings(entry)
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _strings(entry)
+
+
+def _file(name: str) -> Path | None:
+    """Return the file that a setting names, as the package finds it, if there is one."""
+    if "/" not in name and "." not in name:
+        return None
+    try:
+        return next((found for found in candidates(name) if found.is_file()), None)
+    except OSError:
+        return None
+
+
+def _hash_of(name: str) -> str:
+    path = _file(name)
+    if path is None:
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

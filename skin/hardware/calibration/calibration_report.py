@@ -1,0 +1,44 @@
+"""Print what a calibration found."""
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from skin.hardware.calibration.held_out import HeldOutErrors
+from skin.signal.calibration import QUANTITIES, Calibration
+
+_UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
+
+
+def held_out_summary(outcome: HeldOutErrors) -> dict[str, Any]:
+    """Return the figures of an outcome for a file, rounded."""
+    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
+    return {"held_out": list(outcome.held_out), "rmse": rmse}
+
+
+def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
+    """Print the constants over all sensors that live, the broken ones, and how held-out presses came out."""
+    table = Table("", "median", "least", "largest", "", box=None, pad_edge=False)
+    for name in QUANTITIES:
+        known = [value for value in calibration.sensors[name] if value is not None]
+        if known and name in calibration.ranges:
+            low, high = calibration.ranges[name]
+            middle = f"{np.median(known):.4g}"
+            table.add_row(name, middle, f"{low:.4g}", f"{high:.4g}", _UNITS.get(name, "N"))
+    Console().print(table)
+    for kind, numbers in calibration.broken.items():
+        if numbers:
+            print(f"{kind}: sensors {', '.join(map(str, numbers))} (from 0)")
+    broken = {number for group in calibration.broken.values() for number in group}
+    unknown = [n for n, gain in enumerate(calibration.sensors["gain"]) if gain is None and n not in broken]
+    if unknown:
+        print(f"not pressed, so of median gain: sensors {', '.join(map(str, unknown))}")
+    print(
+        f"RMSE on {len(outcome.held_out)} held-out presses: simulated {outcome.simulated:.4f} N, with tare "
+        f"{outcome.tared:.4f} N, calibrated {outcome.calibrated:.4f} N"
+    )
+    if len(outcome.force):
+        off = np.abs(outcome.force - 1)
+        print(f"force of these presses from readings: off by {np.median(off):.1%}, at most {off.max():.1%}")

@@ -1,0 +1,241 @@
+"""Read a session from disk, also when some of its lines are damaged."""
+
+import json
+import logging
+from collections import deque
+from math import inf, isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.hardware.record.line_writer import decode_event
+from skin.hardware.record.stored_session import StoredSession
+from skin.signal.frame import Frame
+from skin.signal.resampling import Resampled, Window
+from skin.wire.conversion import UnitConversion
+from skin.wire.segmentation import RecordedGesture
+
+_log = logging.getLogger("skin.hardware.record")
+
+_IN_FRAMES = b"0123456789+-.e,\r"
+_IN_EVENTS = b' #"[]{}:\0'  # and never in a frame; a power cut leaves NUL where any line may have been
+_SPOILT = 2  # bytes of a frame that may be none of its own
+_SLACK = 1e-6  # s: times are rounded
+_BEFORE = 512  # frames
+_STARTS = ("cut", "reset", "reconnect")
+_BAD = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+
+
+def read_session(path: Path) -> StoredSession:
+    """Return what a session holds, and warn of what it lost.
+
+    Half a line at its end and gestures without an end are left out. A damaged line is skipped and counted.
+    Within a gesture, a damaged frame counts as lost; where the line may have been an event, the gesture is
+    left out, for nobody knows what its frames mean. So is one whose line with the baseline is damaged.
+
+    Raises:
+        InputError: no such file, or no session of skin record.
+    """
+    beside = path.with_name(path.name + ".json")
+    if path.exists() and not beside.exists():
+        raise InputError(f"{path} is no session of skin record: no {beside.name} is beside it")
+    try:
+        reading = _Reading(_about(beside))
+        with path.open("rb") as file:
+            for number, line in enumerate(file, 1):
+                if line.endswith(b"\n"):
+                    reading.line(number, line[:-1])
+    except FileNotFoundError as error:
+        raise InputError(f"no session {path}: skin record out={path} makes one") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    except _BAD as error:
+        raise InputError(f"{beside.name} is damaged or no session's: {error}") from error
+    stored = reading.stored
+    if stored.damaged and not stored.frames:
+        raise InputError(f"{path} is damaged or no session of skin record: {reading.first}")
+    for warning in stored.warnings:
+        _log.warning("%s: %s", path, warning)
+    return stored
+
+
+def _about(beside: Path) -> dict[str, Any]:
+    """Return what stands beside a session; one of the errors in _BAD if that is not what belongs there."""
+    about = json.loads(beside.read_text(encoding="utf-8"))
+    if not isinstance(about, dict) or not {"positions", "started_unix"} <= set(about):
+        raise ValueError("it has no positions or no started_unix")
+    places = np.array(about["positions"], dtype=float)
+    numbers = [about["started_unix"], *(about[name] for name in ("window", "rate") if name in about)]
+    if places.ndim != 2 or not places.size or not np.isfinite(places).all():
+        raise ValueError("positions are no rows of numbers")
+    if not all(isinstance(value, int | float) and 0 < value < inf for value in numbers):
+        raise ValueError("started_unix, window and rate must be numbers above 0")
+    return about
+
+
+class _Reading:
+    """Goes through the lines of a session.
+
+    Attributes:
+        stored: what they held.
+        first: what was wrong with the first damaged one.
+    """
+
+    def __init__(self, about: dict[str, Any]) -> None:
+        self.stored, self.first = StoredSession(about), ""
+        self._sensors = len(about["positions"])
+        self._length = about["window"] / about["rate"] if {"window", "rate"} <= set(about) else inf
+        # Older sessions called a channel at its limit invalid.
+        old = about.get("format") == 1 and about.get("bits")
+        self._limit = 2 ** min(int(about["bits"]), 64) - 1 if old else None
+        self._gesture: RecordedGesture | None = None
+        self._conversion: tuple[str, UnitConversion] | None = None
+        self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
+        # Frames before the gesture: they tell the device's rate, as they do in the live view.
+        self._before: deque[Frame] = deque(maxlen=_BEFORE)
+        self._missing = 0
+        self._spoilt, self._doubtful = 0, False
+        # The last two frames, each with the number of its line: whether time grows.
+        self._last: list[tuple[int, Frame]] = []
+
+    def line(self, number: int, data: bytes) -> None:
+        """Take a line without its end."""
+        try:
+            text = data.decode("ascii")
+            if number == 1:
+                if text.split(",")[:2] != ["time", "seq"]:
+                    raise ValueError("no header")
+            elif text.startswith("#"):
+                self._event(*decode_event(text))
+            else:
+                self._frame(number, text)
+        except _BAD as error:
+            self.first = self.first or f"line {number}: {error}"
+            self.stored.damaged.append(number)
+            self._damaged(data)
+
+    def _damaged(self, data: bytes) -> None:
+        strange = data.translate(None, _IN_FRAMES)
+        if data and len(strange) <= _SPOILT and not set(strange) & set(_IN_EVENTS):
+            count = max(1, round(data.count(b",") / (self._sensors + 1)))
+            self._spoilt, self._missing = self._spoilt + count, self._missing + count
+            return
+        self._doubtful = True
+        self._leave_out("a damaged line in it may have changed what its frames mean")
+
+    def _leave_out(self, reason: str) -> None:
+        if self._gesture is not None:
+            self.stored.left_out[self._gesture.number] = reason
+            self._gesture = None
+
+    def _frame(self, number: int, text: str) -> None:
+        t, seq, *values = text.split(",")
+        row = np.array([float(value) for value in values])
+        if len(row) != self._sensors:
+            raise ValueError(f"{len(row)} values, {self._sensors} sensors")
+        if not isfinite(float(t)) or not np.isfinite(row).all() or "_" in text:
+            raise ValueError("no number")
+        valid, saturated = (np.zeros(len(row), dtype=bool) for _ in range(2))
+        valid[:] = True
+        valid[self._marked["invalid"]] = False
+        saturated[self._marked["saturated"]] = True
+        if self._limit is not None:
+            saturated = row >= self._limit
+            valid |= saturated
+        number_of = int(seq) if seq else None
+        frame = Frame(number_of, float(t), float(t), row, valid, 0, self._missing, "", saturated)
+        self._in_time(frame)
+        self._missing = 0
+        self._last = [*self._last[-1:], (number, frame)]
+        self.stored.frames, self.stored.end = self.stored.frames + 1, frame.t
+        (self._before if self._gesture is None else self._gesture.frames).append(frame)
+
+    def _in_time(self, frame: Frame) -> None:
+        """Time only grows: of two frames that deny this, the one that fits those around it is right."""
+        if not self._last or frame.t >= self._last[-1][1].t:
+            return
+        if len(self._last) == 2 and frame.t < self._last[0][1].t:
+            raise ValueError("time goes backwards")
+        number, wrong = self._last.pop()
+        self.stored.damaged.append(number)
+        self.stored.frames -= 1
+        self._spoilt += 1
+        held = self._before if self._gesture is None else self._gesture.frames
+        if held and held[-1] is wrong:
+            held.pop()
+
+    def _event(self, said: dict[str, Any], token: str) -> None:
+        match said.pop("event"):
+            case "meaning":
+                arrays = {name: np.array(value) for name, value in said.items()}
+                if any(
+                    len(array) != self._sensors or not np.isfinite(array).all() for array in arrays.values()
+                ):
+                    raise ValueError("a meaning of other sensors")
+                self._conversion = token, UnitConversion(**arrays)
+                self._marked = {"invalid": [], "saturated": []}
+                self._gesture, self._doubtful = None, False
+            case "begin":
+                self._begin(said)
+            case "end":
+                self._end(int(said["number"]), int(said["lost"]))
+            case "gap":
+                # After it the device's clock begins anew; a gesture may begin with the frame behind it.
+                if said["after"] in _STARTS:
+                    self._before.clear()
+                    if self._gesture is not None and self._gesture.frames:
+                        self._gesture = None
+                self._missing += max(1, int(said["lost"]))
+            case ("invalid" | "saturated") as event:
+                self._marked[event] = self._channels(said["channels"])
+            case "broken":
+                self._gesture = None
+            case other:
+                raise ValueError(f"unknown event {other}")
+
+    def _channels(self, channels: list[int]) -> list[int]:
+        if not all(0 <= channel < self._sensors for channel in channels):
+            raise ValueError(f"no channels {channels}")
+        return channels
+
+    def _begin(self, said: dict[str, Any]) -> None:
+        number, labels = int(said["number"]), said["labels"]
+        if not isfinite(said["time"]) or not set((labels or {}).values()) <= {0, 1}:
+            raise ValueError("no gesture")
+        self._gesture, self._spoilt = RecordedGesture(number, labels, float(said["time"]), 0), 0
+        # Older sessions do not say which baseline is meant.
+        meant = said.get("meaning")
+        if self._conversion is None or (self._doubtful if meant is None else meant != self._conversion[0]):
+            self._leave_out("the line that says what its values mean is damaged")
+        for event, channels in self._marked.items():
+            self._marked[event] = self._channels(said.get(event, channels))
+
+    def _window(self, gesture: RecordedGesture) -> Resampled:
+        about = self.stored.about
+        window = Window(about.get("window", 30), about.get("rate", 10.0), self._sensors)
+        for frame in (*self._before, *gesture.frames):
+            window.add(frame)
+        self._before.extend(gesture.frames)
+        return window.since(gesture.begin)
+
+    def _end(self, number: int, lost: int) -> None:
+        gesture, self._gesture = self._gesture, None
+        # Another number: the line where this one ended or that one began is damaged.
+        if gesture is None or gesture.number != number or self._conversion is None:
+            return
+        inside = [
+            frame.t
+            for frame in gesture.frames
+            if gesture.begin - _SLACK <= frame.t < gesture.begin + self._length
+        ]
+        if not inside:
+            self.stored.left_out[number] = "it has no frames"
+        elif len(inside) > 1 and inside[0] == inside[-1]:
+            self.stored.left_out[number] = "the device's clock stood still, all its frames have the same time"
+        else:
+            gesture.lost = lost + self._spoilt
+            gesture.resampled = self._window(gesture)
+            self.stored.left_out.pop(number, None)
+            self.stored.gestures[number] = gesture, self._conversion[1]

@@ -1,0 +1,222 @@
+"""Recordings as Parquet and CSV files: one row per frame, as in the report (2.1.1).
+
+Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
+(N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
+rows, then ``saturated_00`` ...: 1 where a sensor is at its limit. What is unknown has no column; a reading
+that means nothing (a dead sensor) is empty and is read back as 0 and invalid. Everything else (units,
+layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in
+``x.csv.json``.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import torch
+from torch import Tensor
+
+from skin import files
+from skin.errors import InputError
+from skin.files import tabular, whole
+from skin.labels import Task
+from skin.recording import Recording, Touches
+from skin.recording_metadata import check_metadata, check_rows
+
+FORMAT = 1
+UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m", "size": "m", "rate": "Hz"}
+
+
+def write_recording(recording: Recording, path: str | Path) -> Path:
+    """Write a recording whole: under another name first, then in place of what was there.
+
+    Args:
+        recording: what to keep.
+        path: ``x.parquet`` or ``x.csv``.
+
+    Raises:
+        InputError: another ending, or a folder that cannot be written.
+    """
+    path = tabular(path, "a recording")
+    table, about = _table(recording), _describe(recording)
+    with whole(path) as partial:
+        if path.suffix == ".parquet":
+            text = json.dumps(about)
+            table = table.replace_schema_metadata({"skin": text, "skin_sha256": _sha256(text.encode())})
+            pa.parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
+        else:
+            pa.csv.write_csv(table, partial)
+            # The table takes its place last: without it the sidecar means nothing.
+            files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
+    return path
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read what :func:`write_recording` wrote; equal to the last bit.
+
+    Raises:
+        InputError: no such file, not a recording, damaged, or rows that are not whole touches.
+    """
+    path = tabular(path, "a recording")
+    if not path.is_file():
+        raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
+    try:
+        about = _read_about(path)
+        if isinstance(about, dict) and about.get("format") != FORMAT:
+            raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
+        task = check_metadata(about, str(path))
+        return _recording(_read_table(path, about), about, task)
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, KeyError, OverflowError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
+
+
+def _sidecar(path: Path) -> Path:
+    return path.with_name(path.name + ".json")
+
+
+def _numbered(name: str, count: int) -> list[str]:
+    digits = max(2, len(str(count - 1)))
+    return [f"{name}_{number:0{digits}d}" for number in range(count)]
+
+
+def _columns(about: dict[str, Any]) -> dict[str, pa.DataType]:
+    """Return the name and type of every column, in order."""
+    task, sensors = about["task"], len(about["positions"])
+    columns = {"simulation": pa.int32(), "frame": pa.int32()}
+    if about["labelled"]:
+        cosines = 2 if task.get("direction") else 0  # older recordings do not say
+        kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
+        columns |= dict(zip(task["names"], kinds, strict=True))
+    names = _numbered("reading", sensors) + ["force"] * about["force"]
+    limits = _numbered("saturated", sensors) if about.get("saturated") else []  # older recordings do not say
+    if about["displacement"]:
+        names += _numbered("D_s", sensors) + _numbered("D_t", sensors)
+    names += [f"gesture_{name}" for name in about["parameters"]]
+    return columns | dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
+
+
+def _describe(recording: Recording) -> dict[str, Any]:
+    touches = recording.touches
+    return {
+        "format": FORMAT,
+        "units": UNITS,
+        "gestures": len(touches),
+        "frames": touches.readings.shape[1],
+        "rate": touches.rate,
+        "positions": touches.positions.tolist(),
+        "footprint": list(recording.footprint),
+        "size": list(recording.size),
+        "task": asdict(recording.task),
+        "labelled": touches.labels is not None,
+        "force": recording.force is not None,
+        "displacement": recording.displacement is not None,
+        "saturated": touches.saturated is not None,
+        "parameters": list(recording.parameters),
+        "metadata": recording.metadata,
+    }
+
+
+def _table(recording: Recording) -> pa.Table:
+    touches = recording.touches
+    batch, time, sensors = touches.readings.shape
+
+    def per_gesture(values: Tensor) -> np.ndarray:
+        return np.repeat(values.cpu().numpy(), time)
+
+    arrays = [np.repeat(np.arange(batch), time), np.tile(np.arange(time), batch)]
+    arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
+    readings = touches.readings.reshape(-1, sensors).cpu().numpy()
+    invalid = ~touches.valid.reshape(-1, sensors).cpu().numpy()
+    arrays += [np.ma.masked_array(readings[:, s], invalid[:, s]) for s in range(sensors)]
+    if recording.force is not None:
+        arrays.append(recording.force.flatten().cpu().numpy())
+    if recording.displacement is not None:
+        arrays += list(recording.displacement.permute(3, 2, 0, 1).reshape(2 * sensors, -1).cpu().numpy())
+    arrays += [per_gesture(values) for values in recording.parameters.values()]
+    if touches.saturated is not None:
+        arrays += list(touches.saturated.reshape(-1, sensors).T.cpu().numpy())
+    columns = _columns(_describe(recording))
+    return pa.table(
+        {
+            name: pa.array(np.ma.getdata(array), kind, mask=np.ma.getmaskarray(array), safe=False)
+            for (name, kind), array in zip(columns.items(), arrays, strict=True)
+        }
+    )
+
+
+def _sha256(text: bytes) -> str:
+    return hashlib.sha256(text).hexdigest()
+
+
+def _read_about(path: Path) -> dict[str, Any]:
+    if path.suffix == ".csv":
+        sidecar = _sidecar(path)
+        if not sidecar.is_file():
+            raise ValueError(f"it needs {sidecar.name} beside it: units, layout and rate are there")
+        return json.loads(sidecar.read_text(encoding="utf-8"))
+    stored = pa.parquet.read_schema(path).metadata or {}
+    if b"skin" not in stored:
+        raise ValueError("its schema has no units, layout and rate under 'skin'")
+    # Older files have no checksum.
+    if stored.get(b"skin_sha256", _sha256(stored[b"skin"]).encode()) != _sha256(stored[b"skin"]).encode():
+        raise ValueError("its units, layout and rate are not those that were written")
+    return json.loads(stored[b"skin"])
+
+
+def _read_table(path: Path, about: dict[str, Any]) -> pa.Table:
+    columns = _columns(about)
+    if path.suffix == ".csv":
+        convert = pa.csv.ConvertOptions(column_types=columns, include_columns=list(columns))
+        table = pa.csv.read_csv(path, convert_options=convert)
+        check_rows(about, len(table), len(columns), str(path))
+        return table
+    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+        check_rows(about, file.metadata.num_rows, len(columns), str(path))
+        return file.read(columns=list(columns)).cast(pa.schema(columns.items()))
+
+
+def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
+    if about["units"] != UNITS:
+        raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
+    batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
+    rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
+    whole = np.stack([np.repeat(np.arange(batch), time), np.tile(np.arange(time), batch)], axis=1)
+    if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
+        raise ValueError(
+            f"row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
+            f"{whole[wrong[0]].tolist()}: every touch needs its {time} frames in order"
+        )
+
+    def column(name: str) -> Tensor:
+        return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
+
+    def columns(name: str) -> Tensor:
+        return torch.stack([column(one) for one in _numbered(name, sensors)], dim=-1)
+
+    present = [table[name].is_valid().to_numpy() for name in _numbered("reading", sensors)]
+    touches = Touches(
+        columns("reading"),
+        torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),
+        torch.tensor(about["positions"], dtype=torch.float32),
+        torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
+        about["rate"],
+        saturated=columns("saturated") > 0.5 if about.get("saturated") else None,
+    )
+    return Recording(
+        touches,
+        task,
+        tuple(about["size"]),
+        tuple(about["footprint"]),
+        column("force") if about["force"] else None,
+        torch.stack([columns("D_s"), columns("D_t")], dim=-1) if about["displacement"] else None,
+        {name: column(f"gesture_{name}")[:, 0] for name in about["parameters"]},
+        about["metadata"],
+    )

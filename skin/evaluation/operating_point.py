@@ -194,8 +194,8 @@ def lowest_threshold(safe: Tensor, target: float) -> float:
 
     At most k = floor(target (n + 1)) - 1 of n safe gestures raise the alarm. A new safe gesture then raises
     it with a probability of at most (k + 1) / (n + 1) <= target (split conformal prediction; Vovk, Gammerman
-    and Shafer 2005). If n < 1 / target - 1, the threshold is above all scores, and the target is not met. Scores
-    that differ by less than 2e-6 count as equal: either all of them raise the alarm or none.
+    and Shafer 2005). If n < 1 / target - 1, the threshold is above all scores, and the target is not met.
+    Scores that differ by less than 2e-6 count as equal: either all of them raise the alarm or none.
 
     Args:
         safe: (n,), n > 0, probabilities of ``dangerous`` of safe gestures.

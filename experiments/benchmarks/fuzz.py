@@ -1,8 +1,8 @@
-"""Whatever the wire says: no exception, and every good frame after the next delimiter is recovered.
+"""Fuzz the decoder: it raises no exception and recovers every valid frame after the next delimiter.
 
 python experiments/benchmarks/fuzz.py 1000000 crc16 25 0
 
-Frames are not written by the package, and what was sent intact is all that the oracle knows.
+Frames are encoded independently of the package. The check uses only which frames were sent intact.
 """
 
 import argparse
@@ -40,21 +40,21 @@ _LONG = 70_000  # bytes: longer than any line may be
 def fuzz(
     count: int, spoken: WireFormat, sensors: int, seed: int, on_event: Callable[[int], object] = id
 ) -> dict[str, int]:
-    """Feed a decoder with ``count`` chunks of a stream of good, damaged and senseless frames, and noise.
+    """Feed a decoder with ``count`` chunks of a stream of valid, damaged and invalid frames, and noise.
 
     Args:
         count: of chunks, of 0 to 3000 bytes each.
         spoken: the checksum of the lines, or ``binary``.
         sensors: S.
-        seed: of everything.
-        on_event: is given the number of chunks now and then.
+        seed: of the random generator.
+        on_event: called with the number of chunks from time to time.
 
     Returns:
         ``chunks`` and ``bytes``; ``pieces``: frames and fragments in them; ``good``: those sent intact behind
-        a delimiter, ``recovered`` or ``missed``; ``wrong``: frames taken with values that are not theirs.
+        a delimiter, ``recovered`` or ``missed``; ``wrong``: frames decoded with wrong values.
 
     Raises:
-        Exception: whatever the decoder raises; it should not.
+        Exception: any error of the decoder, which should raise none.
     """
     rng, decoder = (
         Random(f"{spoken} {sensors} {seed}"),
@@ -83,7 +83,7 @@ def fuzz(
 
 
 class _Stream:
-    """An endless stream of bytes, and which frames in it a decoder must find.
+    """An endless stream of bytes, and the frames in it that a decoder must find.
 
     Attributes:
         expected: numbers of the frames that are intact, stand behind a delimiter and have not been seen.
@@ -111,11 +111,11 @@ class _Stream:
         return taken
 
     def rest(self) -> bytes:
-        """Return what is left."""
+        """Return the remaining bytes."""
         return self.chunk(len(self._bytes))
 
     def values(self, number: int) -> list[float]:
-        """Return what the frame of this number says: whole numbers, signed ones or fractions."""
+        """Return the values of a frame by its number: unsigned or signed integers, or fractions."""
         kind = number % 3
         return [
             ((number * (7 + channel) + 31 * channel) % 1024) / (8 if kind == 2 else 1) - 100 * (kind == 1)

@@ -1,4 +1,4 @@
-"""What every measurement starts from: the default configuration, and how a figure is taken."""
+"""Common parts of the benchmarks: configuration, timing, peak memory, versions."""
 
 import os
 import platform
@@ -25,7 +25,7 @@ def training_config(*overrides: str) -> DictConfig:
 
 
 def median_seconds(task: Callable[[], object], repeats: int) -> float:
-    """Return the median duration of a task, s, after one call that is not counted."""
+    """Return the median duration of a task, s, after one warm-up call."""
     task()
     taken = []
     for _ in range(repeats):
@@ -36,9 +36,9 @@ def median_seconds(task: Callable[[], object], repeats: int) -> float:
 
 
 def peak_memory() -> int:
-    """Return the largest resident set of this process, bytes.
+    """Return the peak resident memory of this process, bytes.
 
-    Linux hands ru_maxrss on from the process that started this one; VmHWM is our own.
+    On Linux ru_maxrss is inherited from the parent process; VmHWM is that of this process.
     """
     status = Path("/proc/self/status")
     if status.is_file():
@@ -48,7 +48,7 @@ def peak_memory() -> int:
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions of those packages that are installed."""
+    """Return the versions of the installed packages among the given ones."""
     found = {}
     for name in packages:
         with suppress(PackageNotFoundError):
@@ -57,12 +57,12 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 
 def machine() -> str:
-    """Return what the figures were taken on."""
+    """Return a description of the machine."""
     return f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}"
 
 
 def _processor() -> str:
-    """Return the processor's name where the system tells it."""
+    """Return the name of the processor, if known."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -30,14 +30,14 @@ def measure_latency(
 ) -> dict[str, float]:
     """Return the time from a frame at 100 Hz to the verdict on it, ms: median and the 99th percentile.
 
-    One thread, a simulated stream of touches, every frame classified. ``core_ms`` is the 99th percentile of
-    the core's own time: what is beyond it is the machine's other work.
+    One thread classifies every frame of a simulated stream of touches. ``core_ms`` is the 99th percentile of
+    the processor time, which excludes other processes.
 
     Args:
-        frames: of the device that are classified.
-        row: of the table, untrained: weights do not matter to speed.
-        run: a finished run instead, by the beginning of its id, or ``latest``.
-        uri: of the store that holds it; None: the project's own.
+        frames: number of classified frames.
+        row: of the table, untrained, because speed does not depend on the weights.
+        run: prefix of the id of a finished run to use instead, or ``latest``.
+        uri: of the store with that run; None: the default.
     """
     torch.set_num_threads(1)
     device, engine = _untrained(row) if run is None else _trained(run, uri)
@@ -80,7 +80,7 @@ def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
 
 
 def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:
-    """Return frames at 100 Hz after those that fill the window, which the engine has then seen."""
+    """Return frames at 100 Hz, after the engine's window has been filled with frames."""
     held = round(RATE / device.rate)
     ahead = held * device.window
     whole = device.simulate_stream((ahead + count) // held + 1).whole.touches
@@ -93,7 +93,7 @@ def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame
 
 
 def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
-    """Return how long a verdict takes, by the clock on the wall and by the core's, s."""
+    """Return the duration of a verdict as wall time and as processor time, s."""
     sensors = engine.window.sensors
     known = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
     wall, core = time.perf_counter(), time.thread_time()

@@ -1,4 +1,4 @@
-"""How many pictures a second the live page draws, in a headless Chromium; and a picture of an alarm.
+"""Measure the frame rate of the live page in a headless Chromium, and take a screenshot of an alarm.
 
 skin live web=true                                          # in one terminal
 python experiments/benchmarks/live_page.py http://127.0.0.1:8765 30               # in another
@@ -26,12 +26,12 @@ _LINE = "return document.getElementById('line').textContent"
 
 
 def measure_refresh(address: str, seconds: float, alarm: Path | None = None) -> dict[str, float | str]:
-    """Return how often a page drew the skin, and the browser refreshed it, per second; and its last line.
+    """Return the drawn frames and browser refreshes of a page per second, and its last status line.
 
     Args:
-        address: of a page that is served.
-        seconds: of watching.
-        alarm: where the picture of the hardest press that is said to be dangerous goes.
+        address: URL of the live page.
+        seconds: duration of the measurement.
+        alarm: path for a screenshot of the strongest press that is classified as dangerous.
     """
     found = installed()
     if found is None:
@@ -61,7 +61,7 @@ def measure_refresh(address: str, seconds: float, alarm: Path | None = None) -> 
 
 
 def _picture(browser: Browser, seconds: float, path: Path) -> None:
-    """Write the picture of the hardest press of some seconds that was said to be dangerous and lasted."""
+    """Write a screenshot of the strongest lasting press that is classified as dangerous."""
     until, hardest = monotonic() + seconds, _HARD
     looks = deque([0.0] * _LOOKS, maxlen=_LOOKS)
     while monotonic() < until:

@@ -1,4 +1,4 @@
-"""How long the peers of the finite-element skins take to answer one frame."""
+"""Time per frame of other solvers for the finite-element skins."""
 
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -23,8 +23,8 @@ def direct_seconds_per_frame(simulator: str, gestures_frames: int, repeats: int)
 
     Args:
         simulator: ``fem``, or ``solid``: scikit-fem's elements without an operator.
-        gestures_frames: over how many frames the factorisation is shared.
-        repeats: of which the median counts.
+        gestures_frames: number of frames that share the factorisation.
+        repeats: number of repetitions; the median is returned.
     """
     stiffness, load = _system(simulator)
     pressures = _pressures()
@@ -40,7 +40,7 @@ def direct_seconds_per_frame(simulator: str, gestures_frames: int, repeats: int)
 
 
 def _system(simulator: str) -> tuple[Callable[[], csc_matrix], csc_matrix]:
-    """Return what assembles the stiffness of the default skin, and the load of its cells."""
+    """Return a function that assembles the stiffness of the default skin, and the loads of its cells."""
     if simulator == "fem":
         structure = Structure(_device().body)
         return structure.stiffness, structure.load()

@@ -1,4 +1,4 @@
-"""Frames as the protocol has them, and broken ones, written without the package: what an oracle knows."""
+"""Valid and invalid frames of the wire protocol, encoded independently of the package."""
 
 import struct
 from random import Random
@@ -6,13 +6,13 @@ from typing import Literal
 
 WireFormat = Literal["crc16", "xor", "none", "binary"]
 FORMATS: tuple[WireFormat, ...] = ("crc16", "xor", "none", "binary")
-"""The checksum of lines, or binary frames."""
+"""Lines with one of three checksums, or binary frames."""
 
 _INSERTED = (b"\n", b"\0", b"\r\n", b"*", b"#", b",")
 
 
 def text_line(fields: list[bytes], separator: bytes, check: WireFormat) -> bytes:
-    """Return a line without its end."""
+    """Return a line of text without its line ending."""
     body = separator.join(fields)
     if check == "crc16":
         return body + b"*%04X" % _crc(body)
@@ -25,12 +25,12 @@ def text_line(fields: list[bytes], separator: bytes, check: WireFormat) -> bytes
 
 
 def binary_frame(number: int, clock: int, values: list[float], kind: int) -> bytes:
-    """Return a binary frame of kind 1 (u16), 2 (i16) or 3 (f32), stuffed, with its delimiter."""
+    """Return a binary frame of kind 1 (u16), 2 (i16) or 3 (f32), byte-stuffed, with its delimiter."""
     return _stuffed(_sealed(_body(number, clock, values, kind)))
 
 
 def invalid_frame(number: int, clock: int, values: list[float], kind: int, rng: Random) -> bytes:
-    """Return a frame with a right CRC that is none: of no known kind, of another length, or with NaN."""
+    """Return an invalid frame with a correct CRC: of unknown kind, of another length, or with NaN."""
     body, trouble = bytearray(_body(number, clock, values, kind)), rng.randrange(5)
     if trouble == 0:
         body[0] = rng.choice((0, 0x5A, 0xFF))
@@ -46,7 +46,7 @@ def invalid_frame(number: int, clock: int, values: list[float], kind: int, rng: 
 
 
 def damage(piece: bytes, rng: Random) -> bytes:
-    """Return a piece that had up to five accidents of up to eight bytes."""
+    """Return a frame with up to five random errors of up to eight bytes."""
     data = bytearray(piece)
     for _ in range(rng.choice((1, 1, 2, 5))):
         first, run = rng.randrange(len(data)), rng.randint(1, 8)

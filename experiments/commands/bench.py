@@ -27,7 +27,7 @@ PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "
 
 @command("bench")
 def main(config: DictConfig) -> None:
-    """Take every figure and write the file whole; progress goes to standard error."""
+    """Run all benchmarks and write bench.json; progress goes to standard error."""
     settings = plain(config)["bench"]
     check_settings(figures, settings, "bench")
 
@@ -42,11 +42,11 @@ def figures(
     repeats: Annotated[int, Ge(3)],
     rows: Sequence[Literal["temporal_graph", "temporal_image", "sequence_graph", "sequence_image"]],
 ) -> dict[str, Any]:
-    """Return every figure.
+    """Return the results of all benchmarks.
 
     Args:
-        repeats: of each, of which the median counts.
-        rows: whose training is timed; each has a reference model.
+        repeats: number of repetitions; medians are returned.
+        rows: rows whose training is timed; each has a reference model.
     """
     from rich.console import Console
 
@@ -76,7 +76,7 @@ def figures(
 
 
 def _compare(generation: dict[str, dict[str, float]], repeats: int, say: Callable[[str], None]) -> None:
-    """Add to each finite-element skin how many times faster it is than its peers, per frame."""
+    """Add the speed of each finite-element skin relative to other solvers, per frame."""
     from experiments.benchmarks import mechanics
     from experiments.benchmarks.generation import GESTURES
 
@@ -93,6 +93,6 @@ def _compare(generation: dict[str, dict[str, float]], repeats: int, say: Callabl
 
 
 def _own(module: str, *arguments: str) -> dict[str, float]:
-    """Measure in a process of its own, so that its peak memory and its threads are its own."""
+    """Run a benchmark in its own process, with its own peak memory and threads."""
     command = [sys.executable, str(HERE / "benchmarks" / f"{module}.py"), *arguments]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)

@@ -24,14 +24,14 @@ PYTHON = ROOT / ".venv-peers" / "bin" / "python"
 
 @command("peers")
 def main(config: DictConfig) -> bool:
-    """Train a peer and log what its answers are worth; False if a finished run has done it before."""
+    """Train a peer and log its evaluation; return False if there is a finished run already."""
     if config.row not in PEERS:
         raise InputError(f"there is no peer row={config.row}: choose from {', '.join(PEERS)}")
     settings = plain(config)["peers"]
     python = PYTHON if settings["python"] is None else Path(settings["python"])
     if not python.is_file():
         raise InputError(f"there is no {python}: make peers builds it")
-    # Where it is done has no part in its identity.
+    # Settings of the environment are not part of the fingerprint.
     own = validate_config(OmegaConf.masked_copy(config, [str(key) for key in config if key != "peers"]))
 
     from rich.console import Console

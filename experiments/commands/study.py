@@ -23,7 +23,7 @@ from skin.files import results
 
 @command("study")
 def main(config: DictConfig) -> None:
-    """Train or find the runs of a study, measure them, write and print what was found."""
+    """Train or find the runs of a study, measure them, and write and print the results."""
     study = Study.of(config)
     folder = results(config.out) / ("smoke" if config.smoke else "")
 
@@ -67,7 +67,7 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
 
 
 def _measure_skin(study: Study, folder: Path) -> None:
-    """Measure the skin itself."""
+    """Apply the measure of a study without runs to the skin."""
     from hydra import compose
 
     from experiments.studies.measures import Subject

@@ -27,7 +27,7 @@ _SMOKE = "SMOKE, one epoch on little data, ignore the scores: "
 
 @command("table")
 def main(config: DictConfig) -> None:
-    """Run the sweep, then write what finished runs say; exit code 1 if one is missing."""
+    """Run the sweep, then write the results of finished runs; exit code 1 if one is missing."""
     settings = plain(config)["table"]
     check_settings(sweep, settings, "table")
     words = sweep(**settings)
@@ -52,7 +52,7 @@ def sweep(
 
 
 def write_results(words: Sequence[str], budget: str, folder: Path) -> int:
-    """Write and print what finished runs say, with their budget; return how many are missing."""
+    """Write and print the results of finished runs and their budget; return the number of missing runs."""
     from experiments.studies.report_figures import draw_runs, draw_skin
     from experiments.studies.results_table import (
         collect,

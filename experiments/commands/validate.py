@@ -19,7 +19,7 @@ from skin.paths import ROOT
 
 @command("validate")
 def main(config: DictConfig) -> None:
-    """Check laws, print a line for each, and write what was found."""
+    """Check laws, print a line for each, and write the results."""
     from rich.console import Console
     from rich.progress import track
 

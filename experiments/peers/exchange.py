@@ -27,18 +27,18 @@ ABOUT = "about.json"
 
 
 def export_touches(device: AbstractSimulated, settings: Evaluation, folder: Path) -> None:
-    """Write every set of touches that learning and evaluating needs, unless they lie there already.
+    """Write all sets of touches for training and evaluation, unless they are already there.
 
     ``touches/<set>.parquet`` are recordings (:mod:`skin.recording_file`), ``features/<set>.parquet`` hold the
     engineered features, one row per touch. Sets: ``train``, ``validation``, ``alarm`` (on which the
     alarm's threshold is chosen), then ``<column>_<number>`` for the sets of
     :func:`skin.evaluation.report.columns`. ``sets.json``, written last, names the content of each set: set ->
-    digest. A folder with other touches is emptied, answers and all.
+    digest. A folder with other touches is removed first, including predictions.
 
     Args:
-        device: whose touches.
+        device: gives the touches.
         settings: of the evaluation.
-        folder: made if it is missing.
+        folder: created if it does not exist.
     """
     if (folder / SETS).is_file():
         known = json.loads((folder / SETS).read_text())
@@ -55,21 +55,22 @@ def export_touches(device: AbstractSimulated, settings: Evaluation, folder: Path
             for touches in sets:
                 name = f"{column}_{next(numbers)}"
                 known[name] = _export(touches, device, folder, name)
-        except InputError:  # sensors that make no grid: the evaluation will say so
+        except InputError:  # sensors that cannot form a grid: the evaluation reports it
             continue
     write_text(json.dumps(known, indent=1) + "\n", folder / SETS)
 
 
 class PeerPredictions:
-    """Answers to touches with the probabilities that another environment wrote for them.
+    """Predictions of a peer for exported touches, read from files.
 
-    It knows touches by their content alone, so an answer can never meet other touches than it was given for.
+    Touches are identified by the digest of their content, so that predictions cannot be assigned to other
+    touches.
 
     Args:
-        folder: that :func:`export_touches` filled.
-        peer: name of the folder in it with ``about.json`` (what the peer tells of itself) and, per set, a
+        folder: written by :func:`export_touches`.
+        peer: name of the subfolder with ``about.json`` (information on the peer) and, per set, a
             ``<set>.parquet`` with one column per label.
-        task: what the labels mean.
+        task: meaning of the labels.
 
     Attributes:
         about: seconds (of training), parameters, versions.
@@ -85,11 +86,11 @@ class PeerPredictions:
         """Return the probability of each label, (B, L).
 
         Raises:
-            LookupError: touches that were not exported.
+            LookupError: the touches were not exported.
         """
         content = touches_hash(touches)
         if content not in self._sets:
-            raise LookupError(f"{self._folder.parent} holds other touches than these: remove it")
+            raise LookupError(f"{self._folder.parent} has predictions for other touches: remove it")
         path = self._folder / f"{self._sets[content]}.parquet"
         table = pa.parquet.read_table(path, columns=self._names, memory_map=False)
         columns = [torch.from_numpy(table[name].to_numpy().copy()) for name in self._names]

@@ -84,7 +84,7 @@ def lightgbm(folder: Path, seed: int, jobs: int) -> tuple[Answer, float, int]:
 
 
 def flat(jobs: int, seed: int) -> Pipeline:
-    """Return a transform to the plain readings: what the ridge makes without any kernel."""
+    """Return a transform to the flattened readings, as a baseline for the convolution kernels."""
     return make_pipeline(FunctionTransformer(lambda x: x.reshape(len(x), -1)), StandardScaler())
 
 

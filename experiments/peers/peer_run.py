@@ -22,17 +22,17 @@ _SOURCES = ("seed", "touch", "body", "layout", "simulator", "device", "data", "e
 def learn(
     store: Store, config: DictConfig, folder: Path, command: Sequence[str], say: Callable[[str], None]
 ) -> dict[str, float]:
-    """Let the peer ``config.row`` learn and log its run; return its overall accuracy in every column.
+    """Train the peer ``config.row`` and log its run; return its overall accuracy in each column.
 
     Args:
         store: where to log.
-        config: its ``row`` names the peer; seed, device, data and evaluation hold, the rest means nothing.
-        folder: where files are exchanged, each configuration of touches in a folder of its own.
-        command: that runs the peers' script; the peer's name, the folder, ``--seed`` and ``--jobs`` follow.
-        say: is told what happens.
+        config: ``row`` names the peer; seed, device, data and evaluation are used, other settings are not.
+        folder: for exchanged files, with a subfolder per configuration of touches.
+        command: runs the script of the peers; the peer's name, the folder, ``--seed`` and ``--jobs`` follow.
+        say: called with progress messages.
 
     Raises:
-        InputError: the device has no unseen devices and layouts: it is not simulated.
+        InputError: the device is not simulated, so there are no unseen devices and layouts.
         subprocess.CalledProcessError: the peer failed.
     """
     source, identity = _source(config), tags(config)
@@ -60,13 +60,13 @@ def learn(
 
 
 def _source(config: DictConfig) -> DictConfig:
-    """Return the part of a configuration that touches depend on, every value final."""
+    """Return the part of a configuration that decides the touches, with all values resolved."""
     whole = plain(config)
     return OmegaConf.create({key: whole[key] for key in _SOURCES})
 
 
 def _follow(command: list[str], say: Callable[[str], None]) -> None:
-    """Run a command to its end and pass on what it says."""
+    """Run a command and pass on each line of its output."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             for line in process.stdout or ():

@@ -73,7 +73,7 @@ def verdict(claim: str, found: Paired | None, by: float = 0.0) -> str:
 
 
 def combine_verdicts(verdicts: Sequence[str]) -> str:
-    """Return the verdict of a statement about several others: it holds only if it holds against each."""
+    """Return the verdict of a statement with several comparisons: it holds only if it holds for each."""
     if "disagree" in verdicts:
         return "disagree"
     return "agree" if verdicts and set(verdicts) == {"agree"} else "undecided"

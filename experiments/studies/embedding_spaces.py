@@ -1,4 +1,4 @@
-"""Figure 5 of the report, the table of what embeddings tell, and the verdicts."""
+"""Figure 5 of the report, the table of accuracies on embeddings, and verdicts."""
 
 from collections.abc import Callable, Iterable, Sequence
 from statistics import fmean, stdev
@@ -37,7 +37,7 @@ def build_embeddings_page(found: Sequence[ProbeResult], names: Sequence[str]) ->
 def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
     """Return the first touches in the plane, (points, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
     few = np.asarray(vectors[:points], dtype=float)
-    # Vectors that are all equal stand on one spot, of which neither method can make a plane.
+    # Neither method works on vectors that are all equal.
     if np.ptp(few, axis=0).max() < 1e-9:
         return np.zeros((len(few), 2))
     reduced = PCA(min(30, *few.shape), random_state=0).fit_transform(few)
@@ -88,10 +88,10 @@ def embeddings_table(found: Sequence[ProbeResult], names: Sequence[str]) -> list
 
 
 def embedding_statements(found: Sequence[ProbeResult], names: Sequence[str]) -> list[str]:
-    """Return what the touches say of the report's sentences on pretrained embeddings (3.2.4), one line each.
+    """Return verdicts on the report's statements about pretrained embeddings (3.2.4), one line each.
 
-    A sentence holds if it does for every embedding; agree and disagree need two standard errors over at least
-    three seeds, and "chance" allows for two points.
+    A statement holds if it holds for each embedding. Agree and disagree need two standard errors over at
+    least three seeds; "chance" has a tolerance of two points.
     """
     groups = _groups(found)
     frame = {one.seed: _mean(one, names) for one in groups[("", FRAME)]}
@@ -141,7 +141,7 @@ def _compare(
 
 
 def _groups(found: Iterable[ProbeResult]) -> dict[tuple[str, str], list[ProbeResult]]:
-    """Return what each input told, seed by seed."""
+    """Return the results of each input, by seed."""
     groups: dict[tuple[str, str], list[ProbeResult]] = {}
     for one in found:
         groups.setdefault((one.attribute, one.name), []).append(one)

@@ -1,4 +1,4 @@
-"""Files and one line on the errors of a learner by margin."""
+"""Page and summary of the errors of a learner by margin."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def build_margins_page(found: MarginReport, title: str) -> Page:
 
 
 def margins_summary(found: MarginReport) -> str:
-    """Return what matters most, in one line: how many errors are near a threshold or of faint touches."""
+    """Return a summary in one line: the number of errors close to a threshold or on weak touches."""
     wrong = {name: sum(one.wrong for one in found.spans[name]) for name in TOUCH.names}
     near = {
         name: sum(one.wrong for one in found.spans[name] if _NEAR[0] <= one.low and one.high <= _NEAR[1])

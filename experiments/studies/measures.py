@@ -1,6 +1,6 @@
-"""What a study measures: of a finished run, on a device that a condition may have changed.
+"""Measures of a study: they evaluate a finished run on a device that a condition may change.
 
-Measures import late, so that a mistake in their settings is reported at once.
+They import heavy packages when called, so that errors in their settings are reported early.
 """
 
 from dataclasses import dataclass
@@ -44,10 +44,10 @@ class Finished:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is measured.
+    """The subject of a measure.
 
     Attributes:
-        config: of the run, with what the condition changes; without a run that of the command.
+        config: of the run, with the changes of the condition; that of the command without a run.
         device: as ``config`` describes it.
         finished: the run; None where a study has none.
     """
@@ -133,9 +133,10 @@ class SelfShare:
 
 @dataclass(frozen=True)
 class Margins:
-    """How far from a threshold a verdict can be trusted.
+    """Errors by the distance from the thresholds of the labels.
 
-    Sorts verdicts by area, travel, duration and pressure over their thresholds, and by the highest reading.
+    Groups predictions by area, travel, duration and pressure relative to their thresholds, and by the largest
+    reading.
 
     Args:
         gestures: number of test touches.
@@ -169,10 +170,10 @@ class Streams(StreamSettings):
 
 @dataclass(frozen=True)
 class Holds:
-    """When the alarm is raised, and whether a held press keeps it.
+    """Delay of the alarm, and whether it persists during a held press.
 
-    Plays dangerous taps, presses, holds of 1 s to 10 min and slow ramps to the engine of ``skin live``, in
-    the time of the device.
+    Feeds dangerous taps, presses, holds of 1 s to 10 min and slow ramps to the engine of ``skin live``, in
+    simulated time.
 
     Args:
         gestures: number of taps, presses, short holds and ramps; a tenth of it of those of ten minutes.
@@ -209,7 +210,7 @@ class Holds:
 
 @dataclass(frozen=True)
 class Motion:
-    """How far touches move the sensors of a skin in which they can, and how well readings tell it; of no run.
+    """Displacements of sensors under touches, and how well readings predict them; needs no run.
 
     Args:
         gestures: number of test gestures.
@@ -227,7 +228,7 @@ class Motion:
 
 
 class Embeddings(ProbeSettings):
-    """What an SVM reads in graph embeddings, in readings, and in the encoder of a run, if one is given."""
+    """Accuracy of an SVM on graph embeddings, readings, and the encoder of a run, if one is given."""
 
     def __call__(self, subject: Subject) -> Measurement:
         from rich.console import Console

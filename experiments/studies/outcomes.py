@@ -1,4 +1,4 @@
-"""What the trials of a study decide: its statements, and differences between conditions or variants."""
+"""Results of the trials of a study: its statements, and differences between conditions or variants."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/dir
 
 @dataclass(frozen=True)
 class StatementResult:
-    """A statement beside what was measured.
+    """The verdict on a statement.
 
     Attributes:
-        statement: what is said.
-        compared: name of what it was compared with -> the comparison; shares in points of a hundred.
+        statement: the statement.
+        compared: name of the other side -> the comparison; shares in percentage points.
         verdict: agree, disagree or undecided.
     """
 
@@ -35,7 +35,7 @@ class Difference:
     Attributes:
         variant: name.
         condition: name, or empty.
-        found: the comparison, shares in points of a hundred.
+        found: the comparison, shares in percentage points.
         verdict: better, worse or undecided.
     """
 

@@ -24,13 +24,13 @@ Way = Callable[[Tensor, Task], Tensor]
 
 
 class _Known:
-    """Answers to touches that all members saw before."""
+    """Combined predictions for touches that all members have predicted."""
 
     def __init__(self, chances: Mapping[str, Tensor], task: Task, way: Way) -> None:
         self._chances, self._task, self._way = chances, task, way
 
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probabilities (B, L) that the members give together."""
+        """Return the combined probabilities (B, L) of the members."""
         chances = self._chances.get(touches_hash(touches))
         if chances is None:
             raise InputError("no member takes these touches")
@@ -38,9 +38,9 @@ class _Known:
 
 
 def decisions(chances: Tensor, task: Task) -> Tensor:
-    """Return what members decide, (M, B, L), 0 or 1, from their probabilities (M, B, L).
+    """Return the predicted classes of members, (M, B, L), 0 or 1, from their probabilities (M, B, L).
 
-    Of a direction, cosines of length 1.
+    Cosines of a direction are normalised to length 1.
     """
     if task.kind == "exclusive":
         return torch.nn.functional.one_hot(chances.argmax(-1), chances.shape[-1]).float()
@@ -66,7 +66,7 @@ def average(chances: Tensor, task: Task) -> Tensor:
 def disagreement(chances: Tensor, task: Task) -> dict[str, float]:
     """Return the shares of touches on which members (M, B, L) differ: per label, and ``any`` of them.
 
-    A direction is left out: no two members say the same.
+    A direction is omitted, because the predictions of two members are never equal.
     """
     decided = decisions(chances, task)[..., : len(task.binary)]
     differs = decided.amax(0) != decided.amin(0)
@@ -75,7 +75,7 @@ def disagreement(chances: Tensor, task: Task) -> dict[str, float]:
 
 
 WAYS: dict[str, Way] = {"ensemble_vote": vote, "ensemble_average": average}
-"""Row -> how it makes one answer of the members'."""
+"""Row -> function that combines the predictions of the members."""
 
 
 def combine(
@@ -114,7 +114,7 @@ def combine(
 
 @dataclass(frozen=True)
 class _Asked:
-    """What the members answered: digest of touches -> (M, B, L); and column -> who did not, and why."""
+    """Predictions of the members: digest of touches -> (M, B, L); and column -> members left out, and why."""
 
     device: AbstractDevice
     chances: dict[str, Tensor]
@@ -122,7 +122,7 @@ class _Asked:
 
 
 def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: AbstractDevice) -> _Asked:
-    """Bring every member back and ask it about every column, of which it takes all sets or none."""
+    """Restore each member and predict each column; a member predicts all sets of a column or none."""
     settings = members[0][0].evaluation
     sets = {column: _drawn(drawn) for column, drawn in columns(device, settings).items()}
     sets["alarm"] = [threshold_gestures(device, settings)]
@@ -143,7 +143,7 @@ def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: Abstra
 
 
 def _drawn(sets: Iterator[Touches]) -> list[Touches]:
-    """Return all sets of a column; none where the sensors make no other layout, which the evaluation says."""
+    """Return all sets of a column; none if the sensors have no other layout, which the evaluation reports."""
     try:
         return list(sets)
     except InputError:

@@ -39,7 +39,7 @@ class Planned:
 
 
 def train_study(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]]:
-    """Train what a study lacks, and return where its runs are, and all of them."""
+    """Train the missing runs of a study, and return its store and all its runs."""
     every = variants(study, smoke)
     store = Store.open(next(iter(every[0].configs.values())).tracking)
     if study.train and any(one.run is None for one in _look(store, every)):
@@ -50,7 +50,7 @@ def train_study(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]
 
 
 def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
-    """Return finished runs: the one that is named, or the newest ones of rows on the simulator of ``config``.
+    """Return finished runs: the named one, or the newest ones of rows on the simulator of ``config``.
 
     Runs of a row whose names differ in more than the seed are different variants.
 
@@ -85,7 +85,7 @@ def newest_finished(store: Store, config: DictConfig, **further: str) -> Run | N
 
 
 def multirun(line: Sequence[str]) -> None:
-    """Train what a line of overrides sweeps, as ``skin train -m`` does; failed runs are told and left out."""
+    """Train the sweep of some overrides, as ``skin train -m`` does; failed runs are reported and skipped."""
     sources = HydraConfig.get().runtime.config_sources
     folder = [one.path for one in sources if one.provider == "command-line"]  # of --config-dir
     with _another_command():
@@ -118,7 +118,7 @@ def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
 
 
 def _ensembles(study: Study, store: Store, members: Sequence[Planned]) -> list[Planned]:
-    """Let the finished runs of each seed decide together, in each way that the study names."""
+    """Return the ensembles of the finished runs of each seed, in each way that the study names."""
     suffix = "" if study.rows is None else "_of_" + "_".join(study.rows)
     ways = {way: Variant(way, {"row": way}, {}) for way in study.ensembles}
     planned = []

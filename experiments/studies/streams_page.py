@@ -1,4 +1,4 @@
-"""Files and one line on an evaluation on streams."""
+"""Page and summary of an evaluation on streams."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ def build_streams_page(found: WindowReport, title: str) -> Page:
 
 
 def streams_summary(found: WindowReport) -> str:
-    """Return what matters most, in one line."""
+    """Return a summary in one line."""
     parts = []
     if found.bins:
         first, last = found.bins[0], found.bins[-1]

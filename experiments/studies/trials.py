@@ -1,4 +1,4 @@
-"""Trials: what a study measures of its runs, under each condition, on each device; kept in MLflow."""
+"""Trials: results of a study for its runs, under each condition, on each device, stored in MLflow."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from skin.trained import Trained, load_trained
 
 @dataclass(frozen=True)
 class Trial:
-    """What was measured of one run under one condition on one device.
+    """Results for one run under one condition on one device.
 
     Attributes:
         variant: of the run.
@@ -52,10 +52,10 @@ class Trial:
 def run_trials(
     store: Store, planned: Planned, study: Study, config: DictConfig, folder: Path
 ) -> Iterator[Trial]:
-    """Yield what a study measures of a run; what was measured before is read from MLflow.
+    """Yield the results of a study for a run; earlier results are read from MLflow.
 
     Args:
-        store: where the run is, and where what is measured is logged beside it.
+        store: of the run; results are logged there.
         planned: the run.
         study: what to measure.
         config: of the command.
@@ -84,7 +84,7 @@ def run_trials(
 
 
 class _Run:
-    """A finished run, brought back at most once."""
+    """A finished run, which is restored at most once."""
 
     def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
         self.store, self.run, self.config = store, run, config
@@ -98,7 +98,7 @@ class _Run:
         return load_trained(self.store, self.run, validate_config(self.stored), self.stored)
 
     def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
-        """Return the run of MLflow that holds what a study measures on the device that overrides change."""
+        """Return the MLflow run with the results of a study on the device that the overrides describe."""
         own = apply_overrides(self.stored, compose("train", [*base, *line]), line)
         what = study.measure or Accuracy()
         asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]

@@ -1,4 +1,4 @@
-"""Refuse what does not fit into memory before it is allocated."""
+"""Check that arrays fit into memory before they are allocated."""
 
 import psutil
 
@@ -6,15 +6,15 @@ from skin.errors import InputError
 
 
 def require_memory(needed: float, what: str, mend: str) -> None:
-    """Raise unless ``needed`` bytes are free on this machine.
+    """Raise InputError unless ``needed`` bytes of memory are available.
 
     Args:
         needed: estimate, bytes.
-        what: what needs it, the subject of the sentence.
-        mend: what to give instead.
+        what: subject of the error message.
+        mend: end of the error message: what to set instead.
 
     Raises:
-        InputError: the estimate passes what is available.
+        InputError: the estimate exceeds the available memory.
     """
     available = psutil.virtual_memory().available
     if needed > available:

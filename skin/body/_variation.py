@@ -10,7 +10,7 @@ from skin.rng import Stream, generator
 def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
     """Return independent log-normal numbers with mean 1 and standard deviation ``variation``.
 
-    Without variation they are 1 to the last bit.
+    Without variation they are exactly 1.
     """
     spread = math.sqrt(math.log1p(variation**2))
     values = np.exp(spread * generator(Stream.MODULUS, seed).standard_normal(shape) - spread**2 / 2)
@@ -24,8 +24,8 @@ def along(field: np.ndarray, cell: tuple[float, float], first: np.ndarray, secon
     Args:
         field: (H, W).
         cell: extent (x, y) of a cell, m.
-        first: where the lines begin, (n, 2), m.
-        second: where they end, (n, 2), m; elsewhere than they begin.
+        first: start points of the lines, (n, 2), m.
+        second: end points, (n, 2), m, different from the start points.
     """
     rows, columns = field.shape
     crossings = []

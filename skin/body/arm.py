@@ -16,23 +16,23 @@ from skin.settings import checked
 @checked("body")
 @dataclass(frozen=True)
 class Arm(AbstractBody):
-    """Layers glued around a hard core, over a part of its circumference: a sheet rolled up (docs/adr/0010).
+    """Layers on a rigid cylinder, over a part of its circumference: a rolled-up sheet (docs/adr/0010).
 
-    The chart is the outer surface unrolled: x runs around the arm, y along it. So distances between places
-    on the surface are those of the chart; deeper down, an arc over the same x is shorter. In space y is the
-    arm's axis, and the middle of the sleeve is on top, along z.
+    The chart is the unrolled outer surface: x runs around the arm, y along it. Distances on the surface are
+    those of the chart; below the surface an arc over the same x is shorter. In space y is the axis of the
+    arm, and the middle of the sleeve is at the top, along z.
 
     Attributes:
         radius: of the outer surface, m.
         length: of the sleeve along the arm, m.
-        angle: that the sleeve covers, rad; less than a full turn: a closed sleeve has no edge.
+        angle: of the sleeve, rad; less than a full turn.
         size: (radius * angle, length), m.
         cells, layers, variation, variation_seed: as in :class:`skin.body.base.AbstractBody`; layers from the
             core outwards.
 
     Raises:
-        InputError: as in :class:`skin.body.base.AbstractBody`, and a sleeve that closes, or layers that
-            leave no core.
+        InputError: as in :class:`skin.body.base.AbstractBody`, and a closed sleeve, or layers that are
+            thicker than the radius.
     """
 
     size: tuple[float, float] = field(init=False)

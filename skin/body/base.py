@@ -40,28 +40,26 @@ class Layer:
 
 @dataclass(frozen=True)
 class AbstractBody(ABC):
-    """Layers glued to something hard, cut into equal cells, seen through a chart of their surface.
+    """Layers on a rigid base, divided into equal cells, with a chart of their surface.
 
-    In the chart the surface is a rectangle: x runs to the right, y downwards, both along the surface from
-    the upper left corner; z is the depth below it. Positions, pressures and pictures are in the chart; only
-    three-dimensional mechanics and pictures in space ask where that is (:meth:`place`, :meth:`frame`).
+    In the chart the surface is a rectangle: x runs to the right, y downwards, both along the surface from the
+    upper left corner; z is the depth below it. Positions, pressures and images are in the chart. Only
+    three-dimensional mechanics and plots use positions in space (:meth:`place`, :meth:`frame`).
 
     Attributes:
         size: extent (x, y) along the surface, m.
         cells: number of cells (along x, along y); a pressure on the body is (..., H, W) with H = cells[1]
             and W = cells[0].
-        layers: from the table up (or whatever they are glued to). A configuration gives each as
-            ``{material, thickness}``, with the material as in :meth:`skin.material.Material.of` and the
-            thickness in m.
-        variation: standard deviation of Young's modulus from cell to cell of each layer, as a share of the
-            layer's own, which stays its mean (log-normal, independent, so never below 0); 0: the same
-            everywhere. Another mesh is another draw.
-        variation_seed: what the moduli are drawn from.
-        flat: whether the chart is the body itself, so that plates lie in it.
+        layers: from the base up. A configuration gives each as ``{material, thickness}``, with the material
+            as in :meth:`skin.material.Material.of` and the thickness in m.
+        variation: standard deviation of Young's modulus between the cells of a layer, relative to the mean
+            (independent, log-normal); 0: uniform. Another mesh gives another draw.
+        variation_seed: of the moduli.
+        flat: whether the body is flat, so that the chart is the body itself.
 
     Raises:
         InputError: a size or thickness that is not positive, fewer than two cells along a side, no layer, an
-            unknown material, a variation below 0, or more cells than memory allows.
+            unknown material, a variation below 0, or more cells than fit into memory.
     """
 
     size: tuple[PositiveFloat, PositiveFloat]
@@ -83,7 +81,7 @@ class AbstractBody(ABC):
         )
 
     def resized(self, size: tuple[float, float]) -> str:
-        """Return the overrides that give the body an extent (x, y), m, for a person to type."""
+        """Return the overrides that set the extent (x, y) of the body, m."""
         return f"body.size=[{size[0]:g},{size[1]:g}]"
 
     @abstractmethod
@@ -114,21 +112,21 @@ class AbstractBody(ABC):
 
     @cached_property
     def interfaces(self) -> tuple[float, ...]:
-        """Depth below the surface of each layer's upper face, m, from the table up; the last is 0.
+        """Depth below the surface of each layer's upper face, m, from the base up; the last is 0.
 
-        The table itself is no interface: nothing moves there.
+        The base is not included, because it is fixed.
         """
         above = [layer.thickness for layer in self.layers[1:]]
         return tuple(math.fsum(above[level:]) for level in range(len(self.layers)))
 
     @property
     def sensor_depth(self) -> float:
-        """Where sensors lie by default, m: under the top layer; on the surface of a single layer."""
+        """Default depth of sensors, m: below the top layer, or on the surface of a single layer."""
         return self.interfaces[-2] if len(self.layers) > 1 else 0.0
 
     @cached_property
     def moduli(self) -> np.ndarray:
-        """Young's modulus of each cell over that of its layer, (layers, H, W), from the table up."""
+        """Young's modulus of each cell divided by that of its layer, (layers, H, W), from the base up."""
         return factors(self.variation, self.variation_seed, (len(self.layers), *self.shape))
 
     @property
@@ -137,14 +135,14 @@ class AbstractBody(ABC):
         return sum(layer.material.young * layer.thickness for layer in self.layers)
 
     def stiffness(self, first: np.ndarray, second: np.ndarray, width: float) -> np.ndarray:
-        """Return how stiff strips of the body between places are along themselves, (n,), N/m.
+        """Return the axial stiffness of strips of the body between two points, (n,), N/m.
 
-        That is the layers' E h, averaged along the straight line where the modulus varies, times w / d.
+        It is the sum of E h over the layers, averaged along the line between the points, times w / d.
 
         Args:
-            first: where the strips begin, (n, 3), m.
-            second: where they end, (n, 3), m; elsewhere than they begin.
-            width: w of every strip, m.
+            first: start points of the strips, (n, 3), m.
+            second: end points, (n, 3), m, different from the start points.
+            width: w of the strips, m.
         """
         per_layer = [layer.material.young * layer.thickness for layer in self.layers]
         per_cell = np.tensordot(per_layer, self.moduli, axes=1)
@@ -152,9 +150,9 @@ class AbstractBody(ABC):
         return tension * width / np.linalg.norm(second - first, axis=1)
 
     def footprint_areas(self, sensors: "Sensors") -> np.ndarray:
-        """Return the area that each sensor's footprint shares with each cell, (S, H*W), m^2.
+        """Return the overlap of each sensor's footprint with each cell, (S, H*W), m^2.
 
-        A footprint that passes the body's edge is cut there.
+        A footprint beyond the edge of the body is clipped.
         """
         along_x, along_y = (
             overlaps(
@@ -170,14 +168,14 @@ class AbstractBody(ABC):
         """Return weights (S, H*W) that sum to 1 per sensor.
 
         ``footprints(sensors) @ pressure.reshape(H * W)`` is the mean pressure over each sensor's footprint,
-        Pa; cells that it covers in part weigh by area.
+        Pa; partly covered cells are weighted by area.
         """
         areas = self.footprint_areas(sensors)
         return areas / areas.sum(axis=1, keepdims=True)
 
 
 def overlaps(edges: np.ndarray, centres: np.ndarray, extent: float) -> np.ndarray:
-    """Return the length that intervals share with the cells between consecutive edges.
+    """Return the overlap of intervals with the cells between consecutive edges.
 
     Args:
         edges: (n + 1,), ascending, m.
@@ -192,14 +190,14 @@ def overlaps(edges: np.ndarray, centres: np.ndarray, extent: float) -> np.ndarra
 
 
 def _layers(given: Sequence[Layer | Mapping[str, Any]]) -> tuple[Layer, ...]:
-    """Return the layers from the table up.
+    """Return the layers from the base up.
 
     Raises:
         InputError: no layer, or one that cannot be used.
     """
     if not isinstance(given, Sequence) or isinstance(given, str) or not given:
         raise InputError(
-            f"body.layers must list at least one layer from the table up, got {given}: "
+            f"body.layers must list at least one layer from the base up, got {given}: "
             "as in body.layers=[{material: EcoFlex 00-30, thickness: 0.005}]"
         )
     return tuple(

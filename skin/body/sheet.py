@@ -1,4 +1,4 @@
-"""A flat sheet of silicone layers on a table."""
+"""A flat sheet of silicone layers on a rigid base."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,9 +12,9 @@ from skin.settings import checked
 @checked("body")
 @dataclass(frozen=True)
 class Sheet(AbstractBody):
-    """A rectangular sheet of layers, glued to a table: its chart is the sheet itself, seen from above.
+    """A rectangular sheet of layers on a rigid base; its chart is the sheet seen from above.
 
-    Space has the chart's x and y, and z up from the surface.
+    In space x and y are those of the chart, and z points up from the surface.
     """
 
     flat: ClassVar[bool] = True

@@ -1,1 +1,1 @@
-"""How time is folded: each module is one choice of ``fusion=``."""
+"""Fusion of the frames of a window: each module is one choice of ``fusion=``."""

@@ -1,4 +1,4 @@
-"""How a sequence of embeddings becomes one."""
+"""Heads: modules that reduce a sequence of embeddings to one."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -54,7 +54,7 @@ class AttentionGru(nn.Module):
 
 
 def positions(length: int, width: int) -> Tensor:
-    """Return sines and cosines (length, width) that tell frames apart (Vaswani et al., 2017, section 3.5).
+    """Return sinusoidal position encodings (length, width) (Vaswani et al., 2017, section 3.5).
 
     Column 2i of frame t is sin(t / 10000^(2i / width)), column 2i + 1 its cosine; ``width`` is even.
     """
@@ -64,9 +64,9 @@ def positions(length: int, width: int) -> Tensor:
 
 
 class TransformerHead(nn.Module):
-    """The mean over time of what two layers of self-attention make of the frames.
+    """Two layers of self-attention over the frames, and the mean over time.
 
-    Positions are computed, not learnt, so that windows of other lengths are taken too.
+    Position encodings are sinusoidal instead of learned, so that windows of any length are accepted.
     """
 
     def __init__(self, width: int, hidden: int) -> None:
@@ -83,7 +83,7 @@ class TransformerHead(nn.Module):
 class Residual(nn.Module):
     """Four residual convolutions over five frames each; the mean and the maximum over time.
 
-    Takes its time to see 19 frames around every frame, and forgets when in the window they were.
+    The receptive field is 19 frames. The output does not depend on the position in the window.
     """
 
     def __init__(self, width: int, hidden: int) -> None:
@@ -113,4 +113,4 @@ HEADS: dict[Head, Callable[[int, int], nn.Module]] = {
     "residual": Residual,
     "transformer": TransformerHead,
 }
-"""Each makes a module (B, T, E) -> (B, ``module.width``) from E and the width of its hidden layer."""
+"""Name -> function of E and the hidden width that returns a module (B, T, E) -> (B, ``module.width``)."""

@@ -1,4 +1,4 @@
-"""What a fusion is: it folds time, so that a model need not know of it."""
+"""The interface of fusions, which combine the frames of a window; models process single frames."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,16 +12,16 @@ from skin.representation.base import Frames
 
 
 class MakeModel(Protocol):
-    """A model short of what the data decide."""
+    """A model without the arguments that the data decide."""
 
     def __call__(self, kind: Kind, shape: Sequence[int]) -> AbstractModel: ...
 
 
 class AbstractFusion(nn.Module, ABC):
-    """Makes one embedding of a window of frames.
+    """Computes one embedding of a window of frames.
 
-    Built as ``cls(model, kind, shape, window, **options)``: the model short of its shapes, what the
-    representation yields, the shape of one frame and the number of frames.
+    Built as ``cls(model, kind, shape, window, **options)``: the model without its shapes, the kind of
+    representation, the shape of one frame and the number of frames.
 
     Attributes:
         width: E, the width of the embedding.
@@ -31,10 +31,10 @@ class AbstractFusion(nn.Module, ABC):
 
     @staticmethod
     def common(adjacency: Tensor | None) -> Tensor | None:
-        """Return the graph of all frames, (S, S), if there is one.
+        """Return the graph that all frames share, (S, S), if there is one.
 
         Raises:
-            InputError: every frame has its own.
+            InputError: each frame has its own graph.
         """
         if adjacency is not None and adjacency.ndim > 2:
             raise InputError("one graph per frame needs fusion=late, or representation.positions=layout")
@@ -45,5 +45,5 @@ class AbstractFusion(nn.Module, ABC):
         """Return the embeddings (B, E) of windows.
 
         Raises:
-            InputError: the window has another length than the weights are made for.
+            InputError: the length of the window does not fit the weights.
         """

@@ -13,12 +13,12 @@ from skin.representation.base import Frames
 class Early(AbstractFusion):
     """Stacks the frames as channels of one image or as features of one graph (report, 3.2.2 and 3.2.3).
 
-    Fast, since the model runs once per window; but every frame has weights of its own, so the length of the
-    window is fixed and a touch that comes later looks like another touch.
+    It is fast, because the model runs once per window. Each frame has its own weights, so the length of the
+    window is fixed, and the model is not invariant to shifts in time.
 
     Args:
-        model: short of its shapes.
-        kind: what the representation yields.
+        model: without its shapes.
+        kind: kind of representation.
         shape: of one frame: (C, H, W), (S, F) or (F,).
         window: number of frames.
     """
@@ -31,7 +31,7 @@ class Early(AbstractFusion):
         self.width = self.model.width
 
     def forward(self, frames: Frames) -> Tensor:
-        """Return the embeddings (B, E) of windows of the length that was built for."""
+        """Return the embeddings (B, E) of windows of the length given at construction."""
         x, adjacency = frames.x, self.common(frames.adjacency)
         if x.shape[1] != self.window:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Every frame by itself, then a head over time."""
+"""A model on each frame, then a head over time."""
 
 from collections.abc import Sequence
 
@@ -14,15 +14,15 @@ from skin.settings import checked
 
 @checked("fusion")
 class Late(AbstractFusion):
-    """Encodes every frame with the same weights and folds the embeddings (report, sections 3.2.4 and 3.2.5).
+    """Encodes each frame with the same weights and combines the embeddings (report, 3.2.4 and 3.2.5).
 
-    Takes windows of any length. The model runs once per frame, so it costs what the window is long.
+    Accepts windows of any length. The model runs once per frame, so the cost is proportional to the window.
 
     Args:
-        model: short of its shapes.
-        kind: what the representation yields.
+        model: without its shapes.
+        kind: kind of representation.
         shape: of one frame: (C, H, W), (S, F) or (F,).
-        window: number of frames; any other length is taken too.
+        window: number of frames; any other length is accepted too.
         head: over time: mean, max, conv, lstm, gru, attention+gru or transformer.
         hidden: width of the head, where it has weights; of a transformer a multiple of 4.
 

@@ -1,4 +1,4 @@
-"""All frames as one big graph."""
+"""All frames as one graph with edges in time."""
 
 from collections.abc import Sequence
 
@@ -32,16 +32,16 @@ def link(adjacency: Tensor, window: int) -> Tensor:
 
 
 class Linked(AbstractFusion):
-    """Links every sensor with itself in the following frame and encodes one big graph (report, 3.2.1).
+    """Connects each sensor to itself in the following frame and encodes one graph (report, 3.2.1).
 
-    Takes windows of any length, but news travels one frame per convolution: a shallow network sees almost no
-    time.
+    Accepts windows of any length. Information moves one frame per convolution, so a shallow network has a
+    small receptive field in time.
 
     Args:
-        model: short of its shapes.
+        model: without its shapes.
         kind: must be ``graph``.
         shape: of one frame: (S, F).
-        window: number of frames; any other length is taken too.
+        window: number of frames; any other length is accepted too.
 
     Raises:
         InputError: not a graph.

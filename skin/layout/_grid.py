@@ -1,4 +1,4 @@
-"""Sensors on a regular grid: their places, and which way they face."""
+"""Positions and normals of sensors on a regular grid."""
 
 import math
 from typing import Annotated
@@ -21,8 +21,9 @@ def grid(rows: int, columns: int) -> np.ndarray:
 def rosette(rows: int, columns: int, tilt: float) -> np.ndarray:
     """Return the normals (S, 3) of a grid's sensors, row by row, tilted along +x, +y, -x and -y in turn.
 
-    Each row begins two ways after the one above, so that a sensor's eight neighbours all lean another way
-    than it does, and any two by two of them lean all four: shear along any direction is felt everywhere.
+    Each row is shifted by two directions against the row above. A sensor then differs from its eight
+    neighbours, and each block of two by two sensors has all four directions, so that shear along any
+    direction is sensed everywhere.
 
     Args:
         rows: number of rows (along y).
@@ -31,5 +32,5 @@ def rosette(rows: int, columns: int, tilt: float) -> np.ndarray:
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
     lean = math.sin(tilt) * _WAYS[(column + 2 * row) % 4]
-    # Without a tilt, -0.0 would be another key to stored operators than 0.0.
+    # -0.0 and 0.0 would give different keys of stored operators.
     return np.column_stack([lean + 0.0, np.full(len(lean), math.cos(tilt))])

@@ -1,4 +1,4 @@
-"""The interface of a sensor layout, and the check that sensors fit where it puts them."""
+"""The interface of sensor layouts, and checks of sensor positions."""
 
 from abc import ABC, abstractmethod
 
@@ -10,7 +10,7 @@ from skin.errors import InputError
 from skin.sensors import Sensors
 
 Footprint = tuple[PositiveFloat, PositiveFloat]
-"""Extent (x, y) over which a sensor feels, m."""
+"""Extent (x, y) of the sensitive area of a sensor, m."""
 
 # Two sensors closer than this in the plane are at one place, m.
 _APART = 1e-6
@@ -36,14 +36,18 @@ def place(
     footprint: Footprint,
     normals: np.ndarray | None = None,
 ) -> Sensors:
-    """Return sensors at x and y, each (S,), m, and depth, of each or of all; None: ``body.sensor_depth``.
+    """Return sensors at x and y, each (S,), m.
 
-    Their normals (S, 3), unit vectors, are those of the surface if none are given.
+    Args:
+        body: the body.
+        x, y: (S,), m.
+        depth: of all sensors or of each (S,), m; None: ``body.sensor_depth``.
+        footprint: extent (x, y) of the sensitive area, m.
+        normals: (S, 3), unit vectors; None: those of the surface.
 
     Raises:
-        InputError: a depth that is no number, a sensor outside
-            the body or deeper than it, or two sensors at one place in the plane, whatever their depths:
-            images and graphs are flat.
+        InputError: a depth that is not a number, a sensor outside the body, or two sensors with the same x
+            and y, because images and graphs are flat.
     """
     depths = np.asarray(body.sensor_depth if depth is None else depth)
     if depths.dtype.kind not in "if":
@@ -65,7 +69,7 @@ def _inside(body: AbstractBody, positions: np.ndarray) -> None:
             f"{outside.sum()} of {len(positions)} sensors lie outside the body; the first is "
             f"sensor {number + 1} at x = {x:g} m, y = {y:g} m, depth = {depth:g} m, on a surface of "
             f"{extent[0]:g} x {extent[1]:g} m, {extent[2]:g} m thick: positions are in metres from the "
-            "upper left corner; mend the layout, give a larger body or take layout=grid"
+            "upper left corner; correct the layout, set a larger body or layout=grid"
         )
 
 
@@ -76,5 +80,5 @@ def _apart(positions: np.ndarray) -> None:
         x, y, _ = positions[first[0]]
         raise InputError(
             f"sensors {first[0] + 1} and {second[0] + 1} are at one place, x = {x:g} m, y = {y:g} m: "
-            "move one or take it out of the layout"
+            "move one or remove it from the layout"
         )

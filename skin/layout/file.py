@@ -25,19 +25,19 @@ _PLACE = ("x_m", "y_m", "depth_m")
 class File(AbstractLayout):
     """Sensors of a CSV file with the columns ``x_m``, ``y_m`` and optionally ``depth_m``, all m.
 
-    The order of the rows is the order of the readings: that of the hardware's channels. ``normal_x``,
-    ``normal_y`` and ``normal_z``, of any length, say which way a sensor faces, in the local frame (x, y,
-    into the skin); without them it faces the surface. Only ``simulator=solid`` feels tilted sensors. Other
-    columns are ignored.
+    The rows are in the order of the readings, which is that of the hardware's channels. ``normal_x``,
+    ``normal_y`` and ``normal_z``, of any length, are the direction of a sensor in the local frame (x, y,
+    into the skin); the default is the surface normal. Only ``simulator=solid`` supports tilted sensors.
+    Other columns are ignored.
 
     Args:
-        path: the file; a relative path is looked for in the current folder, then beside the package.
-        footprint: extent (x, y) over which a sensor feels, m.
+        path: of the file; a relative path is searched in the current folder, then beside the package.
+        footprint: extent (x, y) of the sensitive area of a sensor, m.
         depth: of all sensors, m, where the file has no ``depth_m``; None: ``body.sensor_depth``.
 
     Raises:
-        InputError: no such file, nothing in it, a column missing, a cell that is no number or a normal
-            without a length, with its line.
+        InputError: a missing or empty file, a missing column, a cell that is not a number, or a normal of
+            length 0, with its line.
     """
 
     def __init__(

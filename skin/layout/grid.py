@@ -12,14 +12,15 @@ from skin.settings import checked
 
 @checked("layout")
 class Grid(AbstractLayout):
-    """Sensors in the middle of equal tiles of the body's surface.
+    """Sensors at the centres of equal tiles of the body's surface.
 
     Args:
         rows: number of rows (along y).
         columns: number of columns (along x).
-        footprint: extent (x, y) over which a sensor feels, m.
-        tilt: angle between each sensor's normal and the surface's, rad: along +x, +y, -x and -y in turn, so
-            that all neighbours feel another direction of shear. Only ``simulator=solid`` feels it.
+        footprint: extent (x, y) of the sensitive area of a sensor, m.
+        tilt: angle between the normals of each sensor and of the surface, rad, along +x, +y, -x and -y in
+            turn, so that neighbours respond to different directions of shear. Only ``simulator=solid``
+            supports it.
         depth: of all sensors, m; None: ``body.sensor_depth``.
 
     Raises:

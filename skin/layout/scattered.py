@@ -15,16 +15,16 @@ from skin.settings import checked
 
 @checked("layout")
 class Scattered(AbstractLayout):
-    """A grid of sensors, each moved at random: what a skin made by hand looks like.
+    """A grid of sensors with random displacements, as in a hand-made skin.
 
     Args:
         rows: number of rows (along y).
         columns: number of columns (along x).
-        jitter: how far a sensor may move along x and y, as a share of the pitch, 0 to 0.5.
-        seed: what the moves are drawn from.
-        footprint: extent (x, y) over which a sensor feels, m.
-        tilt: angle between each sensor's normal and the surface's, rad, as in ``layout=grid``.
-        normals: (S, 3), which way each sensor faces instead; None: as ``tilt`` says.
+        jitter: largest displacement along x and y, as a share of the pitch, 0 to 0.5.
+        seed: of the displacements.
+        footprint: extent (x, y) of the sensitive area of a sensor, m.
+        tilt: angle between the normals of each sensor and of the surface, rad, as in ``layout=grid``.
+        normals: (S, 3), direction of each sensor; None: from ``tilt``.
         depth: of all sensors or of each (S,), m; None: ``body.sensor_depth``.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a learner is: it is fitted to touches and then gives each label's probability."""
+"""The interface of learners, which are fitted to touches and predict the probability of each label."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class AbstractLearner(ABC):
-    """Learns the labels of touches, whether by gradient descent, by boosting or by rules.
+    """Learns the labels of touches, for example by gradient descent, boosting or rules.
 
     Attributes:
         parameters: number of trained parameters, known after ``fit`` or ``load``.
@@ -27,18 +27,18 @@ class AbstractLearner(ABC):
     seconds_per_epoch: float
 
     def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
-        """Raise InputError where it could not be fitted, before anything is logged."""
+        """Raise InputError if the learner cannot be fitted, before anything is logged."""
 
     @abstractmethod
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
-        """Learn from the training split of ``data``, choosing by its validation split only."""
+        """Fit to the training split of ``data``; model selection uses its validation split only."""
 
     @abstractmethod
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L), for touches of any layout that can be taken."""
+        """Return the probability of each label, (B, L), for touches of any supported layout."""
 
     def embeddings(self, touches: Touches) -> Tensor:
-        """Return what the encoder makes of touches, (B, E).
+        """Return the embeddings of touches, (B, E).
 
         Raises:
             InputError: this learner has no encoder.
@@ -51,4 +51,4 @@ class AbstractLearner(ABC):
 
     @abstractmethod
     def load(self, data: "TouchData", path: Path) -> None:
-        """Take what ``save`` wrote; ``data`` gives the shapes as in ``fit``."""
+        """Load the file that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""

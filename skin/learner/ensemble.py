@@ -18,17 +18,18 @@ if TYPE_CHECKING:
 
 
 class Ensemble(AbstractLearner):
-    """Trains its members on the same touches, each from a seed of its own, and averages what they say.
+    """Trains its members on the same touches, each with its own seed, and averages their probabilities.
 
-    Members that err in different ways (trees and networks) gain most. Takes what every member takes.
+    Members with different errors (trees and networks) improve most. It accepts the touches that all members
+    accept.
 
     Args:
-        members: name -> a learner short of its seed.
-        copies: name -> how many of it, each from another seed; 1 where nothing is said.
-        seed: member number i learns from seed 1000 ``seed`` + i.
+        members: name -> a learner without its seed.
+        copies: name -> number of copies, each with another seed; 1 by default.
+        seed: member number i has the seed 1000 ``seed`` + i.
 
     Raises:
-        InputError: no member, or copies of one that is not there.
+        InputError: no member, or copies of an unknown member.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class Ensemble(AbstractLearner):
         self._members = [make(seed=1000 * seed + number) for number, make in enumerate(makers)]
 
     def check(self, data: "TouchData") -> None:
-        """Ask every member."""
+        """Check every member."""
         for member in self._members:
             member.check(data)
 
@@ -72,7 +73,7 @@ class Ensemble(AbstractLearner):
         return whole
 
     def load(self, data: "TouchData", path: Path) -> None:
-        """Take what ``save`` wrote."""
+        """Load the folder that :meth:`save` wrote."""
         for number, member in enumerate(self._members):
             (file,) = (Path(path) / str(number)).iterdir()
             member.load(data, file)

@@ -1,4 +1,4 @@
-"""Learning by gradient descent."""
+"""Neural networks, trained by gradient descent."""
 
 import os
 import warnings
@@ -31,19 +31,19 @@ CHUNK = 64  # touches at a time when predicting: fastest, and bounds memory to a
 
 
 class Network(AbstractLearner):
-    """Trains ``fusion(model)`` on frames and keeps the weights of the best validation loss.
+    """Trains ``fusion(model)`` on frames and keeps the weights with the lowest validation loss.
 
     Args:
-        model: short of kind and shape.
-        fusion: short of model, kind, shape and window.
-        optimizer: short of the parameters.
+        model: without kind and shape.
+        fusion: without model, kind, shape and window.
+        optimizer: without the parameters.
         trainer: settings of pytorch_lightning.Trainer: max_epochs, accelerator, ...
         hidden: widths of the dense layers between embedding and labels.
         activation: relu, elu or silu, after each of them.
-        warmup: share of the training in which the learning rate rises to the optimizer's; it then falls to
-            nothing along a cosine. None keeps it constant.
-        dropout: share of the embedding and of the dense layers that is dropped in training.
-        seed: of weights, dropout and nothing else; the caller's random state is left as it was.
+        warmup: share of the training in which the learning rate rises to that of the optimizer; it then
+            decays to 0 along a cosine. None: constant.
+        dropout: probability of dropout for the embedding and the dense layers.
+        seed: of weights and dropout only; the global random state does not change.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Network(AbstractLearner):
         self._classifier: TouchClassifier | None = None
 
     def check(self, data: "TouchData") -> None:
-        """Build network, optimizer and trainer for nothing: what does not fit shows at once."""
+        """Build network, optimizer and trainer once, so that errors in the settings are reported early."""
         with torch.random.fork_rng():
             network = self.build(data)
         self._trainer_of(None, [])
@@ -79,9 +79,9 @@ class Network(AbstractLearner):
             raise InputError(f"the optimizer refuses its settings: {error}") from error
 
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
-        """Train on the training split; validation chooses the epoch.
+        """Train on the training split; the validation loss chooses the epoch.
 
-        Where several processes train together, only the first has what was learned.
+        With several processes, only the first has the trained weights.
 
         Raises:
             InputError: the choices do not fit each other or the data.
@@ -135,15 +135,15 @@ class Network(AbstractLearner):
         return trainer
 
     def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L), for touches of any layout that the model takes."""
+        """Return the probability of each label, (B, L), for touches of any layout that the model accepts."""
         from skin.classifier import probabilities
 
         return self._map(touches, lambda of, frames: probabilities(of(frames), of.task))
 
     def embeddings(self, touches: Touches) -> Tensor:
-        """Return what the fusion makes of touches, (B, E): the input of the dense layers.
+        """Return the embeddings of touches, (B, E), which are the input of the dense layers.
 
-        Takes touches of any layout that the model takes, as :meth:`probabilities` does.
+        Accepts the same touches as :meth:`probabilities`.
 
         Raises:
             RuntimeError: before ``fit`` or ``load``.
@@ -151,7 +151,7 @@ class Network(AbstractLearner):
         return self._map(touches, lambda of, frames: of.fusion(frames))
 
     def _map(self, touches: Touches, function: "Callable[[TouchClassifier, Frames], Tensor]") -> Tensor:
-        """Return what a function of the classifier and frames gives, (B, ...), a chunk at a time."""
+        """Return a function of the classifier and frames, (B, ...), computed in chunks."""
         if self._classifier is None or self._data is None:
             raise RuntimeError("fit or load the learner first")
         classifier = self._classifier.eval()
@@ -173,11 +173,11 @@ class Network(AbstractLearner):
         return path
 
     def load(self, data: "TouchData", path: Path) -> None:
-        """Take the weights that ``save`` wrote; ``data`` gives the shapes as in ``fit``."""
+        """Load the weights that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
         self.build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
 
     def build(self, data: "TouchData") -> "TouchClassifier":
-        """Make the untrained network for the frames that ``data`` gives, from torch's random state.
+        """Return the untrained network for the frames of ``data``, drawn from torch's random state.
 
         Raises:
             InputError: the choices do not fit each other or the data.
@@ -203,10 +203,10 @@ class Network(AbstractLearner):
 
 
 def _check(trainer: "Trainer") -> None:
-    """Refuse what Lightning takes and this program cannot do.
+    """Check for settings that Lightning accepts and this program does not support.
 
     Raises:
-        InputError: naming what it can.
+        InputError: an unsupported setting.
     """
     from pytorch_lightning.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
 

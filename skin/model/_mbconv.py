@@ -17,7 +17,7 @@ def unit(
 
 
 class SqueezeExcitation(nn.Module):
-    """Weights each channel by what a small network makes of all channels' means (Hu et al., 2018)."""
+    """Weights each channel by a small network of all channels' means (Hu et al., 2018)."""
 
     def __init__(self, channels: int, squeezed: int) -> None:
         super().__init__()

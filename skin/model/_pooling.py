@@ -1,4 +1,4 @@
-"""How the nodes of a graph become one vector.
+"""Poolings: modules that reduce the nodes of a graph to one vector.
 
 PyTorch Geometric's aggregations take 2.9 (max), 1.0 to 1.5 (mean), 1.1 to 1.2 (attention) and 1.0 to 1.3
 (set2set) times as long as these, and 0.7 s to import (experiments/benchmarks/layers.py).
@@ -17,7 +17,7 @@ STEPS = 3  # of Set2Set
 
 
 class Reduced(nn.Module):
-    """What torch's ``amax`` or ``mean`` makes of one dimension; it has no weights.
+    """A reduction over one dimension, such as ``torch.amax``, without weights.
 
     Args:
         width: E, of the last dimension.
@@ -74,4 +74,4 @@ POOLINGS: dict[Pooling, Callable[[int], nn.Module]] = {
     "attention": Attention,
     "set2set": Set2Set,
 }
-"""Each makes a module (S, N, E) -> (N, ``module.width``) from E."""
+"""Name -> function of E that returns a module (S, N, E) -> (N, ``module.width``)."""

@@ -1,4 +1,4 @@
-"""What a model is: an encoder of frames that knows nothing of time."""
+"""The interface of models: encoders of single frames."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar, Literal
@@ -11,20 +11,20 @@ Kind = Literal["image", "graph", "readings"]
 
 
 class AbstractModel(nn.Module, ABC):
-    """Encodes frames one by one; how they follow each other is the matter of ``fusion``.
+    """Encodes single frames; the fusion combines them over time.
 
-    Built as ``cls(kind, shape, **options)`` with the kind of frame and the shape of one frame, both known
-    from the representation only.
+    Built as ``cls(kind, shape, **options)`` with the kind and the shape of one frame, which the
+    representation decides.
 
     Args:
-        kind: what the representation yields.
+        kind: kind of representation.
 
     Attributes:
-        takes: the kind of frame that the model can encode.
+        takes: the kind of frame that the model encodes.
         width: E, the width of the embedding.
 
     Raises:
-        InputError: the model does not take this kind.
+        InputError: the model does not accept this kind.
     """
 
     takes: ClassVar[Kind]
@@ -44,5 +44,5 @@ class AbstractModel(nn.Module, ABC):
 
         Args:
             x: images (N, C, H, W), graphs (N, S, F) or readings (N, F).
-            adjacency: (S, S) or (N, S, S), normalised; None where there is no graph.
+            adjacency: (S, S) or (N, S, S), normalised; None without a graph.
         """

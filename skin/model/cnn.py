@@ -18,15 +18,15 @@ SPARSE = 32  # images with fewer than one active pixel in so many go the short w
 class Cnn(AbstractModel):
     """Blocks of 3x3 convolution, 2x2 max pooling, ReLU and spatial dropout (report, 3.2.3 and 3.2.5).
 
-    Takes any layout with the same weights. Images that are zero but for a few pixels
-    (``representation=image``) take an exact short cut; see :mod:`skin.model._sparse`.
+    Accepts any layout with the same weights. Sparse images (``representation=image``) are computed by a
+    faster, exact method; see :mod:`skin.model._sparse`.
 
     Args:
         kind: must be ``image``.
         shape: (C, H, W).
         channels: of the blocks.
-        repeat: how many times the image is fed to the first block. The report feeds it three times; that is
-            one convolution with summed weights, and so it is computed.
+        repeat: number of copies of the image in the input of the first block, 3 in the report; computed as
+            one convolution with summed weights.
         embedding: width of a dense layer on the flattened blocks; None: the flattened blocks are the
             embedding.
         dropout: share of channels dropped after each block in training.

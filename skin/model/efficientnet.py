@@ -29,11 +29,11 @@ CHUNK = 256  # images at a time where no gradient is asked for: bounds memory to
 
 
 class EfficientNet(AbstractModel):
-    """EfficientNet-B0 (Tan and Le, 2019) without its classes: what the report tried first (3.2.5).
+    """EfficientNet-B0 (Tan and Le, 2019) without its classification layer (report, 3.2.5).
 
-    Takes any layout and any size of image with the same weights. Training wants about 9 MB and 5 ms of a core
-    per frame of 64 x 64: without a GPU make the data small (``data.gestures``, ``representation.pixels``) and
-    always the batches (``data.batch_size=8``); frozen it wants a fifth of the time and hardly any memory.
+    Accepts any layout and image size with the same weights. Training needs about 9 MB and 5 ms of a core per
+    frame of 64 x 64. Use small batches (``data.batch_size=8``) and, without a GPU, few data
+    (``data.gestures``, ``representation.pixels``). Frozen weights need a fifth of the time and little memory.
 
     Args:
         kind: must be ``image``.

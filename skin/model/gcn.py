@@ -47,9 +47,9 @@ def _mix(adjacency: Tensor, x: Tensor) -> Tensor:
 
 @checked("model")
 class Gcn(AbstractModel):
-    """Graph convolutions, then one vector per graph (report, sections 3.2.1, 3.2.2 and 3.2.4).
+    """Graph convolutions and a pooling over the nodes (report, sections 3.2.1, 3.2.2 and 3.2.4).
 
-    Takes any layout and any number of sensors with the same weights.
+    Accepts any layout and number of sensors with the same weights.
 
     Args:
         kind: must be ``graph``.

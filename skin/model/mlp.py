@@ -12,13 +12,13 @@ from skin.model.base import AbstractModel, Kind
 
 
 class Mlp(AbstractModel):
-    """Dense layers on the vector of readings: sensors keep their identity, so it serves one layout only.
+    """Dense layers on the vector of readings, for one layout only.
 
     Args:
         kind: must be ``readings``.
         shape: (F,).
-        widths: of the layers; the last one is the embedding. Empty: the readings themselves are the
-            embedding, which leaves all work to the recurrent layer of ``fusion=late``.
+        widths: of the layers; the last one is the embedding. Empty: the readings are the embedding, for a
+            recurrent head of ``fusion=late``.
         activation: relu, elu or silu, after every layer.
     """
 
@@ -38,11 +38,11 @@ class Mlp(AbstractModel):
         """Return the embeddings (N, E) of readings (N, F).
 
         Raises:
-            InputError: another number of readings than the weights are made for.
+            InputError: the number of readings does not fit the weights.
         """
         if x.shape[-1] != self.inputs:
             raise InputError(
                 f"model=mlp is made for {self.inputs} readings per frame, got {x.shape[-1]}: "
-                "train with representation=graph or image, which take other layouts"
+                "train with representation=graph or image, which accept other layouts"
             )
         return self.layers(x)

@@ -15,10 +15,10 @@ from skin.model.base import AbstractModel, Kind
 
 
 class Pyg(AbstractModel):
-    """A network of PyTorch Geometric on the graph of sensors, then one vector per graph.
+    """A network of PyTorch Geometric on the graph of sensors, and a pooling over the nodes.
 
-    Takes any layout and any number of sensors with the same weights. Networks that know weights of edges
-    (GCN) take the graph's; the others see only which sensors are neighbours.
+    Accepts any layout and number of sensors with the same weights. Networks with edge weights (GCN) use those
+    of the graph; the others use only which sensors are neighbours.
 
     Args:
         kind: must be ``graph``.
@@ -27,7 +27,7 @@ class Pyg(AbstractModel):
         width: of the hidden layers and the embedding.
         layers: number of convolutions.
         pooling: over the nodes: max, mean, attention, or set2set, which doubles the width of the embedding.
-        degree: typical number of neighbours; only PNA asks for it.
+        degree: typical number of neighbours; only PNA uses it.
 
     Raises:
         InputError: not a graph, an unknown pooling, or settings that the network does not take.

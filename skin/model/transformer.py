@@ -15,10 +15,10 @@ Pooling = Literal["mean", "max"]
 
 @checked("model")
 class Transformer(AbstractModel):
-    """Lets every sensor attend to every other one, then takes one vector per frame (report, section 3.2.2).
+    """Self-attention between all sensors, and a pooling over them (report, section 3.2.2).
 
-    Takes any layout and any number of sensors with the same weights. It does not look at the edges of the
-    graph and knows of places only what the nodes tell: add ``representation.coordinates=true``.
+    Accepts any layout and number of sensors with the same weights. It does not use the edges of the graph.
+    Add ``representation.coordinates=true`` to give it the positions.
 
     Args:
         kind: must be ``graph``.

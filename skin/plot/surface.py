@@ -15,7 +15,7 @@ from skin.simulator.base import AbstractSimulator
 
 
 def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "vertical") -> np.ndarray:
-    """Return how far every node moves into the skin, (F, layers, ny + 1, nx + 1), m, from the table up.
+    """Return the inward displacement of each node, (F, layers, ny + 1, nx + 1), m, from the base up.
 
     The plates and beams of :class:`skin.simulator.fem.PlatesAndBeams`, solved for the frames themselves and
     not for the sensors: one factorisation, one solve per frame. The table, which does not move, is left out.

@@ -1,4 +1,4 @@
-"""What a representation is: a batched map from readings to what a network takes."""
+"""The interface of representations: batched maps from readings to the input of a network."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar, Literal, NamedTuple
@@ -10,13 +10,12 @@ from skin.recording import Touches
 
 
 class Frames(NamedTuple):
-    """Touches as a network takes them.
+    """The input of a network.
 
     Attributes:
         x: images (B, T, C, H, W), graphs (B, T, S, F), plain readings (B, T, F).
-        adjacency: (S, S) or (B, T, S, S), dense, normalised; None where there is no graph.
-        summary: (B, D), numbers about the whole window, which go to the dense layers; None where the
-            representation gives none.
+        adjacency: (S, S) or (B, T, S, S), dense, normalised; None without a graph.
+        summary: (B, D), features of the whole window for the dense layers; None if there are none.
     """
 
     x: Tensor
@@ -31,8 +30,8 @@ class AbstractRepresentation(nn.Module, ABC):
     (x, y), m. Readings are divided by ``scale``, N; invalid ones become 0.
 
     Attributes:
-        kind: what a model must take: images, graphs or plain readings.
-        windowed: whether what a frame shows depends on the other frames of its window.
+        kind: kind of input that a model must accept: images, graphs or plain readings.
+        windowed: whether a frame depends on the other frames of its window.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]]
@@ -43,19 +42,19 @@ class AbstractRepresentation(nn.Module, ABC):
         """Return the frames of readings (B, T, S), N, and valid (B, T, S), bool."""
 
     def show(self, touches: Touches) -> Frames:
-        """Return the frames of touches; what a touch tells beyond its readings is left aside."""
+        """Return the frames of touches; by default of their readings only."""
         return self(touches.readings, touches.valid)
 
 
 def channels(readings: Tensor, valid: Tensor, scale: float, mask: bool) -> Tensor:
-    """Return what every representation starts from.
+    """Return scaled readings and, optionally, a mask: the common input of all representations.
 
     Args:
         readings: (B, T, S), N.
-        valid: (B, T, S), bool; a reading that is not valid becomes 0, whatever it holds (NaN too).
+        valid: (B, T, S), bool; a reading that is not valid becomes 0, also if it is NaN.
         scale: N; readings are divided by it.
-        mask: append a channel that is 1 where the reading means nothing, so that it is silent where all is
-            well: a channel of ones beside small readings drowns them (docs/results/dead.csv).
+        mask: append a channel that is 1 where the reading is not valid. It is 0 for valid readings, because
+            a constant channel of ones is large beside small readings (docs/results/dead.csv).
 
     Returns:
         (B, T, S, C), with C = 2 under ``mask`` and else 1.

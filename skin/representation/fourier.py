@@ -13,17 +13,16 @@ from skin.settings import checked
 
 @checked("representation")
 class Fourier(AbstractRepresentation):
-    """Shows log(1 + |FFT|) of the sensor image, zero frequency in the middle (report, section 2.2).
+    """Returns log(1 + |FFT|) of the sensor image, zero frequency in the middle (report, section 2.2).
 
-    The report hopes that regular patterns of active sensors become visible; absolute places are lost with the
-    phase.
+    It shows regular patterns of active sensors. Absolute positions are lost with the phase.
 
     Args:
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m.
         pixels: edge length of the image and of its spectrum.
         scale: N; readings are divided by it.
-        mask: append a channel that tells which pixels (not frequencies) hold an invalid reading.
+        mask: append a channel that is 1 at the pixels (not frequencies) of invalid readings.
 
     Raises:
         InputError: ``pixels`` is below 8.

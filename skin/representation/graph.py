@@ -1,4 +1,4 @@
-"""A graph with a sensor at each node and an edge between neighbours."""
+"""A graph of sensors with edges between neighbours."""
 
 from typing import ClassVar, Literal
 
@@ -21,13 +21,13 @@ Positions = Literal["layout", "deformed"]
 
 
 def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarray:
-    """Return which sensors (S, 3), m, are neighbours: (S, S), bool, symmetric, no node its own neighbour.
+    """Return which sensors (S, 3), m, are neighbours: (S, S), bool, symmetric, without self-loops.
 
     ``knn``: one of the two is among the ``count`` nearest of the other. ``delaunay``: they share an edge of
     the Delaunay triangulation in the plane.
 
     Raises:
-        InputError: sensors of which no triangle can be made.
+        InputError: the sensors do not form a triangle.
     """
     linked = np.zeros((len(positions), len(positions)), dtype=bool)
     if edges == "knn":
@@ -48,7 +48,7 @@ def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarra
 
 
 def typical_distance(positions: np.ndarray) -> float:
-    """Return d0, the median distance from a sensor of (S, 3), m, to its nearest neighbour, m."""
+    """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours, m."""
     distance = cdist(positions, positions)
     return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
 
@@ -110,21 +110,21 @@ def normalised(edges: np.ndarray) -> np.ndarray:
 
 
 def self_share(adjacency: Tensor) -> float:
-    """Return which share of its row a node of a normalised adjacency (..., S, S) is itself, on average.
+    """Return the mean diagonal entry of a normalised adjacency (..., S, S).
 
-    Near 1 the graph hardly mixes neighbours, near 1 / S it mixes all.
+    Close to 1 the graph mixes neighbours little; close to 1 / S it mixes all nodes.
     """
     return float(adjacency.diagonal(dim1=-2, dim2=-1).mean())
 
 
 @checked("representation")
 class Graph(AbstractRepresentation):
-    """Makes a sensor a node and links neighbours (report, section 2.2).
+    """Represents sensors as nodes with edges between neighbours (report, section 2.2).
 
-    Needs nothing but positions, so it carries to any layout and any number of sensors. The graph is one dense
-    matrix, normalised once and common to all frames, unless ``positions=deformed`` asks for one per frame
-    (report, section 4.2). Which sensors are linked follows from the layout in any case: neighbours in the
-    material stay neighbours, and an edge that came and went would be a jump. So does the unit d0.
+    It needs positions only and applies to any layout and number of sensors. The adjacency is one dense
+    matrix, normalised once and shared by all frames; with ``positions=deformed`` each frame has its own
+    (report, section 4.2). Edges and the unit d0 always follow from the layout at rest, so that the graph
+    changes continuously.
 
     Args:
         layout: (S, 3), m; by position.
@@ -132,15 +132,15 @@ class Graph(AbstractRepresentation):
         edges: ``knn`` or ``delaunay``; see :func:`neighbours`.
         count: number of nearest neighbours under ``knn``.
         weight: ``exp``, ``distance``, ``stiffness`` or ``none``; see :func:`adjacency`.
-        positions: from where distances are taken: ``layout``, or ``deformed``, where the skin has taken the
-            sensors in each frame. That needs touches that tell it, and a fusion that takes a graph per frame.
+        positions: of the sensors for distances: ``layout``, or ``deformed``, the displaced positions in each
+            frame, which needs touches with displacements and a fusion that accepts a graph per frame.
         coordinates: append x / size_x and y / size_y as the last two node features of every frame.
         scale: N; readings are divided by it.
-        mask: append a node feature that tells whether the reading is valid.
-        body: the skin as it is believed to be; only ``weight=stiffness`` needs it.
+        mask: append a node feature that is 1 where the reading is not valid.
+        body: model of the skin; only ``weight=stiffness`` needs it.
 
     Raises:
-        InputError: an unknown option, or sensors of which the graph cannot be made.
+        InputError: an unknown option, or sensors that do not form a graph.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "graph"
@@ -175,7 +175,7 @@ class Graph(AbstractRepresentation):
         places = layout.cpu().numpy().astype(float)
         weights = adjacency(places, neighbours(places, edges, count), weight, body)
         first, second = np.nonzero(np.triu(weights))
-        # Without a second sensor there is no distance, and no edge that would need one.
+        # A single sensor has no distance and no edges.
         self.unit = typical_distance(places) if len(places) > 1 else 1.0
         self.register_buffer("adjacency", torch.from_numpy(normalised(weights)).to(torch.float32))
         self.register_buffer("layout", torch.from_numpy(places).to(torch.float32))
@@ -190,17 +190,17 @@ class Graph(AbstractRepresentation):
         Args:
             readings: (B, T, S), N.
             valid: (B, T, S), bool.
-            motion: (B, T, S, 3), m, how far each sensor is from its place in the layout; only
+            motion: (B, T, S, 3), m, displacement of each sensor from its place in the layout; only
                 ``positions=deformed`` needs it.
 
         Raises:
-            InputError: the motion is needed and nobody knows it.
+            InputError: the motion is needed and not known.
         """
         places, matrix = self.layout, self.adjacency
         if self.positions == "deformed":
             if motion is None:
                 raise InputError(
-                    "representation.positions=deformed needs touches that tell where the sensors go: add "
+                    "representation.positions=deformed needs touches with displacements of sensors: add "
                     "device.track=oracle simulator.constraint=free, or set representation.positions=layout"
                 )
             places = self.layout + motion
@@ -212,7 +212,7 @@ class Graph(AbstractRepresentation):
         return Frames(x, matrix)
 
     def show(self, touches: Touches) -> Frames:
-        """Return the frames of touches, with the sensors where the touches say that they are."""
+        """Return the frames of touches, with the sensors at their displaced positions if these are known."""
         return self(touches.readings, touches.valid, touches.motion)
 
     def _adjacency_at(self, places: Tensor) -> Tensor:

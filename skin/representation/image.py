@@ -1,4 +1,4 @@
-"""An image that is zero but for one pixel per sensor."""
+"""A sparse image with one pixel per sensor."""
 
 from typing import ClassVar, Literal
 
@@ -13,17 +13,17 @@ from skin.settings import checked
 
 @checked("representation")
 class Image(AbstractRepresentation):
-    """Puts every reading on the pixel of its sensor; all others are 0 (report, section 2.2).
+    """Writes each reading to the pixel of its sensor; all other pixels are 0 (report, section 2.2).
 
-    Needs nothing but positions, so it carries to any layout. Sensors that share a pixel are averaged: a sum
-    would make a crowded place look like a hard press.
+    It needs positions only and applies to any layout. Sensors that share a pixel are averaged, because a sum
+    would depend on the density of sensors.
 
     Args:
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m; the square image covers all of it.
         pixels: edge length of the image; the report tries 48, 64 and 128.
         scale: N; readings are divided by it.
-        mask: append a channel that tells which pixels hold an invalid reading.
+        mask: append a channel that is 1 at the pixels of invalid readings.
 
     Raises:
         InputError: ``pixels`` is below 8.

@@ -21,12 +21,12 @@ Method = Literal["nearest", "linear", "cubic"]
 def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarray:
     """Return the matrix (P, S) that interpolates values at ``points`` (S, 2) to ``targets`` (P, 2).
 
-    Every method is linear in the values, so the images of the S unit readings are its columns: nearest;
-    linear on the Delaunay triangles; cubic after Clough and Tocher. Outside the convex hull the nearest value
-    holds.
+    Methods: nearest; linear on the Delaunay triangles; cubic after Clough and Tocher. All are linear in the
+    values, so the columns of the matrix are the images of unit readings. Outside the convex hull the nearest
+    value is used.
 
     Raises:
-        InputError: points of which no triangle can be made.
+        InputError: the points do not form a triangle.
     """
     unit = np.eye(len(points))
     matrix = NearestNDInterpolator(points, unit)(targets)
@@ -50,8 +50,8 @@ def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarr
 class Interpolation(AbstractRepresentation):
     """Fills the image between the sensors (report, section 2.2 and figure 4).
 
-    One precomputed matrix of (pixels * pixels, S) per method, applied to whole batches. It guesses values
-    where nothing was measured: pleasant to look at; whether it helps a network is a question for the table.
+    One precomputed matrix (pixels * pixels, S) per method is applied to whole batches. The results table
+    shows whether interpolated values help a network.
 
     Args:
         positions: (S, 3), m.
@@ -59,7 +59,7 @@ class Interpolation(AbstractRepresentation):
         method: nearest, linear or cubic, see :func:`weights`; or several of them, each giving one channel.
         pixels: edge length of the image.
         scale: N; readings are divided by it.
-        mask: append where readings are invalid, interpolated, one channel per method.
+        mask: append the interpolated mask of invalid readings, one channel per method.
 
     Raises:
         InputError: an unknown method, none at all, too few sensors for it, or ``pixels`` below 8.

@@ -1,4 +1,4 @@
-"""Readings as they are, one feature per sensor."""
+"""Plain readings, one feature per sensor."""
 
 from typing import ClassVar, Literal
 
@@ -8,15 +8,15 @@ from skin.representation.base import AbstractRepresentation, Frames, channels
 
 
 class Readings(AbstractRepresentation):
-    """Keeps the readings as a vector: the sensors keep their identity, their places are not told.
+    """Returns the readings as a vector with one feature per sensor, without positions.
 
-    The strongest choice on one fixed layout, and of no use on another one.
+    It is the most accurate representation for one fixed layout, and does not apply to another layout.
 
     Args:
         positions: (S, 3), m; only their number matters.
         size: extent (x, y) of the sheet, m; not used.
         scale: N; readings are divided by it (the clip of the report's sensors is 10 N).
-        mask: append one feature per sensor that tells whether its reading is valid.
+        mask: append one feature per sensor that is 1 where its reading is not valid.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]] = "readings"

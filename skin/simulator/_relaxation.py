@@ -1,4 +1,4 @@
-"""Skins that relax: elastic answers at several speeds, joined by first-order lags."""
+"""Viscoelastic skins: elastic solutions at several rates, combined by first-order lags."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -18,23 +18,23 @@ _APART = 1.2
 
 
 def relaxes(body: AbstractBody) -> bool:
-    """Return whether some material of a body relaxes."""
+    """Return whether a body has a viscoelastic material."""
     return any(layer.material.relaxation for layer in body.layers)
 
 
 def elastic(body: AbstractBody, speed: float) -> AbstractBody:
-    """Return the elastic body that answers a load like exp(``speed`` t), 1/s, as the relaxing one does."""
+    """Return the elastic body with the response of the viscoelastic one to a load exp(``speed`` t), 1/s."""
     return replace(
         body, layers=tuple(replace(layer, material=layer.material.elastic(speed)) for layer in body.layers)
     )
 
 
 def times(body: AbstractBody) -> list[float]:
-    """Return the times of the lags, s, ascending: both ends of each material's range, where they differ.
+    """Return the time constants of the lags, s, ascending: both ends of each material's range.
 
-    All times of the exact answer lie between tau and tau (1 + g) of some material: a layer whose strain is
-    held relaxes with the first, one whose stress is held creeps with the second. Ends of a range, or of two
-    ranges, that are closer than a factor of 1.2 count as one; those of creep have precedence.
+    All time constants of the exact solution lie between tau and tau (1 + g) of a material: at constant strain
+    a layer relaxes with the first, at constant stress it creeps with the second. Values closer than a factor
+    of 1.2 are merged, and those of creep take precedence.
     """
     branches = [one for layer in body.layers if (one := layer.material.relaxation) is not None]
     creep = [one.time * (1 + one.strength) for one in branches]
@@ -46,25 +46,25 @@ def times(body: AbstractBody) -> list[float]:
 
 
 def speeds(lags: Sequence[float]) -> list[float]:
-    """Return where the fit is exact, 1/s, one speed per lag: 0, and between each lag and the next."""
+    """Return the collocation points, 1/s, one per lag: 0, and one between each lag and the next."""
     return [0.0, *(1 / math.sqrt(one * other) for one, other in pairwise(lags))]
 
 
 class Relaxing(AbstractSimulator):
-    """Answers movies of pressure as a body does whose materials relax: E(t) = E (1 + g exp(-t / tau)).
+    """Simulates a body with viscoelastic materials, E(t) = E (1 + g exp(-t / tau)).
 
-    By the correspondence principle the answer to exp(s t) is that of the elastic body with the moduli E (1 +
-    g s tau / (1 + s tau)). As a function of s it is met by R_inf + sum_j D_j / (1 + s theta_j), whose terms
-    are lags in time: exact for ever slow and ever fast loads, and at as many speeds between as there are
-    lags left (Schapery's collocation). What a nonlinear reading is made of (equation 10: D_s, D_t and F_in)
-    goes through the lags, and the reading is made of what comes out: the skin's motion of the moment.
+    By the correspondence principle the response to exp(s t) is that of the elastic body with the moduli
+    E (1 + g s tau / (1 + s tau)). As a function of s it is fitted by R_inf + sum_j D_j / (1 + s theta_j),
+    whose terms are first-order lags in time. The fit is exact for very slow and very fast loads and at the
+    collocation points in between (Schapery). For nonlinear readings (equation 10: D_s, D_t and F_in) the
+    linear quantities pass through the lags, and the reading is computed from the result.
 
-    Between frames a load is held as it is at the later one.
+    Between two frames the load is that of the later one.
 
     Args:
         simulator: ``simulator(body, sensors)`` of an elastic body.
-        body: with a material that relaxes.
-        sensors: where the sensors are.
+        body: with a viscoelastic material.
+        sensors: the sensors.
         rate: frames per second, Hz.
 
     Raises:
@@ -87,13 +87,13 @@ class Relaxing(AbstractSimulator):
         self.lags, self.rate = times(body), float(rate)
         at = speeds(self.lags)
         self.models = nn.ModuleList(simulator(elastic(body, speed), sensors) for speed in [*at, math.inf])
-        self._relaxed.linear(torch.zeros(body.shape))  # refused at the door rather than in the first batch
+        self._relaxed.linear(torch.zeros(body.shape))  # raises here instead of in the first batch
         terms = 1 / (1 + np.outer(at, self.lags))
         self.register_buffer("shares", torch.from_numpy(np.linalg.inv(terms)))
 
     @property
     def feels_shear(self) -> bool:  # type: ignore[override]
-        """As the elastic body's."""
+        """That of the elastic body."""
         return self._relaxed.feels_shear
 
     @property
@@ -101,19 +101,19 @@ class Relaxing(AbstractSimulator):
         return self.models[0]  # type: ignore[return-value]
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
-        """Return the response to pressure (..., H, W), Pa, that has always been there."""
+        """Return the steady-state response to pressure (..., H, W), Pa."""
         return self._relaxed(pressure, shear)
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return how far sensors move under pressure that has always been there, (..., S, 3), m."""
+        """Return the steady-state displacement of sensors, (..., S, 3), m."""
         return self._relaxed.motion(pressure, shear)
 
     def compliance(self) -> Tensor:
-        """Return the compliance for pressure that has always been there, (H*W, H*W), m/Pa."""
+        """Return the steady-state compliance, (H*W, H*W), m/Pa."""
         return self._relaxed.compliance()
 
     def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
-        """Return the largest strain under pressure that has always been there, (U,): no load has a larger."""
+        """Return the largest steady-state strain, (U,), an upper bound for all loads."""
         return self._relaxed.strain(pressure, shear)
 
     def play(
@@ -124,7 +124,7 @@ class Relaxing(AbstractSimulator):
         shear: Tensor | None = None,
         displacement: bool = True,
     ) -> Response:
-        """Return the response to movies that begin at rest."""
+        """Return the response to movies with a skin that is initially at rest."""
         parts = [model.linear(frames, shear)[index] * scale[..., None] for model in self.models]  # type: ignore[operator]
         time = torch.arange(index.shape[1], device=scale.device) / self.rate
         felt = parts[-1]

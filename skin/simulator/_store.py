@@ -1,4 +1,4 @@
-"""Arrays that took long to compute, kept on disk under a hash of all that they depend on."""
+"""A cache on disk for computed arrays, with keys that are hashes of their inputs and source code."""
 
 import hashlib
 import json
@@ -18,15 +18,12 @@ from skin.safe_loading import load_npz
 
 
 def folder(given: str | Path | None) -> Path:
-    """Return where arrays are kept: as given, else by the variable SKIN_CACHE, else the user's cache."""
+    """Return the folder of the cache: the given one, else the variable SKIN_CACHE, else the user's cache."""
     return Path(given or os.environ.get("SKIN_CACHE") or platformdirs.user_cache_dir("skin")).expanduser()
 
 
 def hashed(content: Mapping[str, Any], sources: Iterable[Path]) -> str:
-    """Hash what arrays depend on, and the code that computes them.
-
-    Mechanics that changed must not be answered from a file that the old mechanics wrote.
-    """
+    """Return a hash of the inputs and of the source code, so that changed code does not use old files."""
     code = [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources]
     return hashlib.sha256(json.dumps([content, code], sort_keys=True).encode()).hexdigest()
 
@@ -37,10 +34,9 @@ def kept(
     shapes: Mapping[str, Sequence[int]],
     build: Callable[[], Mapping[str, np.ndarray]],
 ) -> dict[str, np.ndarray]:
-    """Return named float64 arrays from their file, or build them and write it.
+    """Return named float64 arrays from their file, or build them and write the file.
 
-    A file that is damaged, foreign or of another shape is rebuilt; a folder that cannot be written to costs
-    a warning.
+    A damaged file, or one with other contents, is rebuilt. A folder that is not writable gives a warning.
 
     Args:
         path: x.npz.
@@ -68,7 +64,7 @@ def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str
         if str(stored["key"]) != key:
             return None
         found = {name: stored[name] for name in shapes}
-    except Exception:  # Whatever a broken archive raises, the answer is the same: build it anew.
+    except Exception:  # any error of a broken archive: build the arrays again
         return None
     sound = all(
         array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()

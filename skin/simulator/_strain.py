@@ -1,4 +1,4 @@
-"""How far the linear solution goes beyond small strains: rows over the cells for all of the top layer."""
+"""Largest strains of the top layer, which show whether the linear solution is valid."""
 
 from collections.abc import Callable, Iterator
 
@@ -18,7 +18,7 @@ _NUMBERS_AT_ONCE = 2**24
 
 
 def squeeze(structure: Structure) -> np.ndarray:
-    """Return how much thinner the top layer of plates and beams gets at each node, (nodes, cells), 1/Pa."""
+    """Return the compressive strain of the top layer of plates and beams, (nodes, cells), 1/Pa."""
     moved = factorised(structure.stiffness()).solve(structure.load().toarray())
     layers, rows, columns = structure.grid
     down = -moved.reshape(layers, rows * columns, len(structure.free), -1)[:, :, structure.free.index(2)]

@@ -1,4 +1,4 @@
-"""What a simulator is: a differentiable map from surface pressure to true sensor readings."""
+"""The interface of simulators: differentiable maps from surface pressure to true sensor readings."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple
@@ -13,12 +13,12 @@ from skin.touch.movie import Movie
 
 
 class Response(NamedTuple):
-    """What the skin answers to a pressure, before any imperfection of a device.
+    """Response of the skin to a pressure, before imperfections of a device.
 
     Attributes:
         readings: (..., S), N.
         displacement: (..., S, 2), m: D_s at each sensor's depth and D_t at the surface above it, positive
-            into the skin; or None where the simulator knows no displacement.
+            into the skin; None if the simulator does not compute displacements.
     """
 
     readings: Tensor
@@ -29,11 +29,11 @@ class AbstractSimulator(nn.Module, ABC):
     """Maps pressure (..., H, W) in Pa on the surface cells to a :class:`Response`.
 
     Every simulator is positively homogeneous: ``k`` times the pressure gives ``k`` times the response, for
-    k >= 0. So a static touch needs one image, whatever its time profile.
+    k >= 0. A static touch with any time profile therefore needs one frame.
 
     Attributes:
-        feels_shear: readings depend on forces along the surface too.
-        mechanical: readings depend on the layers' thickness and stiffness.
+        feels_shear: whether readings depend on tangential forces too.
+        mechanical: whether readings depend on the thickness and stiffness of the layers.
     """
 
     feels_shear: ClassVar[bool] = False
@@ -45,26 +45,26 @@ class AbstractSimulator(nn.Module, ABC):
 
         Args:
             pressure: on the surface cells, into the skin.
-            shear: (..., 2), the traction along x and y that goes with each frame, over its pressure: the
-                coefficient of friction times the direction in which the object moves. None: no friction.
+            shear: (..., 2), tangential traction along x and y of each frame divided by its pressure: the
+                coefficient of friction times the direction of motion. None: no friction.
 
         Raises:
-            InputError: shear, where the simulator feels none.
+            InputError: shear, if the simulator does not support it.
         """
 
     def linear(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return what is linear in the pressure, (..., R): that of which :meth:`read` makes the response.
+        """Return the quantities (..., R) that are linear in the pressure, the input of :meth:`read`.
 
         Raises:
             InputError: the simulator has no mechanics.
         """
         raise InputError(
-            f"materials relax where there are mechanics, got simulator={self._name}: set simulator=fem or "
-            "simulator=solid, or leave out the materials' relaxation"
+            f"relaxation of materials needs a simulator with mechanics, got simulator={self._name}: set "
+            "simulator=fem or simulator=solid, or remove the relaxation from the materials"
         )
 
     def read(self, linear: Tensor) -> Response:
-        """Return the response that has these linear parts (..., R)."""
+        """Return the response for the linear quantities (..., R)."""
         raise NotImplementedError
 
     def play(
@@ -75,14 +75,14 @@ class AbstractSimulator(nn.Module, ABC):
         shear: Tensor | None = None,
         displacement: bool = True,
     ) -> Response:
-        """Return the response to movies, (B, T, ...); each distinct frame is solved for once.
+        """Return the response to movies, (B, T, ...); each distinct frame is solved once.
 
         Args:
             frames: (U, H, W), Pa.
-            index: (B, T), which frame is shown.
-            scale: (B, T), by what it is multiplied.
-            shear: (U, 2), as of :meth:`forward`.
-            displacement: False leaves it out.
+            index: (B, T), the frame at each time.
+            scale: (B, T), factor of the frame.
+            shear: (U, 2), as in :meth:`forward`.
+            displacement: whether to compute the displacement.
         """
         readings, moves = self(frames, shear)
         shown = readings[index] * scale[..., None]
@@ -93,7 +93,7 @@ class AbstractSimulator(nn.Module, ABC):
     def respond(self, movie: Movie, displacement: bool = True) -> Response:
         """Return the readings (B, T, S), N, of gestures, and the displacement (B, T, S, 2), m.
 
-        The displacement is None if the simulator knows none, or if it is not asked for.
+        The displacement is None if the simulator does not compute it, or if ``displacement`` is false.
         """
         home = next(self.buffers(), movie.frames).device
         shear = None if movie.shear is None else movie.shear.to(home)
@@ -101,49 +101,49 @@ class AbstractSimulator(nn.Module, ABC):
         return self.play(movie.frames.to(home), index, scale, shear, displacement)
 
     def refuse_shear(self) -> None:
-        """Raise an InputError that says which simulator feels friction, unless this one does."""
+        """Raise InputError if this simulator does not support friction."""
         if not self.feels_shear:
             raise InputError(
-                "friction needs a simulator that feels forces along the surface, got "
+                "friction needs a simulator with tangential forces, got "
                 f"simulator={self._name}: set simulator=solid, or touch.shear=0"
             )
 
     def refuse_tilted(self, sensors: Sensors) -> None:
-        """Raise an InputError that names a sensor that leans, unless this simulator feels that."""
+        """Raise InputError for a tilted sensor if this simulator does not support it."""
         if not self.feels_shear and sensors.tilted.any():
             raise InputError(
-                f"sensor {int(sensors.tilted.argmax()) + 1} is tilted, but simulator={self._name} knows only "
-                "forces across the surface: set simulator=solid, or give normals (0, 0, 1)"
+                f"sensor {int(sensors.tilted.argmax()) + 1} is tilted, but simulator={self._name} has normal "
+                "forces only: set simulator=solid, or give normals (0, 0, 1)"
             )
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
+        """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m.
 
-        Positively homogeneous like the response, and with ``shear`` (..., 2) as :meth:`forward` takes it.
+        Positively homogeneous like the response; ``shear`` (..., 2) is that of :meth:`forward`.
 
         Raises:
-            InputError: in this simulator sensors do not move along the sheet, or it feels no shear.
+            InputError: this simulator has no displacements along the sheet, or does not support shear.
         """
         raise InputError(
-            f"sensors that move need a simulator in which they can, got simulator={self._name}: "
+            f"displacements of sensors along the sheet are not known for simulator={self._name}: "
             "set simulator=fem simulator.constraint=free"
         )
 
     def compliance(self) -> Tensor:
-        """Return C (cells, cells), m/Pa: how far each cell's surface moves inwards under 1 Pa on each cell.
+        """Return C (cells, cells), m/Pa: inward displacement of each cell's surface under 1 Pa on each cell.
 
         Raises:
-            InputError: in this simulator the surface does not move as a whole.
+            InputError: this simulator has no compliance.
         """
         raise InputError(
-            "a rigid object needs a simulator whose surface gives way, got "
+            "a rigid object needs a simulator with a compliant surface, got "
             f"simulator={self._name}: set simulator=solid, or contact=prescribed"
         )
 
     def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
         """Return the largest principal strain of the top layer under pressures (U, H, W), (U,), 1.
 
-        By the linear solution, which holds to about 0.3. None where the simulator has no mechanics.
+        From the linear solution, which is valid up to about 0.3. None if the simulator has no mechanics.
         """
         return None
 

@@ -23,27 +23,27 @@ Reading = Literal["equation10", "interface"]
 
 @checked("simulator")
 class PlatesAndBeams(AbstractSimulator):
-    """Layers of Kirchhoff plates on upright Euler-Bernoulli beams, glued to a table.
+    """Layers of Kirchhoff plates on vertical Euler-Bernoulli beams, on a rigid base.
 
-    Each layer is a set of beams, one per node with the part of the sheet nearest to it as section, and the
-    plates on their heads. Linear: no contact, no large strain.
+    Each layer consists of beams, one per node, whose section is the part of the sheet nearest to the node,
+    and of plates on top of them. Linear: no contact, small strains.
 
-    Refinement is slow. Under a Gaussian touch of 15 mm standard deviation the default 32 x 32 cells give a
-    D_s 16 %, a D_t 11 % and a share D_s / D_t 5 % smaller than 128 x 128 cells do; 64 x 64 come within 5 %.
-    Under uniform pressure the surface's edges deviate from its middle by -11 to +3 % (128 x 128: -1.4 to
+    Convergence is slow. Under a Gaussian touch of 15 mm standard deviation the default 32 x 32 cells give a
+    D_s 16 %, a D_t 11 % and a ratio D_s / D_t 5 % smaller than 128 x 128 cells; 64 x 64 are within 5 %. Under
+    uniform pressure the edges of the surface deviate from its middle by -11 to +3 % (128 x 128: -1.4 to
     +0.3 %).
 
     Args:
         body: the sheet.
-        sensors: where the sensors are; each lies at an interface between layers, or on the surface.
-        reading: ``equation10`` is the report's: the force on the footprint at the surface times D_s / D_t,
-            the share of the surface's motion that reaches the sensor. It is zero beside the contact.
-            ``interface`` is the force that the layer below carries under the footprint: linear, and
-            neighbours feel a touch.
-        constraint: ``vertical`` is the report's: nodes move vertically and tilt. ``free`` lets them move
-            along the sheet too; then :meth:`motion` tells where the sensors go.
-        cache: folder of operators kept from earlier runs; None means the variable SKIN_CACHE, else the
-            user's cache.
+        sensors: each at an interface between layers, or on the surface.
+        reading: ``equation10``, as in the report: the force on the footprint at the surface times D_s / D_t,
+            the ratio of the displacements at the sensor and at the surface; zero beside the contact.
+            ``interface``: the force that the layer below carries under the footprint; linear, and not zero
+            beside the contact.
+        constraint: ``vertical``, as in the report: nodes move vertically and rotate. ``free``: nodes move
+            along the sheet too, and :meth:`motion` gives the displacements of the sensors.
+        cache: folder for computed operators; None: the environment variable SKIN_CACHE, else the user's
+            cache.
 
     Raises:
         InputError: an unknown reading or constraint, a body that is not flat, a sensor at no interface or
@@ -81,7 +81,7 @@ class PlatesAndBeams(AbstractSimulator):
         """Return the response to pressure (..., H, W), Pa, with D_s and D_t as its displacement.
 
         Raises:
-            InputError: shear; only normal forces are felt.
+            InputError: shear; only normal forces are supported.
         """
         return self.read(self.linear(pressure, shear))
 
@@ -104,7 +104,7 @@ class PlatesAndBeams(AbstractSimulator):
         return Response(share * force, displacement)
 
     def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return by how much of its thickness the top layer is squeezed where it is most, (U,)."""
+        """Return the largest compressive strain of the top layer, (U,)."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         return largest(cells, self._squeeze.to(cells.device))
 
@@ -113,16 +113,16 @@ class PlatesAndBeams(AbstractSimulator):
         return torch.from_numpy(squeeze(self._structure)[None]).float()
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m.
+        """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m.
 
         Raises:
-            InputError: nodes are held along x and y; or shear.
+            InputError: nodes are fixed along x and y; or shear.
         """
         if shear is not None:
             self.refuse_shear()
         if self.constraint != "free":
             raise InputError(
-                "sensors that move need a skin that does, got simulator.constraint="
+                "displacements of sensors along the sheet are fixed at 0 by simulator.constraint="
                 f"{self.constraint}: set simulator.constraint=free"
             )
         cells = flatten(pressure, self.shape, self.along.dtype)

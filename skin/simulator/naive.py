@@ -1,4 +1,4 @@
-"""The naive skin: each sensor reads the pressure above it (report, 2.1.1)."""
+"""A skin without mechanics: each sensor reads the pressure above it (report, 2.1.1)."""
 
 from typing import ClassVar
 
@@ -12,16 +12,16 @@ from skin.simulator.base import AbstractSimulator, Response, flatten
 
 
 class Naive(AbstractSimulator):
-    """Reads the pressure of the cell that holds the sensor, times the area of its footprint: no mechanics.
+    """Reads the pressure of the cell of the sensor times the area of its footprint, without mechanics.
 
-    Choose it to see what mechanics is worth, or for a skin too thin to spread a touch.
+    Use it as a baseline for the mechanics, or for a skin too thin to spread a touch.
 
     Args:
-        body: any; only its cells matter.
-        sensors: where the sensors are; a footprint that passes the body's edge is cut there.
+        body: any; only its cells are used.
+        sensors: the sensors; a footprint beyond the edge of the body is clipped.
 
     Raises:
-        InputError: a sensor that does not face the surface.
+        InputError: a tilted sensor.
     """
 
     mechanical: ClassVar[bool] = False
@@ -43,10 +43,10 @@ class Naive(AbstractSimulator):
         self.register_buffer("area", torch.from_numpy(area).float())
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
-        """Return the response to pressure (..., H, W), Pa; it knows no displacement.
+        """Return the response to pressure (..., H, W), Pa, without displacements.
 
         Raises:
-            InputError: shear; only normal forces are felt.
+            InputError: shear; only normal forces are supported.
         """
         if shear is not None:
             self.refuse_shear()

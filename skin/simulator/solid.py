@@ -33,25 +33,26 @@ _INWARDS = 2
 
 @checked("simulator")
 class Solid(AbstractSimulator):
-    """Layers of nearly incompressible elastic solid, glued to something hard.
+    """Layers of nearly incompressible elastic solid on a rigid base.
 
-    A sensor reads the force n . sigma . n that pushes on its footprint across its normal, so a tilted one
-    feels shear, and all feel their neighbourhood. Linear: no large strain (see the summary of each data set).
+    A sensor reads the normal force n . sigma . n on its footprint. A tilted sensor therefore responds to
+    shear, and each sensor responds to its neighbourhood. The model is linear: strains must be small (see the
+    summary of each data set).
 
-    Reads 1000 Pa spread evenly over a sheet to 0.2 % in its middle; tests/simulator/test_solid.py and
-    ``make physics`` hold the rest.
+    The reading in the middle of a sheet under 1000 Pa of uniform pressure has an error of 0.2 %; ``make
+    physics`` and tests/simulator/test_solid.py check other cases.
 
     Args:
         body: sheet or arm.
-        sensors: where the sensors are and which way they face.
+        sensors: positions and normals of the sensors.
         divisions: rows of elements in each layer.
-        poisson: name of a material -> nu to take in place of its own, for those that no solid can have.
-        cache: folder of operators kept from earlier runs; None means the variable SKIN_CACHE, else the
-            user's cache.
+        poisson: name of a material -> nu that replaces a value >= 0.5.
+        cache: folder for computed operators; None: the environment variable SKIN_CACHE, else the user's
+            cache.
 
     Raises:
-        InputError: a material with nu >= 0.5, a name that no material has, no row of elements, or a mesh
-            finer than memory allows.
+        InputError: a material with nu >= 0.5, an unknown material, no row of elements, or a mesh that does
+            not fit into memory.
     """
 
     feels_shear: ClassVar[bool] = True
@@ -85,7 +86,7 @@ class Solid(AbstractSimulator):
         return self._rows(pressure, shear, slice(3 * self._sensors))
 
     def _rows(self, pressure: Tensor, shear: Tensor | None, chosen: slice) -> Tensor:
-        """Return some rows of the operator times the load of pressure and shear."""
+        """Return some rows of the operator times the load from pressure and shear."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         felt = cells @ self.transfer[_INWARDS, :, chosen]
         if shear is not None:
@@ -95,27 +96,27 @@ class Solid(AbstractSimulator):
         return felt
 
     def read(self, linear: Tensor) -> Response:
-        """Return the response that has these linear parts (..., 3 S)."""
+        """Return the response for readings, D_s and D_t (..., 3 S)."""
         readings, sensor, surface = linear.chunk(3, dim=-1)
         return Response(readings, torch.stack([sensor, surface], dim=-1))
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return how far each sensor moves along x, along y and into the skin, (..., S, 3), m."""
+        """Return the displacement of each sensor along x, along y and into the skin, (..., S, 3), m."""
         count = self._sensors
         inwards, _, x, y = self._rows(pressure, shear, slice(count, 5 * count)).chunk(4, dim=-1)
         return torch.stack([x, y, inwards], dim=-1)
 
     def compliance(self) -> Tensor:
-        """Return C (cells, cells), m/Pa: how far each cell's surface moves inwards under 1 Pa on each cell.
+        """Return C (cells, cells), m/Pa: inward displacement of each cell's surface under 1 Pa on each cell.
 
-        A cell's motion is the mean of its corners'. Symmetric. Solved for once, then kept on disk.
+        The displacement of a cell is the mean of its corners. Symmetric. Computed once, then cached on disk.
         """
         loads = self._mesh.loads(_INWARDS)
         compliance = loads.T @ self.influence(_INWARDS) / self._area
         return torch.from_numpy((compliance + compliance.T) / 2)
 
     def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return the largest principal strain of the top layer, (U,); friction counts too."""
+        """Return the largest principal strain of the top layer, (U,), including that from shear."""
         cells = flatten(pressure, self.shape, self.transfer.dtype)
         axes, loads = [_INWARDS], [cells]
         if shear is not None:
@@ -130,13 +131,16 @@ class Solid(AbstractSimulator):
         return torch.stack([largest(load, torch.from_numpy(rows).to(load)) for rows in strains]).amax(0)
 
     def influence(self, axis: int) -> np.ndarray:
-        """Return how every node moves under 1 Pa on each cell along an axis, (3 N, cells), m/Pa."""
+        """Return the displacement of each node under 1 Pa on each cell along an axis, (3 N, cells), m/Pa."""
         return self._elastic.influence(axis, self._folder / f"influence-{self._key}-{axis}.npy")
 
     def of(self, sensors: Sensors) -> np.ndarray:
-        """Return what other sensors read of 1 Pa on each cell along x, y and inwards, (3, S, cells), N/Pa.
+        """Return the readings of other sensors under 1 Pa on each cell along x, y and inwards.
 
-        Exact, whatever their places: read from :meth:`influence`, so a layout costs milliseconds.
+        They are exact for any layout and computed from :meth:`influence` in milliseconds.
+
+        Returns:
+            (3, S, cells), N/Pa.
         """
         rows = reading_rows(self._mesh, sensors)
         return np.stack([_read(rows, self.influence(axis)) for axis in range(3)])
@@ -146,7 +150,7 @@ class Solid(AbstractSimulator):
         return Elastic(self._mesh)
 
     def _operator(self, sensors: Sensors) -> np.ndarray:
-        """Return readings, D_s, D_t and motions along x and y over the cells, (3, 5 S, cells)."""
+        """Return the rows of readings, D_s, D_t and displacements along x and y, (3, 5 S, cells)."""
         about = {
             "body": self._key,
             "positions": sensors.positions.tolist(),
@@ -186,14 +190,14 @@ def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) 
 
 
 def reading_rows(mesh: Hexahedra, sensors: Sensors) -> sp.csr_matrix:
-    """Return rows (S, 3 N) that read the force that pushes on each sensor across its normal, N."""
+    """Return rows (S, 3 N) that give the normal force on each sensor, N, from nodal displacements."""
     points, areas, owner = quadrature(sensors, mesh.lines)
     sums = sp.csr_matrix((-areas, (owner, np.arange(len(owner)))), shape=(len(sensors), len(points)))
     return (sums @ mesh.stress(points, sensors.normals[owner])).tocsr()
 
 
 def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
-    """Return rows (S, 3 N) that read D_s, D_t and how far each sensor moves along x and y, m."""
+    """Return rows (S, 3 N) that give D_s, D_t and the displacements of each sensor along x and y, m."""
     places = sensors.positions
     above = places * np.array([1.0, 1.0, 0.0])
     x, y, inwards = (np.tile(axis, (len(places), 1)) for axis in np.eye(3))
@@ -201,7 +205,7 @@ def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
 
 
 def _read(rows: sp.csr_matrix, influence: np.ndarray) -> np.ndarray:
-    """Return rows @ influence, of which only the lines that rows touch are read from disk."""
+    """Return rows @ influence; only the lines with non-zero columns in rows are read from disk."""
     used = np.unique(rows.indices)
     return np.asarray(rows[:, used] @ influence[used])
 

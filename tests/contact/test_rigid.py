@@ -232,15 +232,18 @@ def test_draws_that_fail_are_counted():
     assert movie.parameters["unconverged"].sum() == 0
 
 
-def test_what_is_not_found_is_told_and_never_used():
+def test_frames_that_do_not_converge_are_reported_and_not_used():
     hasty = sampler(rigid(iterations=5))
     with pytest.warns(RuntimeWarning, match=r"\d+ frames did not converge to contact.tolerance"):
         movie = hasty.sample(32, np.random.default_rng(5))
     assert movie.parameters["unconverged"].sum() > 0
 
 
-def test_what_is_never_found_is_refused():
-    with pytest.warns(RuntimeWarning, match="not found"), pytest.raises(InputError, match=r"contact\.relief"):
+def test_contact_that_never_converges_is_refused():
+    with (
+        pytest.warns(RuntimeWarning, match="did not converge"),
+        pytest.raises(InputError, match=r"contact\.relief"),
+    ):
         sampler(rigid(iterations=1), redraws=1).sample(16, np.random.default_rng(5))
 
 

@@ -1,4 +1,4 @@
-"""What an SVM reads in graph embeddings, and on what they spend their variance."""
+"""Accuracy of an SVM on graph embeddings, and the variance that labels and layouts explain."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -47,7 +47,7 @@ class Space(NamedTuple):
 
 
 class ProbeResult(NamedTuple):
-    """What one embedding told with one seed.
+    """Result of probing one embedding with one seed.
 
     Attributes:
         attribute: degree, reading, or nothing where the input is no graph embedding.
@@ -70,10 +70,10 @@ class ProbeResult(NamedTuple):
 def probe(
     device: AbstractDevice, settings: ProbeSettings, learner: AbstractLearner | None
 ) -> Iterator[ProbeResult]:
-    """Yield what every input tells, seed by seed: graph embeddings, a trained encoder's, plain readings.
+    """Yield the result of each input and seed: graph embeddings, those of a trained encoder, plain readings.
 
-    A simulated device draws new touches for every seed, of which no training has any; of another device the
-    train and test splits are taken, once. Embeddings see the readings of all touches, but no label.
+    A simulated device draws new touches for each seed, separate from all training data; other devices use
+    their train and test splits, once. Embeddings use the readings of all touches, but no labels.
     """
     if device.task.direction:
         raise InputError("embeddings are probed for labels that hold or not: set data.direction=false")
@@ -191,7 +191,7 @@ def _layouts(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list
     count = len(simulation.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
-        return []  # no grid of so many sensors could be scattered
+        return []  # this number of sensors cannot form a grid
     sensors, found = simulation.sensors, list[AbstractDevice]()
     for number in range(settings.layouts):
         seed_of = _FIRST_LAYOUT + number

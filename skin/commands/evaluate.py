@@ -15,7 +15,7 @@ from skin.files import results
 
 @command("evaluate")
 def main(config: DictConfig) -> None:
-    """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
+    """Restore a finished run, evaluate it, and print and log the metrics."""
     from skin.build import build_data, build_device, build_learner
     from skin.console import quiet
     from skin.evaluation.report import evaluate
@@ -40,17 +40,17 @@ def main(config: DictConfig) -> None:
     device, learner = build_device(config), build_learner(config)
     load_learner(store, run, learner, build_data(config, device.blank()))
     point = load_operating_point(run, learner, stored, config.evaluation)
-    touches = device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
+    touches = device.touches("test")  # read before anything is logged, because a port may fail
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
-        # Every evaluation keeps its files.
+        # Evaluations do not overwrite each other's files.
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
             chances = learner.probabilities(touches)
-            said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
+            text, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
             store.client.log_artifact(evaluation.info.run_id, str(path))
-            print(f"{title}\n{said}\n{path}")
+            print(f"{title}\n{text}\n{path}")
             return
         found = evaluate(learner, device, config.evaluation, point)
         log_report(store, evaluation, found, device.task, {})

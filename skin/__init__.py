@@ -1,6 +1,6 @@
-"""Simulate a soft, sparsely sensed robot skin and learn what touches it.
+"""Simulation of a soft robot skin with few force sensors, and classification of touches.
 
-The names that a script needs are here; importing ``skin`` imports none of the heavy libraries yet.
+This module exports the public names for scripts; they are imported at first use.
 """
 
 from importlib import import_module
@@ -32,7 +32,7 @@ _PLACES = {
     "Solid": "skin.simulator.solid",
     "load_run": "skin.trained",
     "open_skin": "skin.wire.open",
-    "read_recording": "skin.recording_file:read",
+    "read_recording": "skin.recording_file",
 }
 
 

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def build_device(config: DictConfig) -> AbstractDevice:
-    """Return the source of touches, with its body, layout and, where it has one, its simulator."""
+    """Return the device, with its body, layout and, if it has one, its simulator."""
     groups = plain(config)
     check_groups({name: groups[name] for name in ("body", "layout", "device")})
     check_plausibility(groups)
     body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
-    # Not as arguments of instantiate: it would take the dataclass of the body for a configuration.
+    # Not arguments of instantiate, which would treat the dataclass of the body as a configuration.
     device: AbstractDevice = instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
     if device.simulation is not None and device.simulation.model.mechanical:
         warn_of_surface(body, device.simulation.sensors)
@@ -29,8 +29,8 @@ def build_device(config: DictConfig) -> AbstractDevice:
 
 
 def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
-    """Return the batches of a device's touches, shown as the representation does."""
-    # Here, because it brings Lightning, which takes seconds and which commands without training do not need.
+    """Return the data module of a device's touches in the configured representation."""
+    # Imported here because Lightning takes seconds and commands without training do not need it.
     from skin.datamodule import TouchData
     from skin.signal.augmentation import Augmentation
 
@@ -42,7 +42,7 @@ def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
 
 
 def build_learner(config: DictConfig) -> AbstractLearner:
-    """Return what will learn, untrained."""
+    """Return an untrained learner."""
     learner = plain(config)["learner"]
     check_groups({"learner": learner})
     return instantiate(learner, seed=config.seed)

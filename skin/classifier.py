@@ -28,25 +28,25 @@ def probabilities(logits: Tensor, task: Task) -> Tensor:
 
 
 class TouchClassifier(pl.LightningModule):
-    """Dense layers on the embedding of a window, and how they learn.
+    """Classifies windows by dense layers on their embedding.
 
     Logs ``{train,val}_loss``, ``{train,val}_accuracy`` and, of binary tasks, ``{train,val}_accuracy_<label>``
-    per epoch. Labels that mean nothing, because the task's gate is shut or a touch has no direction, count in
-    neither.
+    per epoch. Labels that are undefined, because the task's gate is 0 or a touch has no direction, are left
+    out of both.
 
-    Numbers about the whole window, where the representation gives such (``Frames.summary``), pass two dense
-    layers of their own and join the embedding.
+    Numbers about the whole window, if the representation has them (``Frames.summary``), are encoded by two
+    dense layers and concatenated to the embedding.
 
     Args:
-        fusion: makes the embedding (B, E) of frames.
-        task: what the labels mean: its length is the number of logits, its kind decides the loss.
+        fusion: computes the embedding (B, E) of frames.
+        task: its length is the number of logits, its kind determines the loss.
         hidden: widths of the dense layers before the last one.
         activation: relu, elu or silu, after each of them.
-        optimizer: short of the parameters.
+        optimizer: partial; takes the parameters.
         warmup: share of the steps in which the learning rate rises to the optimizer's; it then falls to
             nothing along a cosine (Smith and Topin, 2018). None keeps it constant.
         dropout: share of the embedding and of the first dense layer that is dropped in training.
-        summary: how many numbers about the whole window there are; 0: none.
+        summary: number of numbers about the whole window.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class TouchClassifier(pl.LightningModule):
         widths = [fusion.width * (2 if summary else 1), *hidden]
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
-            # Where nothing is dropped there is no layer for it, so that older weights keep their names.
+            # Without dropout there is no layer, so that older weights keep their names.
             dropped = [nn.Dropout(dropout)] if dropout else []
             layers += [*dropped, nn.Linear(before, after), activation_of(activation)]
         self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
@@ -79,7 +79,7 @@ class TouchClassifier(pl.LightningModule):
         return self.head(self.embed(frames))
 
     def embed(self, frames: Frames) -> Tensor:
-        """Return what the dense layers are given: the embedding (B, E), beside the summary's where it is."""
+        """Return the input of the dense layers: the embedding (B, E), with that of the summary if any."""
         embedding = self.fusion(frames)
         if self.summary is None:
             return embedding
@@ -88,8 +88,8 @@ class TouchClassifier(pl.LightningModule):
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1, or the cosines of a direction.
 
-        Where the task has a gate (report, 4.2) or a direction, the mean is over the labels that mean
-        something: those of a window without touch have no loss and no gradient, but for the gate itself.
+        Where the task has a gate (report, 4.2) or a direction, the mean is over the labels that are
+        defined: without touch, only the gate itself has a loss and a gradient.
         """
         if self.task.kind == "exclusive":
             return F.cross_entropy(logits, labels)
@@ -152,7 +152,7 @@ class TouchClassifier(pl.LightningModule):
 
 
 class _Standardised(nn.BatchNorm1d):
-    """Batch norm that takes a last batch of one touch too, by what it has seen before.
+    """Batch norm that accepts a batch of one touch, for which it uses its running statistics.
 
     Its statistics are plain means over all batches: a moving average would begin at a variance of 1, which of
     numbers in metres is wrong for a thousand batches.
@@ -166,7 +166,7 @@ class _Standardised(nn.BatchNorm1d):
 
 
 class _Summary(nn.Module):
-    """Two dense layers on numbers of any unit, each brought to mean 0 and deviation 1 first."""
+    """Two dense layers on numbers of any unit, each standardised first."""
 
     def __init__(self, numbers: int, width: int, activation: str) -> None:
         super().__init__()

@@ -39,8 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"skin {__version__}")
     elif verb not in known:
         near = get_close_matches(verb, known, 1)
-        said = f": did you mean {near[0]}?" if near else f": {', '.join(known)}"
-        sys.exit(_refused(f"skin has no verb {verb}{said}"))
+        hint = f": did you mean {near[0]}?" if near else f": {', '.join(known)}"
+        sys.exit(_refused(f"skin has no verb {verb}{hint}"))
     elif _source(known[verb]) is None:
         sys.exit(_refused(f"skin {verb} needs files that an installed package lacks: clone the repository"))
     else:
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _help(known: Mapping[str, str]) -> str:
-    """Return the first line of the documentation of each verb, of which none is imported."""
+    """Return the first line of each verb's docstring, without importing it."""
     sources = {name: _source(module) for name, module in known.items()}
     width = max(map(len, known))
     lines = [

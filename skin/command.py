@@ -1,4 +1,4 @@
-"""Commands: functions of a configuration that Hydra composes from what the command line asks for."""
+"""Commands: functions of a configuration that Hydra composes from the command line."""
 
 from skin import interrupt  # noqa: F401  # isort: skip
 import os
@@ -25,10 +25,10 @@ _VERSION = "1.3"  # of Hydra, whose defaults hold
 
 
 def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[..., None]]:
-    """Make a command of a function that takes a checked configuration.
+    """Return a decorator that turns a function of a checked configuration into a command.
 
-    Bad input ends it with one sentence and exit code 2. In a multirun the job fails and the others run on.
-    The command takes the words of its command line; None: those of this process.
+    Bad input ends the command with a message and exit code 2. In a multirun the job fails and the others
+    continue. The command takes a list of arguments; None: those of the process.
 
     Args:
         name: the primary configuration, a file in ``conf/``.
@@ -67,11 +67,11 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
 
 
 def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> None:
-    """Compose a configuration and run a job with it, or print what the words ask for instead."""
+    """Compose a configuration and run a job with it, or print help."""
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     version.setbase(_VERSION)
     parser = get_args_parser()
-    # Neither the shell nor Hydra's grammar knows ~ in device.path=~/x.csv.
+    # Neither the shell nor Hydra expands ~ in device.path=~/x.csv.
     asked = parser.parse_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
     if asked.help:
         if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
@@ -79,7 +79,7 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
         print(_help(sys.modules[job.__module__].__doc__ or "", asked.config_name or name, asked))
         return
     given = os.environ.get("HYDRA_FULL_ERROR")
-    # Hydra then raises what it would print in several lines.
+    # Makes Hydra raise errors instead of printing them.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         _run_hydra(asked, parser, job, str(CONF), name)
@@ -89,7 +89,7 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
 
 
 def _help(about: str, name: str, asked: Any) -> str:
-    """Return what a command does, the options of its groups, and its settings with their comments."""
+    """Return the help of a command: its docstring, the options of its groups, and its settings."""
     folders = [CONF, *([Path(asked.config_dir).resolve()] if asked.config_dir else [])]
     words = [*asked.overrides, f"hydra.searchpath=[{','.join(map(str, folders[1:]))}]"]
     with initialize_config_dir(str(CONF), version_base=_VERSION):
@@ -115,7 +115,7 @@ def _help(about: str, name: str, asked: Any) -> str:
 
 
 def _parts(folders: Sequence[Path], name: str) -> list[str]:
-    """Return the configurations without a group that one consists of, itself last."""
+    """Return the configurations without a group that a configuration includes, itself last."""
     stored = OmegaConf.load(next(path for folder in folders if (path := folder / f"{name}.yaml").is_file()))
     assert isinstance(stored, DictConfig)
     below = [part for part in stored.get("defaults", []) if isinstance(part, str) and part != "_self_"]

@@ -20,7 +20,7 @@ from skin.fingerprint import config_hash
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
 
-# They steer a run and change none of its results.
+# Settings without effect on results.
 _STEERING = ("tracking", "trust")
 
 
@@ -41,7 +41,7 @@ class Data:
 
 @dataclass
 class Evaluation:
-    """On what a trained learner is tried (``conf/train.yaml``)."""
+    """Test data of a trained learner (``conf/train.yaml``)."""
 
     devices: int
     layouts: int
@@ -63,7 +63,7 @@ class Tracking:
 
 @dataclass
 class Config:
-    """What may stand at the top of a configuration; groups without a type here belong to their class."""
+    """Top-level keys of a configuration; groups without a type here are checked by their class."""
 
     row: str | None = None
     seed: int | None = None
@@ -125,7 +125,7 @@ def validate_config(config: DictConfig) -> DictConfig:
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
     assert isinstance(whole, DictConfig)
-    # It would pass every comparison that is not written for it.
+    # NaN would pass most comparisons.
     for name in _not_numbers(OmegaConf.to_container(whole)):
         raise InputError(f"{name} is nan: give a number")
     OmegaConf.set_readonly(whole, True)
@@ -145,7 +145,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
     """Return a configuration with every interpolation resolved, as plain containers.
 
     Raises:
-        InputError: an interpolation leads nowhere.
+        InputError: an interpolation cannot be resolved.
     """
     try:
         return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
@@ -154,13 +154,13 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def fingerprint(config: DictConfig) -> str:
-    """Return a hash of what a run's result depends on: configuration, the files it names, version."""
-    # What is not set belongs to other commands; a new command must not make every finished run look unknown.
+    """Return a hash of everything that results depend on: configuration, files it names, version."""
+    # Unset keys belong to other commands; a new command must not change the fingerprint of finished runs.
     groups = plain(config).items()
     content = {key: value for key, value in groups if key not in _STEERING and value is not None}
     return config_hash(content)
 
 
 def overrides() -> list[str]:
-    """Return what the command line of a running command asks for."""
+    """Return the overrides on the command line of the running command."""
     return list(HydraConfig.get().overrides.task)

@@ -21,22 +21,22 @@ MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentat
 
 @checked("data")
 class TouchData(pl.LightningDataModule):
-    """Cuts a device's touches into batches and shows them as a representation does.
+    """Data module with batches of a device's touches in a representation.
 
     Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
-    one. A device that draws fresh gestures is asked again every epoch. Processes that train together share
+    one. A device that draws fresh gestures is called again every epoch. Processes that train together share
     each training batch; each of them validates on all gestures.
 
     Args:
         device: source of touches.
-        representation: short of positions (S, 3), m, and size (x, y), m.
+        representation: partial; takes positions (S, 3), m, and size (x, y), m.
         batch_size: gestures per batch.
         seed: of the order of gestures and of their augmentation; epoch e uses (seed, e).
         augmentation: changes the touches of training batches; None leaves them.
 
     Attributes:
         device: as given.
-        task: what the labels mean.
+        task: the labels.
         window: number of frames per touch.
     """
 
@@ -56,7 +56,7 @@ class TouchData(pl.LightningDataModule):
             )
         self.device, self.batch_size, self.seed = device, batch_size, seed
         self._make = representation
-        # One that changes nothing is none: it draws nothing.
+        # An augmentation without effect must not draw random numbers.
         self.augmentation = None if augmentation == Augmentation() else augmentation
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
         self._drawn: dict[str, Touches] = {}

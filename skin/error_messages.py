@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from skin.errors import InputError
 
-# What a disk or its owner refuses; everything else that the system says is an error of ours.
+# Errors of the disk or its permissions; all other system errors are bugs.
 _DISK = frozenset(
     (
         errno.ENOSPC,
@@ -26,17 +26,17 @@ _DISK = frozenset(
 
 
 class JobInputError(InputError, CompactHydraException):
-    """Bad input of one job of a multirun: Hydra ends with its sentence, without a traceback."""
+    """Bad input of one job of a multirun; Hydra prints its message without a traceback."""
 
 
 def to_input_error(error: Exception) -> InputError | None:
-    """Return the sentence for a person, or None where the error is ours and deserves its traceback."""
+    """Return an error as an InputError with a message for the user; None for bugs, which need a traceback."""
     if isinstance(error, InputError):
         return error
     for one in _chain(error):
         if isinstance(one, sqlite3.OperationalError) or type(one) is sqlite3.DatabaseError:
             return InputError(
-                f"the database of runs refuses: {one}: make room, or give another one, as in "
+                f"the database of runs failed: {one}: make room, or give another one, as in "
                 "tracking.uri=sqlite:////FOLDER/runs.db; what has finished is kept"
             )
         if isinstance(one, OSError) and one.errno in _DISK:
@@ -61,7 +61,7 @@ def to_input_error(error: Exception) -> InputError | None:
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error and what it came from: libraries wrap what the system says."""
+    """Yield an error and its causes: libraries wrap errors of the system."""
     found: BaseException | None = error
     while found is not None:
         yield found
@@ -69,9 +69,9 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, on one line; OmegaConf adds lines about its own objects."""
-    told = str(error).split("Config search path:")[0]
-    lines = [line.strip() for line in told.splitlines() if line.strip()]
+    """Return the message of an error on one line, without the details that OmegaConf adds."""
+    text = str(error).split("Config search path:")[0]
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     kept = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
     ends = [" " if line.endswith((".", ":", ",")) else "; " for line in kept[:-1]] + [""]
     return "".join(line + end for line, end in zip(kept, ends, strict=True))

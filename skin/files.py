@@ -19,8 +19,8 @@ def tabular(path: str | Path, what: str) -> Path:
     """Return the path of a table.
 
     Args:
-        path: as a person gave it.
-        what: is in it, the subject of the sentence.
+        path: as given by the user.
+        what: its content, the subject of the message.
 
     Raises:
         InputError: another ending than .parquet or .csv.
@@ -33,15 +33,14 @@ def tabular(path: str | Path, what: str) -> Path:
 
 @contextmanager
 def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
-    """Give a temporary path beside ``path``, with its ending, that takes its place if the block ends well.
+    """Yield a temporary path that replaces ``path`` if the block succeeds.
 
-    It has reached the disk then, so that a power cut leaves the old file or the new one.
-
-    Folders that are missing are made.
+    The file is flushed to the disk first, so that a power cut leaves either the old file or the new one.
+    Missing folders are created.
 
     Args:
         path: of the file.
-        place: setting that chooses another folder, for the message.
+        place: override that selects another folder, for the message.
 
     Raises:
         InputError: the disk is full or read-only, or the folder cannot be written.
@@ -65,7 +64,7 @@ def whole(path: Path, place: str = "out=FOLDER") -> Iterator[Path]:
 
 
 def write(text: str, path: Path) -> Path:
-    """Write a text whole and return its path.
+    """Write a text atomically and return its path.
 
     Raises:
         InputError: as of :func:`whole`.
@@ -76,8 +75,8 @@ def write(text: str, path: Path) -> Path:
 
 
 def unwritable(path: Path | str, error: OSError, place: str) -> InputError:
-    """Return what a person is told where a disk refuses."""
-    # Arrow's own words repeat the number and hide the reason.
+    """Return the error for a file that cannot be written."""
+    # The message of Arrow repeats the number and hides the reason.
     reason = os.strerror(error.errno) if error.errno else str(error)
-    mend = "make room there" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "make it writable"
-    return InputError(f"cannot write {path}: {reason}: {mend}, or choose another place, as in {place}")
+    fix = "make room there" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "make it writable"
+    return InputError(f"cannot write {path}: {reason}: {fix}, or choose another place, as in {place}")

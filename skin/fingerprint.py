@@ -1,4 +1,4 @@
-"""A hash of what a result depends on: its configuration, the files it names, and the version."""
+"""Hash of everything that a result depends on: configuration, the files it names, and version."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ RENAMED: dict[str, str] = {
 }
 """Former name of a class -> its name now. Add a line when you move or rename the class of an option."""
 
-# Group -> settings that were added later. With these values nothing changes, so older runs keep their hash.
+# Group -> settings added later, with their neutral values, which keep the hash of older runs.
 _LATER: dict[str, dict[str, Any]] = {
     "touch": {"stretch": 4.0, "leak": 0.6, "strict": False},
     "layout": {"depth": None},
@@ -27,7 +27,7 @@ _MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strateg
 def config_hash(content: dict[str, Any]) -> str:
     """Return the hash of a configuration in plain containers, 16 hexadecimal digits.
 
-    Classes count by the first name that they had, so that a renamed module changes no hash.
+    Classes enter by their first name, so that renaming a module does not change the hash.
     """
     files = {value: _hash_of(value) for value in _strings(content) if _file(value)}
     first = renamed(content, {new: old for old, new in RENAMED.items()})
@@ -36,11 +36,11 @@ def config_hash(content: dict[str, Any]) -> str:
 
 
 def renamed(value: Any, names: Mapping[str, str] = RENAMED) -> Any:
-    """Return plain containers with other names of classes.
+    """Return plain containers with renamed classes.
 
     Args:
         value: containers, or an entry of one.
-        names: old -> new; by default to the names that the classes have now.
+        names: old -> new; by default ``RENAMED``.
     """
     if isinstance(value, dict):
         return {
@@ -51,9 +51,9 @@ def renamed(value: Any, names: Mapping[str, str] = RENAMED) -> Any:
 
 
 def _relevant(value: Any, group: str = "") -> Any:
-    """Return a configuration without what makes no other run.
+    """Return a configuration without settings that do not affect the result.
 
-    These are later settings that are at their defaults, and the machine, wherever a group is.
+    These are later settings at their defaults, and those of the machine.
     """
     if not isinstance(value, dict):
         return value
@@ -61,7 +61,7 @@ def _relevant(value: Any, group: str = "") -> Any:
     kept = {key: _relevant(one, key) for key, one in value.items() if later.get(key, ...) != one}
     if group != "trainer":
         return kept
-    # Every run names an accelerator; the CPU stands for all, as in the runs before this was left out.
+    # The CPU stands for all accelerators, as in earlier runs.
     return {key: one for key, one in kept.items() if key not in _MACHINE} | {"accelerator": "cpu"}
 
 
@@ -77,7 +77,7 @@ def _strings(value: Any) -> Iterator[str]:
 
 
 def _file(name: str) -> Path | None:
-    """Return the file that a setting names, as the package finds it, if there is one."""
+    """Return the file that a setting names, or None."""
     if "/" not in name and "." not in name:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Handle Ctrl-C from the first import on: the command ends as by the signal, without a traceback."""
+"""Handle Ctrl-C from the first import on: the command ends without a traceback."""
 
 import sys
 from types import TracebackType
@@ -6,10 +6,10 @@ from types import TracebackType
 _usual = sys.excepthook
 
 
-def _said(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Say nothing of Ctrl-C: who pressed it knows. A shell sees exit code 130."""
+def _handle(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print no traceback for Ctrl-C; the exit code is 130."""
     if not issubclass(kind, KeyboardInterrupt):
         _usual(kind, error, trace)
 
 
-sys.excepthook = _said
+sys.excepthook = _handle

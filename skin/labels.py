@@ -15,18 +15,18 @@ _STRAIGHT = 0.5
 
 @dataclass(frozen=True)
 class Task:
-    """What a device's labels mean; head width, loss, metrics and table columns follow from it.
+    """Names and kind of a device's labels; they determine head width, loss, metrics and table columns.
 
     Attributes:
         names: one name per label, in the order of the label tensor's last axis.
         kind: ``binary`` (each label holds or not by itself) or ``exclusive`` (exactly one holds).
-        gate: the label without which the others mean nothing (report, 4.2), such as ``touch``; None: all
-            labels always mean something.
-        direction: the last two labels are no binary ones but the cosines of a direction with x and y, -1 to
-            1. Both are 0 where a touch has none; they mean nothing there.
+        gate: the label without which the others are undefined (report, 4.2), such as ``touch``; None: all
+            labels are always defined.
+        direction: the last two labels are not binary but the cosines of a direction with x and y, -1 to 1.
+            Both are 0 if a touch has no direction; they are then undefined.
 
     Raises:
-        ValueError: a gate that is no label, or a gate or a direction beside labels that are not binary.
+        ValueError: the gate is no label, or labels with a gate or a direction are not binary.
     """
 
     names: Annotated[tuple[str, ...], MinLen(1), ONCE]
@@ -54,7 +54,7 @@ class Task:
         return tuple(name for name in self.binary if name != self.gate)
 
     def counts(self, labels: Tensor) -> Tensor:
-        """Return which of the labels (B, L) mean something, bool; a shut gate or no direction: nothing."""
+        """Return the mask of the labels (B, L) that are defined, bool, by gate and direction."""
         counts = torch.ones_like(labels, dtype=torch.bool)
         if self.gate is not None:
             gate = self.names.index(self.gate)
@@ -99,13 +99,13 @@ def sliding(net: Tensor, way: Tensor) -> Tensor:
 
 
 OPPOSITE = {"big": "small", "dynamic": "static", "press": "tap", "dangerous": "safe"}
-"""Label -> what a touch is without it."""
+"""Label -> name of its opposite."""
 
 
 @checked("touch.thresholds")
 @dataclass(frozen=True)
 class Thresholds:
-    """Where the report draws its lines (section 2.1.1).
+    """Thresholds of the labels (report, section 2.1.1).
 
     Attributes:
         area: a touch is big if it covers more than this share of the sheet.
@@ -124,7 +124,7 @@ class Thresholds:
 
 
 class Measures(NamedTuple):
-    """What a movie says about each of its gestures; every tensor is (B,).
+    """Measures of each gesture of a movie; every tensor is (B,).
 
     Attributes:
         area: largest share of the sheet in contact in one frame.
@@ -155,12 +155,12 @@ def measure_gestures(
     cell: tuple[float, float],
     contact: float = Thresholds.contact,
 ) -> Measures:
-    """Measure gestures given as distinct frames, so that no frame is looked at twice.
+    """Measure gestures given as distinct frames, each processed once.
 
     Args:
         frames: (U, H, W), Pa; a frame belongs to one gesture.
-        index: (B, T), which frame is shown.
-        scale: (B, T), by what it is multiplied, 0 where nothing touches.
+        index: (B, T), index of the frame.
+        scale: (B, T), factor of the frame, 0 without touch.
         footprints: (S, H * W), area weights of each sensor that sum to 1.
         cell: extent (x, y) of a cell, m.
         contact: share of the gesture's peak cell above which a cell is in contact.
@@ -218,7 +218,7 @@ def movie_labels(
         pressure: (B, T, H, W), Pa.
         footprints: (S, H * W), area weights of each sensor that sum to 1.
         cell: extent (x, y) of a cell, m.
-        thresholds: where the lines are; the report's if None.
+        thresholds: of the labels; None: those of the report.
     """
     thresholds = thresholds or Thresholds()
     batch, time = pressure.shape[:2]

@@ -38,7 +38,7 @@ class Material:
     """A linear elastic material, which may relax.
 
     Attributes:
-        name: what it is called; it has no meaning to the mechanics.
+        name: of the material; it does not affect the mechanics.
         young: Young's modulus E, Pa; of a material that relaxes, that which is left in the end.
         poisson: Poisson's ratio nu. The plate-and-beam model takes -1 < nu < 1, where its shear modulus
             E / 2(1 + nu) and its plate stiffness E / (1 - nu^2) are positive. A solid needs nu < 0.5.

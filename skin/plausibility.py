@@ -54,7 +54,7 @@ def check_plausibility(groups: Mapping[str, Any]) -> None:
         groups: the configuration, in plain containers. What is no number is left to the classes.
 
     Raises:
-        InputError: a value out of its range.
+        InputError: a value is out of its range.
     """
     for name, ranges in _RANGES.items():
         _within(name, groups.get(name), ranges)

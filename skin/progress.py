@@ -1,4 +1,4 @@
-"""How long the jobs of a sweep will take."""
+"""Progress of a sweep and its estimated duration."""
 
 import csv
 import math
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class SweepProgress:
-    """Counts jobs and estimates what is left.
+    """Estimates the remaining time of a sweep.
 
     Args:
-        seconds: what each job took before on some machine, in order; None where nobody knows.
+        seconds: earlier duration of each job on some machine, in order; None if unknown.
     """
 
     def __init__(self, seconds: list[float | None]) -> None:
@@ -28,24 +28,24 @@ class SweepProgress:
         self._spent = self._done = 0.0
 
     def finish(self, number: int, seconds: float, skipped: bool) -> None:
-        """Note that a job has ended; one that was skipped says nothing about the machine's speed."""
+        """Record the end of a job; skipped jobs do not count for the machine's speed."""
         if not skipped:
             self._spent += seconds
             self._done += self._expected[number]
         self._expected[number] = 0.0
 
     def left(self) -> float | None:
-        """Return the estimated rest, s, scaled by this machine's speed so far; None if nothing is known."""
+        """Return the estimated remaining time, s, scaled by this machine's speed so far; None if unknown."""
         if not self._done:
             return sum(self._expected) if self._sure else None
         return sum(self._expected) * self._spent / self._done
 
 
 def expected_seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]) -> float | None:
-    """Return how long the last finished run of the same row and simulator took, s.
+    """Return the duration of the last finished run of the same row and simulator, s.
 
-    Where there is none, the published table tells: its seconds per epoch times the epochs, and a third more
-    for the evaluation.
+    Without one, it is estimated from the published table: seconds per epoch times epochs, plus a third for
+    the evaluation. None if the row is not in the table.
     """
     same = {name: tags[name] for name in ("row", "simulator")}
     if finished := store.find("FINISHED", **same):
@@ -62,6 +62,6 @@ def expected_seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]
 
 
 def format_duration(duration: float) -> str:
-    """Return a duration in s for a person."""
+    """Return a duration in s as text."""
     minutes = math.ceil(duration / 60)
     return f"{duration:.0f} s" if duration < 90 else f"{minutes} min"

@@ -18,14 +18,14 @@ class Touches:
 
     Attributes:
         readings: (B, T, S), N.
-        valid: (B, T, S), bool: False where a reading means nothing (dead sensor, lost frame).
+        valid: (B, T, S), bool: False for invalid readings (dead sensor, lost frame).
         positions: (S, 3) or (B, T, S, 3), m: x right and y down from the upper left corner, z depth.
         labels: (B, L), 0 or 1, float; or None.
         rate: frames per second, Hz.
         motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
-            None where nobody knows.
+            None if unknown.
         saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
-            where nobody knows.
+            if unknown.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -73,10 +73,10 @@ class Touches:
         """The labels, (B, L).
 
         Raises:
-            InputError: nobody knows them.
+            InputError: the touches have no labels.
         """
         if self.labels is None:
-            raise InputError("touches without labels cannot be learnt from: record them with labels")
+            raise InputError("touches without labels cannot be used for training: record them with labels")
         return self.labels
 
     def to(self, device: torch.device | str) -> "Touches":
@@ -89,17 +89,17 @@ class Touches:
 
 @dataclass(frozen=True)
 class Recording:
-    """Touches with all that is known about them, as :mod:`skin.recording_file` keeps them in a file.
+    """Touches with labels and parameters, as :mod:`skin.recording_file` stores them.
 
     Attributes:
         touches: B touches of T frames; their positions are common to all, (S, 3).
-        task: what the labels mean.
+        task: the labels.
         size: extent (x, y) of the sheet, m.
-        footprint: extent (x, y) over which a sensor feels, m.
-        force: applied force, (B, T), N; None where nobody knows it.
+        footprint: extent (x, y) of a sensor, m.
+        force: applied force, (B, T), N; None if unknown.
         displacement: (B, T, S, 2), m: D_s and D_t (``skin.simulator.base.Response``); or None.
-        parameters: (B,) each, float32: what else is known of each gesture.
-        metadata: anything that JSON can hold: seeds, versions, hashes, a summary.
+        parameters: (B,) each, float32: further parameters of each gesture.
+        metadata: any JSON data: seeds, versions, hashes, a summary.
 
     Raises:
         ValueError: shapes disagree.

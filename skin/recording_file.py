@@ -33,10 +33,10 @@ UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m",
 
 
 def write_recording(recording: Recording, path: str | Path) -> Path:
-    """Write a recording whole: under another name first, then in place of what was there.
+    """Write a recording atomically.
 
     Args:
-        recording: what to keep.
+        recording: to write.
         path: ``x.parquet`` or ``x.csv``.
 
     Raises:
@@ -51,13 +51,13 @@ def write_recording(recording: Recording, path: str | Path) -> Path:
             pa.parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
         else:
             pa.csv.write_csv(table, partial)
-            # The table takes its place last: without it the sidecar means nothing.
+            # The table is moved last, because the sidecar is useless without it.
             files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
     return path
 
 
 def read_recording(path: str | Path) -> Recording:
-    """Read what :func:`write_recording` wrote; equal to the last bit.
+    """Read a recording of :func:`write_recording`; equal to the last bit.
 
     Raises:
         InputError: no such file, not a recording, damaged, or rows that are not whole touches.

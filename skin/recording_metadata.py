@@ -16,7 +16,7 @@ _Extent = Annotated[float, Gt(0), Lt(1e9)]
 
 @dataclass(frozen=True)
 class _Description:
-    """What reading relies on; older recordings have no more."""
+    """Required keys, which older recordings have too."""
 
     units: dict
     gestures: _Count
@@ -34,15 +34,15 @@ class _Description:
 
 
 def check_metadata(about: Any, where: str) -> Task:
-    """Check the description of a recording, and return what its labels mean.
+    """Check the metadata of a recording, and return its task.
 
     Args:
-        about: as JSON gave it.
-        where: it comes from, for the message.
+        about: decoded JSON.
+        where: file, for the message.
 
     Raises:
-        InputError: something is missing or is of another kind; the sentence names it.
-        ValueError: no labels of this kind.
+        InputError: a key is missing or has a wrong type; the message names it.
+        ValueError: invalid labels.
     """
     known = about
     if isinstance(about, Mapping):
@@ -53,7 +53,7 @@ def check_metadata(about: Any, where: str) -> Task:
 
 
 def check_rows(about: Mapping[str, Any], rows: int, columns: int, where: str) -> None:
-    """Check that a file has the rows that its description tells of, and that they fit into memory.
+    """Check that a file has the rows that its metadata describe, and that they fit into memory.
 
     Args:
         about: checked before.

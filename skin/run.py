@@ -38,7 +38,7 @@ from skin.stored_run import TAG
 from skin.tracking import Store
 
 SWEPT = "SKIN_SWEPT"
-"""Environment variable by which a sweep tells its jobs which settings it sweeps."""
+"""Environment variable with the settings that a sweep varies, for its jobs."""
 
 _STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
@@ -57,7 +57,7 @@ class _OpenLogger(MLFlowLogger):
 
 
 def train(config: DictConfig) -> bool:
-    """Train and evaluate as a configuration says; return False if a finished run holds the results already.
+    """Train and evaluate a configuration; return False if a finished run has the results.
 
     A run that finished with the same fingerprint is not repeated, unless ``tracking.resume=false``.
     """
@@ -94,7 +94,7 @@ def train(config: DictConfig) -> bool:
 
 
 def _limit_threads(number: int | None) -> None:
-    """Let torch use so many threads; None: as many as it likes."""
+    """Set the number of threads of torch; None: its default."""
     if number is not None:
         if number < 1:
             raise InputError(f"tracking.threads={number} must be at least 1, or null")
@@ -102,7 +102,7 @@ def _limit_threads(number: int | None) -> None:
 
 
 def _keep(store: Store, run: Run, learner: AbstractLearner) -> None:
-    """Log what was learned."""
+    """Log the trained learner."""
     with tempfile.TemporaryDirectory() as folder:
         path = learner.save(Path(folder))
         store.client.log_artifact(run.info.run_id, str(path))
@@ -117,7 +117,7 @@ def _join(config: DictConfig) -> None:
 
 
 def tags(config: DictConfig) -> dict[str, str]:
-    """Return the tags by which a run is found again."""
+    """Return the tags that identify a run."""
     return {
         "fingerprint": fingerprint(config),
         "row": config.row,
@@ -138,13 +138,13 @@ def _option(part: DictConfig, name: str) -> str:
 
 
 def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
-    """Log what a run is made from, before it starts.
+    """Log the configuration of a run before it starts.
 
     Args:
         store: where.
         run: its id.
-        config: its configuration; groups that had no part in it may be left out.
-        touches: that it learns from.
+        config: its configuration; unused groups may be left out.
+        touches: of its training.
     """
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(plain(config))), "config.yaml")
     store.client.set_tag(run, "data_hash", touches_hash(touches))
@@ -167,7 +167,7 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
 
 
 def _differences(config: DictConfig) -> list[str]:
-    """Return what tells this run from others with its row, simulator and seed: in a sweep, what is swept."""
+    """Return the overrides that distinguish this run: in a sweep, those that are swept."""
     found = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
     if SWEPT in os.environ:
         found = {key: value for key, value in found.items() if key in os.environ[SWEPT].split()}
@@ -175,7 +175,7 @@ def _differences(config: DictConfig) -> list[str]:
 
 
 def relevant_overrides(config: DictConfig) -> dict[str, str]:
-    """Return the overrides of the running command that its result may depend on; else none."""
+    """Return the overrides of the running command that affect its result; empty without a command."""
     if not HydraConfig.initialized():
         return {}
     parsed = OverridesParser.create().parse_overrides(overrides())
@@ -199,7 +199,7 @@ def _holds(value: Any, name: str) -> bool:
 
 
 def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
-    """Log what an evaluation found, with its predictions and confusion matrices, and further values.
+    """Log an evaluation, with its predictions and confusion matrices, and further values.
 
     The operating point is stored as the tag ``TAG``; :func:`skin.stored_run.load_operating_point` reads it.
     """
@@ -219,7 +219,7 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
 
 
 def _write(report: Report, task: Task, folder: Path) -> None:
-    """Write what a person will open: predictions, and confusion matrices as a picture."""
+    """Write predictions, and confusion matrices as a picture."""
     pq.write_table(report.predictions, folder / "predictions.parquet")
     if report.confusion is not None:
         named = dict(zip(task.binary, report.confusion.numpy(), strict=True))

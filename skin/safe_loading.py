@@ -16,10 +16,10 @@ _BYTES = 1 << 30
 
 
 def load_yaml(path: Path) -> Any:
-    """Return what a YAML file holds, as plain containers, interpolations as they stand.
+    """Return the content of a YAML file as plain containers, without resolving interpolations.
 
     Raises:
-        ValueError: no YAML, too large, or with aliases, by which some lines become gigabytes.
+        ValueError: no YAML, too large, or with aliases, which can expand to gigabytes.
         OSError: unreadable.
     """
     if path.stat().st_size > _TEXT:
@@ -37,14 +37,14 @@ def load_yaml(path: Path) -> Any:
 
 
 def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file, which holds numbers and texts, no objects.
+    """Return the arrays of an .npz file without objects.
 
     Args:
         path: of the file.
-        most: bytes that its arrays may take together.
+        most: largest total size of the arrays, bytes.
 
     Raises:
-        ValueError: no such file, objects, larger arrays, or shapes that do not fit what is there.
+        ValueError: no such file, objects, larger arrays, or shapes that do not match the data.
         OSError: unreadable.
     """
     try:
@@ -61,7 +61,7 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
 
 
 def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
-    """Return how many bytes an array takes, which are as many as its entry holds."""
+    """Return the size of an array, bytes, which must match that of its entry."""
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         known = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

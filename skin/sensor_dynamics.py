@@ -5,9 +5,10 @@ from torch import Tensor
 
 
 def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Tensor:
-    """Return readings (B, T, S) behind a first-order lag that starts at rest.
+    """Return readings (B, T, S) after a first-order lag that starts at rest.
 
-    Exact for a force that is held from one frame to the next: the rest decays by exp(-dt / time_constant).
+    The result is exact for a force that is constant between frames. The difference decays by
+    exp(-dt / time_constant).
 
     Args:
         readings: N.
@@ -17,12 +18,12 @@ def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Te
     constant = time_constant.to(readings.dtype)
     constant = constant[:, 0] if constant.ndim == 3 else constant
     steps = time.diff(prepend=2 * time[:1] - time[1:2]).to(readings.dtype)
-    state, said = torch.zeros_like(readings[:, 0]), torch.empty_like(readings)
+    state, output = torch.zeros_like(readings[:, 0]), torch.empty_like(readings)
     for number, frame in enumerate(readings.unbind(1)):
-        # A constant of 0 gives exp(-inf) = 0; the least number keeps 0 / 0 away.
+        # A constant of 0 gives exp(-inf) = 0; the clamp avoids 0 / 0.
         state = torch.lerp(frame, state, torch.exp(-steps[number] / constant.clamp(min=1e-9)))
-        said[:, number] = state
-    return said
+        output[:, number] = state
+    return output
 
 
 def running_peak(readings: Tensor) -> Tensor:
@@ -36,7 +37,7 @@ def running_peak(readings: Tensor) -> Tensor:
 
 
 def apply_hysteresis(readings: Tensor, hysteresis: Tensor) -> Tensor:
-    """Return what is felt, (B, T, S), N: more on the way back from a peak, by a share of it on average.
+    """Return readings (B, T, S), N, with hysteresis: larger on unloading, by a mean share of the peak.
 
     At a force x after a peak P that is x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
     """
@@ -46,6 +47,6 @@ def apply_hysteresis(readings: Tensor, hysteresis: Tensor) -> Tensor:
 
 
 def quantize(readings: Tensor, quantum: Tensor) -> Tensor:
-    """Return readings in whole steps of ``quantum``, N; 0: as they are."""
+    """Return readings rounded to multiples of ``quantum``, N; 0: not rounded."""
     step = torch.where(quantum > 0, quantum, 1)
     return torch.where(quantum > 0, torch.round(readings / step) * step, readings)

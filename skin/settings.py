@@ -50,13 +50,13 @@ ONCE = AfterValidator(_once)
 def check_settings(
     target: Callable[..., Any], settings: Mapping[str, Any], name: str, whole: bool = False
 ) -> None:
-    """Refuse settings that a class or function does not have, or does not take.
+    """Check settings against the parameters of a class or function.
 
     Args:
-        target: what they configure.
+        target: the class or function.
         settings: in plain containers; keys that begin with ``_`` are Hydra's.
-        name: where they stand in the configuration, for the message.
-        whole: whether they are all that the target is given; if not, the program gives what has no default.
+        name: their place in the configuration, for the message.
+        whole: whether they are all arguments; if not, the program passes those without a default.
 
     Raises:
         InputError: naming the setting, its value and what is valid.
@@ -87,10 +87,10 @@ def check_settings(
 
 
 def configured(target: Callable[..., _Made], settings: Mapping[str, Any], name: str) -> _Made:
-    """Return what a class or function makes of settings that were checked.
+    """Check settings and call a class or function with them.
 
     Args:
-        target: what they configure; it takes nothing else.
+        target: the class or function; it takes no other arguments.
         settings: in plain containers.
         name: as in :func:`check_settings`.
 
@@ -102,7 +102,7 @@ def configured(target: Callable[..., _Made], settings: Mapping[str, Any], name: 
 
 
 def checked(name: str) -> Callable[[type[_Made]], type[_Made]]:
-    """Let a class check its arguments, so that a script is refused what a configuration is refused.
+    """Return a class decorator that checks arguments like settings of a configuration.
 
     Args:
         name: as in :func:`check_settings`.
@@ -123,7 +123,7 @@ def checked(name: str) -> Callable[[type[_Made]], type[_Made]]:
 
 
 def check_groups(config: Mapping[str, Any]) -> None:
-    """Check all parts of a configuration that build something, except classes of libraries.
+    """Check all parts of a configuration with a ``_target_``, except classes of libraries.
 
     Args:
         config: in plain containers.
@@ -132,7 +132,7 @@ def check_groups(config: Mapping[str, Any]) -> None:
         InputError: as :func:`check_settings`, or a class that cannot be imported.
     """
     for name, part in _parts(config, ""):
-        # A learner holds its model: people set it by the name of the group.
+        # The model is inside the learner, but is set by the name of its group.
         inner = name.split(".")[-1]
         shown = inner if inner in _INNER else name
         check_settings(import_target(part["_target_"], shown), part, shown)
@@ -158,7 +158,7 @@ def import_target(target: str, name: str) -> Callable[..., Any]:
 
 
 def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield every mapping with a ``_target_`` that is no library's, the innermost first, with its name."""
+    """Yield every mapping with a ``_target_`` outside of libraries, the innermost first, with its name."""
     if isinstance(value, Mapping):
         for key, one in value.items():
             yield from _parts(one, f"{name}.{key}" if name else str(key))
@@ -174,7 +174,7 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
     except NameError:
         if target.__module__.startswith("skin."):
             raise
-        return {}  # others may use names that only type checkers know
+        return {}  # annotations of others may need names that exist for type checkers only
 
 
 def _plain(hint: Any) -> bool:
@@ -193,11 +193,11 @@ def _adapter(hint: Any) -> TypeAdapter:
 
 
 def _refusal(hint: Any, value: Any) -> str:
-    """Return what is wrong with a value, and what is valid; empty if it fits."""
+    """Return why a value is invalid, and what is valid; empty if it is valid."""
     try:
         taken = _adapter(hint).validate_python(value)
     except ValidationError as error:
-        # Of a union, what is said of the member that the value came closest to.
+        # Of a union, the message for the closest member.
         nearest = max(error.errors(), key=lambda one: len(one["loc"]))
         said = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
         said = said.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
@@ -211,7 +211,7 @@ def _refusal(hint: Any, value: Any) -> str:
 
 
 def _changed(value: Any, taken: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield what pydantic has converted to another type, which would reach the class unconverted."""
+    """Yield values that pydantic converted to another type, because the class gets the original."""
     if isinstance(value, list | tuple):
         for pair in zip(value, taken, strict=True):
             yield from _changed(*pair)
@@ -221,7 +221,7 @@ def _changed(value: Any, taken: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _written(default: Any) -> str:
-    """Return a default as an override has it; empty if it is no example."""
+    """Return a default in the syntax of overrides; empty if it is not useful as an example."""
     if isinstance(default, list | tuple) and default:
         return f"[{','.join(map(_written, default))}]"
     return str(default) if isinstance(default, int | float | str) and not isinstance(default, bool) else ""

@@ -1,4 +1,4 @@
-"""Restore a finished run: its configuration with changes, and its weights."""
+"""Load a finished run: its configuration with changes, and its weights."""
 
 import pickle
 import sys
@@ -27,7 +27,7 @@ from skin.trust import check_targets
 TAG = "operating_point"
 """Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
 
-# What a learner raises on a file that is damaged, or that another learner wrote.
+# Errors of loading a file that is damaged or belongs to another learner.
 _UNFIT = (
     ArithmeticError,
     AttributeError,
@@ -39,7 +39,7 @@ _UNFIT = (
     ValueError,
     pickle.PickleError,
 )
-# What a run learned fits these as they were; the rest may be tried with others.
+# Groups that the weights of a run depend on.
 _FIXED = (
     "representation",
     "model",
@@ -54,10 +54,10 @@ _FIXED = (
 
 
 def find_run(store: Store, name: str) -> Run:
-    """Return the finished training run with an id that begins so; ``latest`` is the last one that finished.
+    """Return the finished training run whose id begins with ``name``; ``latest`` is the last finished one.
 
     Raises:
-        InputError: there is none, or more than one.
+        InputError: no run or more than one matches.
     """
     runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
     named = [run for run in runs if run.info.run_id.startswith(name)]
@@ -70,15 +70,15 @@ def find_run(store: Store, name: str) -> Run:
 
 
 def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfig:
-    """Return the configuration that a run was made from, every value in it final.
+    """Return the resolved configuration of a run.
 
     Args:
         store: where the run is.
-        run: whoever made it.
+        run: the run.
         trust: skip :func:`skin.trust.check_targets`; the configuration may then run any code.
 
     Raises:
-        InputError: it cannot be read, or names what a stored run may not build.
+        InputError: the configuration cannot be read, or names a class that is not allowed.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = _fetched(store, run, "config.yaml", folder)
@@ -94,15 +94,15 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
 
 
 def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Return a run's configuration with the changes that a command line asks for, checked.
+    """Return a run's configuration with the overrides of a command line, checked.
 
     Args:
         stored: as :func:`load_configuration` gives it.
-        composed: a fresh configuration that the overrides have changed.
-        overrides: of the command line: only what they name is taken from ``composed``.
+        composed: a new configuration with the overrides.
+        overrides: of the command line; only these settings are taken from ``composed``.
 
     Raises:
-        InputError: an override would not fit what the run learned.
+        InputError: an override changes a setting that the weights depend on.
     """
     whole = OmegaConf.create(_raw(stored))
     assert isinstance(whole, DictConfig)
@@ -116,20 +116,20 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
             raise InputError(f"{key} was fixed when the run was trained: leave it out, or train another run")
         parent, _, name = key.rpartition(".")
         source = OmegaConf.select(composed, parent) if parent else composed
-        # As it stands there, unresolved: a device follows the simulator of this run, not of a default one.
+        # Unresolved, so that a device refers to the simulator of this run.
         OmegaConf.update(whole, key, _raw(source)[name], merge=False)
     if "rate" in whole.device and whole.device.rate is None:
-        # A live device is reduced to the frames that the run has learnt from.
+        # A live device is resampled to the rate of the training.
         whole.device.rate = stored.device.get("rate")
     whole.tracking = composed.tracking
     return validate_config(whole)
 
 
 def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -> None:
-    """Give a learner what a run learned.
+    """Load the weights of a run into a learner.
 
     Raises:
-        InputError: what it learned does not fit the touches, as another window does not fit early fusion.
+        InputError: the weights do not fit the touches, such as another window with early fusion.
     """
     name = run.data.tags["learned"]
     if Path(name).name != name:
@@ -151,19 +151,19 @@ def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchDa
 def load_operating_point(
     run: Run, learner: AbstractLearner, stored: DictConfig, settings: Evaluation
 ) -> OperatingPoint | None:
-    """Return where a run raises the alarm; None where its task has no label ``dangerous``.
+    """Return the operating point of a run; None if its task has no label ``dangerous``.
 
-    It is stored with the run. If the run stores none for the target rate that is asked for, it is chosen now,
-    where the device draws fresh gestures; else it is 0.5. Both are told on standard error.
+    It is stored with the run. If the run has none for the target rate, it is chosen now if the device draws
+    fresh gestures; else the threshold is 0.5. Both cases are reported on standard error.
 
     Args:
         run: a finished training.
-        learner: what it learned.
+        learner: its trained learner.
         stored: its configuration as :func:`load_configuration` gives it: the device it was trained on.
         settings: the target rate and the number of safe gestures.
 
     Raises:
-        InputError: the stored one cannot be read.
+        InputError: the stored operating point cannot be read.
     """
     text, target = run.data.tags.get(TAG), settings.false_alarm_rate
     known = None if text is None else parse_operating_point(text)
@@ -172,19 +172,19 @@ def load_operating_point(
     lacks = f"run {run.info.run_id} stores no alarm threshold for {100 * target:g} % false alarms"
     if "simulator" in stored.device:
         point = choose_operating_point(learner, build_device(stored), settings)
-        said = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
+        message = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
     else:
         point = known or OperatingPoint.default(target)
-        said = (
+        message = (
             f"{lacks} and its device draws no fresh gestures: {point.sentence()}; train it again to store one"
         )
-    if said:
-        print(said, file=sys.stderr, flush=True)
+    if message:
+        print(message, file=sys.stderr, flush=True)
     return point
 
 
 def _reason(error: Exception) -> str:
-    """Return what an error says, in short; torch's words on a pickle advise to run the code in it."""
+    """Return a short message; that of torch on a pickle would advise to run its code."""
     if isinstance(error, pickle.PickleError):
         return "it holds something else than numbers"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -203,7 +203,7 @@ def _fetched(store: Store, run: Run, name: str, folder: str) -> Path:
 
 
 def _follow(whole: DictConfig, composed: DictConfig) -> None:
-    """Let the device follow other groups again, as a fresh configuration does, where it did in the run.
+    """Restore the interpolations of the device to other groups that the run had.
 
     Stored configurations are resolved; without this ``simulator=naive`` would not reach ``device.simulator``.
     """

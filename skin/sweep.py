@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 
 def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
-    """Return what Hydra's sweeper will choose in each job of a multirun, in its order.
+    """Return the overrides of each job of a multirun, in the order of Hydra's sweeper.
 
     Args:
-        overrides: of the command line; the later one of a key holds.
+        overrides: of the command line; of equal keys the last one counts.
         parameters: ``hydra.sweeper.params``.
 
     Raises:
-        InputError: an interval, which has no first and no last value to try.
+        InputError: an interval, which has no discrete values.
     """
-    # Only a loader knows the options that glob(...) means.
+    # glob(...) needs a loader to list options.
     loader = GlobalHydra.instance().config_loader() if GlobalHydra.instance().is_initialized() else None
     lines = [f"{key}={value}" for key, value in parameters.items()] + overrides
     parsed = OverridesParser.create(loader).parse_overrides(lines)
@@ -86,7 +86,7 @@ class Sweep(Callback):
         self._began = 0.0
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Open the parent run and tell the jobs about it."""
+        """Open the parent run, and pass it to the jobs."""
         if not self._wanted or "tracking" not in config:
             return
         try:
@@ -95,7 +95,7 @@ class Sweep(Callback):
             refused = to_input_error(error)
             if refused is None:
                 raise
-            # What no job could accept is refused once, before any of them; Hydra lets only exits pass here.
+            # Errors of all jobs are reported once, before the first; Hydra passes only exits on here.
             print(refused, file=sys.stderr)
             sys.exit(2)
 
@@ -120,9 +120,9 @@ class Sweep(Callback):
         _share_cores(config.hydra.launcher)
         identities = [tags(job) if job else {} for job in composed]
         self._fingerprints = [one.get("fingerprint", "") for one in identities]
-        told = zip(composed, identities, strict=True)
+        pairs = zip(composed, identities, strict=True)
         self._progress = SweepProgress(
-            [expected_seconds(store, job, one) if job else None for job, one in told]
+            [expected_seconds(store, job, one) if job else None for job, one in pairs]
         )
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -155,12 +155,12 @@ class Sweep(Callback):
         store, self._store = self._store, None
         if store is None or self._parent is None:
             return
-        # A database that refuses was told of before, and nobody hears an exit; the next start closes the run.
+        # Errors of the database were reported before; the next start closes the run.
         with suppress(Exception):
             self._conclude(store, self._parent)
 
     def _conclude(self, store: "Store", parent: "Run") -> None:
-        """Log what the jobs found, whenever they were finished; delete a parent without children."""
+        """Log the results of all jobs; delete a parent without children."""
         from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
         from skin.variants import log_variants

@@ -2,7 +2,7 @@
 
 import os
 
-# Before mlflow is imported: it reports home by default.
+# Before mlflow is imported, because it sends telemetry by default.
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
@@ -42,7 +42,7 @@ class Store:
     """An MLflow experiment in a database that exists.
 
     Attributes:
-        client: speaks to the tracking store.
+        client: of the tracking store.
         uri: of the tracking store.
         experiment: id of the experiment.
     """
@@ -94,14 +94,14 @@ class Store:
         )
 
     def create(self, name: str, tags: dict[str, str]) -> Run:
-        """Return a new run with a tag that tells which process works on it; who calls this ends it."""
+        """Return a new run, tagged with this process; the caller must end it."""
         tags = tags | {_PROCESS: _me()}
         return self.client.create_run(self.experiment, run_name=name, tags=tags)
 
     def _close_abandoned(self) -> None:
-        """Call runs KILLED whose process is gone: nobody else ever will.
+        """Set the status of runs whose process no longer exists to KILLED.
 
-        Only a process of this machine can be known to be gone. Runs without the tag are left as they are.
+        Only processes of this machine can be checked. Runs without the tag are left unchanged.
         """
         for run in self.find("RUNNING"):
             if _gone(run.data.tags.get(_PROCESS, "")):
@@ -133,7 +133,7 @@ class Store:
 
 
 def _where() -> str:
-    """Return what tells apart machines, and containers of one machine that number processes by themselves."""
+    """Return an identifier of the machine, or of the container with its own process numbers."""
     try:
         space = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -142,12 +142,12 @@ def _where() -> str:
 
 
 def _me() -> str:
-    """Return the tag of this process: its start tells it from a later one with the same number."""
+    """Return the tag of this process; its start time makes it unique."""
     return json.dumps([_where(), os.getpid(), psutil.Process().create_time()])
 
 
 def _gone(process: str) -> bool:
-    """Return whether the process that a tag names ran on this machine and does so no more."""
+    """Return whether a tagged process of this machine no longer exists."""
     try:
         where, number, started = json.loads(process)
         if where != _where():
@@ -161,7 +161,7 @@ def _gone(process: str) -> bool:
 
 @contextmanager
 def ends_on_signal() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit, so that what is open is closed; only the main thread can."""
+    """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread."""
 
     def leave(number: int, frame: FrameType | None) -> None:
         raise SystemExit(128 + number)
@@ -187,7 +187,7 @@ def commit() -> str:
         return result.stdout.strip()
 
     try:
-        if BUNDLED != ROOT:  # a wheel, which may lie in somebody else's repository
+        if BUNDLED != ROOT:  # a wheel, which may be installed inside another repository
             return "unknown"
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
     except (OSError, subprocess.CalledProcessError):
@@ -195,7 +195,7 @@ def commit() -> str:
 
 
 def _make(path: Path, artifacts: Path) -> None:
-    """Make a database under another name first: one that is cut short halfway could not be opened again."""
+    """Create a database atomically: an incomplete one could not be opened again."""
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
 
     with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
@@ -204,7 +204,7 @@ def _make(path: Path, artifacts: Path) -> None:
 
 @contextmanager
 def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
-    """Keep other processes out while a SQLite database is made: two that make it at once both fail."""
+    """Lock the creation of a SQLite database, which fails in two processes at the same time."""
     if not uri.startswith("sqlite:///"):
         yield
         return

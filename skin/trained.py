@@ -21,12 +21,12 @@ class Trained:
     """A trained run.
 
     Attributes:
-        device: that it was trained on, or what its configuration was changed to.
+        device: of its training, or as its configuration was changed.
         learner: trained.
         window: T, frames.
         positions: (S, 3), m.
         rate: Hz.
-        point: where its alarm is raised; None where it knows no label ``dangerous``.
+        point: operating point of its alarm; None without the label ``dangerous``.
     """
 
     device: AbstractDevice
@@ -45,7 +45,7 @@ class Trained:
         """Return the probability of each label, (B, L), for touches of this window and rate.
 
         Raises:
-            InputError: touches that the run cannot take.
+            InputError: the touches do not fit the run.
         """
         return self.learner.probabilities(touches)
 
@@ -56,7 +56,7 @@ def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) 
     Args:
         name: the beginning of its id; ``latest`` is the last one that finished.
         uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
-        trust: build whatever its configuration names, which may run any code.
+        trust: allow any class in its configuration, which may run any code.
 
     Raises:
         InputError: there is no such run, or it cannot be loaded.
@@ -68,16 +68,16 @@ def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) 
 
 
 def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
-    """Return a run with what it learned.
+    """Load a finished run with its weights.
 
     Args:
-        store: where it is.
+        store: that holds the run.
         run: a finished training.
         config: its configuration, changed as :func:`skin.stored_run.apply_overrides` does.
-        stored: its configuration as it was.
+        stored: its configuration without changes.
 
     Raises:
-        InputError: what it learned does not fit the configuration.
+        InputError: its weights do not fit the configuration.
     """
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device.blank())

@@ -35,7 +35,7 @@ _BASES |= _LIBRARIES
 
 
 def check_targets(config: Any, where: str) -> None:
-    """Check that a stored configuration builds nothing but parts of this package and of its libraries.
+    """Check that a stored configuration builds only classes of this package and of its libraries.
 
     Allowed are subclasses of a group's base class that ``skin`` defines, optimizers of ``torch.optim``, and
     aggregations, convolutions and networks (``BasicGNN``) of ``torch_geometric.nn``. Names are resolved, so
@@ -43,10 +43,10 @@ def check_targets(config: Any, where: str) -> None:
 
     Args:
         config: plain containers.
-        where: they come from, for the message.
+        where: its source, for the message.
 
     Raises:
-        InputError: anything else is named, or a value is an interpolation, which could become a name later.
+        InputError: another class is named, or a value is an interpolation, which could become a name.
     """
     for path, value in _values(config, ()):
         if isinstance(value, str) and "${" in value:
@@ -60,7 +60,7 @@ def check_targets(config: Any, where: str) -> None:
 
 def _refuse(where: str, path: tuple[str, ...], reason: str) -> None:
     raise InputError(
-        f"{where}: {'.'.join(path)} {reason}; if you trust whoever made the run, add trust=true to load it"
+        f"{where}: {'.'.join(path)} {reason}; if you trust the author of the run, add trust=true to load it"
     )
 
 
@@ -79,7 +79,7 @@ def _values(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
 
 
 def _allowed(name: Any) -> bool:
-    """Return whether a name stands for a class that a stored run may build.
+    """Return whether a name is that of an allowed class.
 
     The name's package is checked first, because to resolve a name imports modules, and then the class.
     """
@@ -90,7 +90,7 @@ def _allowed(name: Any) -> bool:
         return False
     try:
         found = import_name(name)
-    except Exception:  # whatever resolving raises, there is no such class
+    except Exception:  # any error means that there is no such class
         return False
     if not inspect.isclass(found) or inspect.isabstract(found):
         return False
@@ -99,7 +99,7 @@ def _allowed(name: Any) -> bool:
 
 
 def import_name(name: str) -> Any:
-    """Return what a dotted name stands for, as Hydra would; its own function logs what it does not find.
+    """Import an object by its dotted name, like Hydra, but without logging errors.
 
     Raises:
         ImportError: there is no such module, class or function.

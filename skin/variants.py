@@ -15,7 +15,7 @@ _LEGAL = re.compile(r"[\w.\- ]+")  # part of the name of a metric in MLflow
 
 
 def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
-    """Return what is swept, such as ``model.norm=none,layer × seed=0,1``, for the name of a run."""
+    """Return the swept settings, such as ``model.norm=none,layer × seed=0,1``, for the name of a run."""
     values = {key: dict.fromkeys(job[key] for job in jobs) for key in swept}
     text = " × ".join(f"{key.lstrip('+')}={','.join(one)}" for key, one in values.items())
     return text if len(text) <= 250 else f"{text[:249]}…"
@@ -32,7 +32,7 @@ def log_variants(
     Args:
         store: where.
         parent: the parent run.
-        keys: settings that tell the variants apart.
+        keys: settings that distinguish the variants.
         runs: values of these settings -> finished runs, one per seed.
     """
     rows: list[dict[str, Any]] = []

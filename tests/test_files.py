@@ -121,7 +121,7 @@ def test_a_database_on_a_full_disk_is_told_of_and_goes_on(tmp_path):
     store = Store.open(settings)
     with full(), pytest.raises(Exception, match="disk") as caught:  # MLflow's own
         store.client.create_run(store.experiment)
-    assert "the database of runs refuses" in str(to_input_error(caught.value))
+    assert "the database of runs failed" in str(to_input_error(caught.value))
     with store.run("later", {}):
         pass
 

@@ -1,4 +1,4 @@
-"""Animate a simulated or recorded touch as GIF; or draw its strongest frame as PNG.
+"""Animate a simulated or recorded touch as GIF, or draw its strongest frame as PNG.
 
     skin animate out=x.gif labels=[big,dynamic,press] shape=hand seed=3
     skin animate out=x.png device=recording device.path=touches.parquet index=5
@@ -14,7 +14,7 @@ from skin.errors import InputError
 
 @command("animate")
 def main(config: DictConfig) -> None:
-    """Write a GIF or PNG of a simulated touch, or of one that a recording holds."""
+    """Write a GIF or PNG of a simulated or recorded touch."""
     if config.out is None or not config.out.endswith((".gif", ".png")):
         raise InputError(
             f"an animation is a .gif file, a still a .png file, got out={config.out}: add out=touch.gif"

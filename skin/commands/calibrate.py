@@ -20,7 +20,7 @@ from skin.errors import InputError
 
 @command("calibrate")
 def main(config: DictConfig) -> None:
-    """Read a session and what pressed the skin; judge a calibration on held-out presses, write one of all."""
+    """Print the errors on held-out presses, and write a calibration with all presses."""
     if config.session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
     files = [config.presses, None if config.calibrate.demo else config.session]
@@ -43,15 +43,16 @@ def main(config: DictConfig) -> None:
     if settings["demo"]:
         print(write_demo_session(device, settings, config.session))
     shape = settings["indenter"], settings["radius"]
-    said = bench_session.read_bench_session(config.session, *shape, settings["unit"])
+    session = bench_session.read_bench_session(config.session, *shape, settings["unit"])
     rows = None if config.presses is None else gauge.read_gauge(config.presses, *shape, settings["delay"])
     with Console(stderr=True).status("fitting"):
-        found = build_bench_data(device, said, rows)
+        found = build_bench_data(device, session, rows)
         outcome, calibration = evaluate_held_out(found, settings["held_out"]), fit_calibration(found)
     print_calibration(calibration, outcome)
     if not outcome.helps:
         print(
-            f"It does not help, so {config.out} was not written: is the layout, the body or the clock wrong?"
+            f"The calibration does not reduce the error, so {config.out} was not written: is the layout, the "
+            "body or the clock wrong?"
         )
         sys.exit(1)
     known = {**calibration.about, **held_out_summary(outcome)}

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @command("compare")
 def main(config: DictConfig) -> None:
-    """Simulate what a session holds, compare readings and, given a run, verdicts; write one page."""
+    """Simulate a session, compare readings and, with ``run=``, predictions; write a page."""
     if config.session is None:
         raise InputError("which session? add session=session.csv, of skin record or a bench")
 
@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
 
     quiet()
     settings = plain(config)["compare"]
-    device = build_device(config).simulated("the other side is the session")
+    device = build_device(config).simulated("a session is compared with a simulation")
     folder = results(config.out)
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
@@ -63,7 +63,7 @@ def _verdicts(
     both: "Sequence[Touches]",
     truth: list[list[bool]] | None = None,
 ) -> "Verdicts | None":
-    """Return what a run says of both sides; None without a run."""
+    """Return the predictions of a run for both sides; None without a run."""
     if config.run is None:
         return None
 

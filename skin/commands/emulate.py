@@ -20,7 +20,7 @@ _FORMATS = ("text", "binary")
 
 @command("emulate")
 def main(config: DictConfig) -> None:
-    """Play gestures of the configured simulator, device and layout in real time."""
+    """Send gestures of the configured simulator, device and layout in real time."""
     if config.format not in _FORMATS:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
 
@@ -38,7 +38,7 @@ def main(config: DictConfig) -> None:
     port = open_port(config.port, config.link)
     try:
         emulator = Emulator(device, port, settings, faults, config.format == "binary", _notify)
-        # From the first line on, because whoever reads it may stop this at once.
+        # Includes the first line, because its reader may stop the command at once.
         with suppress(KeyboardInterrupt):
             print(port.address, flush=True)
             scale = f" device.scale={emulator.converter.scale:g}" if settings.bits else ""

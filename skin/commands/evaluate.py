@@ -15,7 +15,7 @@ from skin.files import results
 
 @command("evaluate")
 def main(config: DictConfig) -> None:
-    """Bring a finished run back, evaluate it, print the figures and log them beside the run."""
+    """Restore a finished run, evaluate it, and print and log the metrics."""
     from skin.console import quiet
     from skin.evaluation.metrics_table import print_report
     from skin.evaluation.report import evaluate
@@ -33,17 +33,17 @@ def main(config: DictConfig) -> None:
     config = apply_overrides(stored, config, given)
     of = load_trained(store, run, config, stored)
     device, learner, point = of.device, of.learner, of.point
-    touches = device.touches("test")  # all that can go wrong with a port goes wrong before anything is logged
+    touches = device.touches("test")  # read before anything is logged, because a port may fail
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
-        # Every evaluation keeps its files.
+        # Evaluations do not overwrite each other's files.
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
             chances = learner.probabilities(touches)
-            said, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
+            text, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
             store.client.log_artifact(evaluation.info.run_id, str(path))
-            print(f"{title}\n{said}\n{path}")
+            print(f"{title}\n{text}\n{path}")
             return
         found = evaluate(learner, device, config.evaluation, point)
         log_report(store, evaluation, found, device.task, {})

@@ -2,7 +2,7 @@
 
     skin generate n=1000 out=touches.parquet
 
-Prints a summary of the touches, and warns where a shape tells a label.
+Prints a summary of the touches, and warns if the shape alone predicts a label.
 """
 
 from omegaconf import DictConfig
@@ -14,9 +14,9 @@ from skin.errors import InputError
 
 @command("generate")
 def main(config: DictConfig) -> None:
-    """Draw a budget of n gestures and write all that is known about them."""
+    """Draw a budget of n gestures and write readings, labels and parameters."""
     if config.out is None:
-        raise InputError("where to? add out=touches.parquet or out=touches.csv")
+        raise InputError("out is missing: add out=touches.parquet or out=touches.csv")
     if not config.out.endswith((".parquet", ".csv")):
         raise InputError(f"a recording is a .parquet or .csv file, got {config.out}: add out=touches.parquet")
 
@@ -32,11 +32,11 @@ def main(config: DictConfig) -> None:
     device = build_device(config)
     recording = device.recording()
     report_balance(device, recording)
-    # Where the touches go does not change them.
+    # The path of the file does not change the touches.
     source = OmegaConf.masked_copy(config, [str(key) for key in config if key != "out"])
     about = {"config_hash": fingerprint(source), "config": plain(source)}
     path = write_recording(replace(recording, metadata=recording.metadata | about), config.out)
-    # What a file says of itself may be anything.
+    # The metadata of a file may have any content.
     known = device.simulation is not None
-    said = summary_line(recording.metadata["summary"]) if known else f"{len(recording)} gestures"
-    print(f"{path}: {said}")
+    text = summary_line(recording.metadata["summary"]) if known else f"{len(recording)} gestures"
+    print(f"{path}: {text}")

@@ -19,10 +19,12 @@ _KEYS = ("baudrate", "format", "limits", "timeout")
 
 @command("listen")
 def main(config: DictConfig) -> None:
-    """Say once a second how many frames came, how fast and how sound; at the end, what each channel read."""
+    """Print rate and errors once a second, and statistics of each channel at the end."""
     device = plain(config)["device"]
     if device["port"] is None:
-        raise InputError("which port? add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER")
+        raise InputError(
+            "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"
+        )
 
     from skin.settings import check_groups
     from skin.wire.diagnosis import PortMonitor

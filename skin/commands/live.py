@@ -1,9 +1,9 @@
-"""Watch a skin and show what a trained run says of each touch.
+"""Show the predictions of a trained run for a skin in real time.
 
     skin live device=serial device.port=/dev/ttyACM0
     skin live web=true
 
-run=latest names the run; web=true serves a page, too. Without device= the simulator of the run is watched: no
+run=latest names the run; web=true also serves a page. Without device= the simulator of the run is used: no
 hardware is needed. Ctrl-C stops.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @command("live")
 def main(config: DictConfig) -> None:
-    """Bring a finished run back, open what is watched, and show verdicts until somebody ends it."""
+    """Restore a finished run, open the skin, and show verdicts until the command is ended."""
     from skin.hardware.live.live_settings import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
@@ -50,34 +50,36 @@ def _watch(config: DictConfig, live: "LiveSettings") -> None:
     from skin.tracking import Store, ends_on_signal
     from skin.trained import load_trained
 
-    store, said = Store.open(config.tracking), Console(stderr=True)
+    store, messages = Store.open(config.tracking), Console(stderr=True)
     run = find_run(store, config.run)
     stored, given = load_configuration(store, run, config.trust), overrides()
     device = build_device(apply_overrides(stored, config, given))
-    # What it learned from stays, whatever is watched.
-    learnt = apply_overrides(
+    # The training data stay those of the run, for any watched device.
+    trained = apply_overrides(
         stored, config, [one for one in given if not one.startswith(("device=", "device."))]
     )
-    said.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
+    messages.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
     if advice := engine_builder.simulator_warning(stored, device):
-        said.print(advice, highlight=False)
-    of = load_trained(store, run, learnt, stored)
+        messages.print(advice, highlight=False)
+    of = load_trained(store, run, trained, stored)
     engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)
     if of.point is not None:
         above = live.patience.above
-        said.print(of.point.sentence() if above is None else f"alarm above {above:g}", highlight=False)
+        messages.print(of.point.sentence() if above is None else f"alarm above {above:g}", highlight=False)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
-        # As late as this, because from now on frames come.
+        # Opened last, because frames arrive from now on.
         source = device.source()
         skin = open_.enter_context(source.skin)
         places, span = of.positions.numpy(), of.window / of.rate
         display = Display(DisplayInfo(run.info.run_name, source.name, places, of.device.size, live.top, span))
         if config.web:
-            said.print(
+            messages.print(
                 f"page: {open_.enter_context(web.serve_page(display, live.web_port))}", highlight=False
             )
         session = LiveLoop(skin, source.tare, engine, display)
-        open_.callback(lambda: said.print(f"{session.verdicts} verdicts, {session.line}", highlight=False))
+        open_.callback(
+            lambda: messages.print(f"{session.verdicts} verdicts, {session.line}", highlight=False)
+        )
         open_.enter_context(terminal.show_in_terminal(display, Console()))
         session.run(config.seconds)

@@ -2,7 +2,7 @@
 
     skin record out=session.csv device.port=/dev/ttyACM0 device.scale=0.039
 
-Asks for each gesture. Ctrl-C stops; the same command resumes. Writes session.parquet for device=recording;
+Prompts for each gesture. Ctrl-C stops; the same command resumes. Writes session.parquet for device=recording;
 record.finish=true writes only that.
 """
 
@@ -18,7 +18,7 @@ from skin.errors import InputError
 
 @command("record")
 def main(config: DictConfig) -> None:
-    """Write raw frames to a session, then its gestures to a recording."""
+    """Record raw frames to a session, then convert its gestures to a recording."""
     if config.out is None or not config.out.endswith(".csv"):
         raise InputError(f"a session is a .csv file, got {config.out}: add out=session.csv")
     settings = dict(config.record)
@@ -30,7 +30,7 @@ def main(config: DictConfig) -> None:
 
     device = build_device(config).wired
     if device is None:
-        raise InputError("only a skin at a port is recorded: leave out device=")
+        raise InputError("only a skin at a port can be recorded: leave out device=")
     path = Path(config.out).expanduser()
     if not settings["finish"]:
         with suppress(KeyboardInterrupt):

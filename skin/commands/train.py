@@ -13,7 +13,7 @@ from skin.command import command
 
 @command()
 def main(config: DictConfig) -> bool:
-    """Train and evaluate one configuration; False if that was done before."""
+    """Train and evaluate one configuration; return False if a finished run has the results."""
     from skin.run import train
 
     return train(config)

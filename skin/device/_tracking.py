@@ -27,11 +27,11 @@ class Tracker:
     simulator: AbstractSimulator | None = None
     weights: Tensor | None = None
 
-    def true_motion(self, movie: Movie) -> Tensor | None:
+    def motion(self, movie: Movie) -> Tensor | None:
         """Return the true motion, (B, T, S, 3), m, of sensors under gestures."""
         return None if self.simulator is None else _motion(self.simulator, movie)
 
-    def with_estimate(self, touches: Touches) -> Touches:
+    def estimate(self, touches: Touches) -> Touches:
         """Return touches with the motion estimated from their readings."""
         if self.weights is None:
             return touches

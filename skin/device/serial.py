@@ -191,20 +191,15 @@ class Serial(AbstractWired):
                 max(done, default=-1) + 1,
                 lambda values: bool((conversion(values, known)[0] > self.trigger).any()),
             )
-        wanted = enumerate(label_plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
-        return PromptedSegmenter(
-            window, (one for one in wanted if one[0] < self.gestures and one[0] not in done), _say
-        )
+        planned = enumerate(label_plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
+        left = (one for one in planned if one[0] < self.gestures and one[0] not in done)
+        return PromptedSegmenter(window, left, _say)
 
     def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
         """Return gestures as a recording."""
-        touches = self._touches(
-            [gesture.resampled for gesture in gestures if gesture.resampled is not None], conversion
-        )
+        touches = self._touches([one.resampled for one in gestures if one.resampled is not None], conversion)
         if gestures and gestures[0].labels is not None:
-            rows = [
-                [float(value) for value in gesture.labels.values()] for gesture in gestures if gesture.labels
-            ]
+            rows = [[float(value) for value in one.labels.values()] for one in gestures if one.labels]
             touches = replace(touches, labels=torch.tensor(rows))
         about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
@@ -212,11 +207,9 @@ class Serial(AbstractWired):
     def _touches(self, windows: Sequence[Resampled], conversion: UnitConversion) -> Touches:
         """Return windows in the device's unit as touches."""
         assert self.rate is not None
-        readings, valid = conversion(
-            np.stack([window.values for window in windows]), np.stack([window.valid for window in windows])
-        )
-        saturated = valid & np.stack([window.saturated for window in windows])
-        known = [torch.from_numpy(values) for values in (readings, valid, saturated)]
+        values, mask, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
+        readings, valid = conversion(values, mask)
+        known = [torch.from_numpy(array) for array in (readings, valid, valid & saturated)]
         return Touches(known[0], known[1], self._positions, None, self.rate, saturated=known[2])
 
     def _record(self) -> Recording:
@@ -230,16 +223,12 @@ class Serial(AbstractWired):
             for gesture in self._finished_gestures(skin, segmenter):
                 gestures.append(gesture)
                 words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
-                _say(
-                    f"{len(gestures)}/{self.gestures}{words}"
-                    + (f" ({gesture.lost} frames lost)" * bool(gesture.lost))
-                )
+                lost = f" ({gesture.lost} frames lost)" * bool(gesture.lost)
+                _say(f"{len(gestures)}/{self.gestures}{words}{lost}")
                 if len(gestures) == self.gestures:
                     break
         if not gestures:
-            raise InputError(
-                "no gesture was read: does the emulator announce, does something touch the skin?"
-            )
+            raise InputError("no gesture was read: does the emulator announce, is the skin touched?")
         return self.to_recording(gestures, conversion)
 
     def _finished_gestures(self, skin: Skin, segmenter: AbstractSegmenter) -> Iterator[RecordedGesture]:

@@ -106,9 +106,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def _refuse(self) -> None:
         """Check the settings, and combinations that are not possible."""
-        check_settings(
-            type(self), {entry.name: getattr(self, entry.name) for entry in fields(self)}, "device"
-        )
+        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        check_settings(type(self), settings, "device")
         if self.stream and self.direction:
             raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
         if self.stream or self.track != "none":
@@ -191,9 +190,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         """Draw gestures or windows in batches; ``complete`` adds the displacements."""
         cuts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
         if self.stream:
-            return concatenate(
-                in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts))
-            )
+            found = in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts))
+            return concatenate(found)
         wanted = balanced(count, generator(stream, *key, 0))
         found = in_threads(lambda n: self._batch(wanted[cuts[n]], complete, stream, (*key, 1 + n)), len(cuts))
         return concatenate(found)
@@ -232,12 +230,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(
-            readings, valid, positions, labels, float(self.rate), self.tracker.true_motion(movie)
-        )
+        touches = Touches(readings, valid, positions, labels, float(self.rate), self.tracker.motion(movie))
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
-        # A stream's windows have labels of their own.
+        # Windows of streams get other labels.
         about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
         return Recording(touches, *about, movie.force, displacement, movie.parameters | known)
 
@@ -249,9 +245,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         readings, valid, saturated = self.imperfection.apply(force, constants, noise)
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
-        return replace(
-            true, touches=self.tracker.with_estimate(touches), parameters=true.parameters | clipped
-        )
+        return replace(true, touches=self.tracker.estimate(touches), parameters=true.parameters | clipped)
 
     def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
         about: dict[str, Any] = {"source": "simulated", "simulator": type(self.model).__name__}

@@ -58,7 +58,7 @@ def test_it_says_what_comes(address):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "which port? add device.port="),
+        ([], "device.port is missing: add device.port="),
         (["device.port=/dev/ttyACM77"], "no port /dev/ttyACM77"),
         (
             ["device.port=/dev/ttyACM77", "device.format=xml"],

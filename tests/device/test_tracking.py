@@ -54,7 +54,7 @@ def test_true_motion_is_what_each_frame_of_the_movie_does(oracle):
     expected = np.stack(
         [frames @ rows.T for rows in (operator.along_x, operator.along_y, operator.sensor)], axis=-1
     )
-    motion = oracle.tracker.known(movie).numpy()
+    motion = oracle.tracker.motion(movie).numpy()
     np.testing.assert_allclose(motion, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
 
 

@@ -35,7 +35,7 @@ def session(device, path, labels):
     """Write what a skin of another gain says of the emulator's gestures, in counts above 500."""
     about = {"positions": device.sensors.positions.tolist(), "unit": "adc", "labels": labels}
     log = SessionLog(path, about | {"window": device.window, "rate": device.rate}, 9)
-    log.meaning(UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
+    log.conversion(UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
     number, now = 0, time.monotonic()
     for one, gesture in enumerate(islice(emulated_gestures(device), COUNT)):
         rows = 500 + GAIN * upsample(gesture.force, device.rate, RATE) / 0.01

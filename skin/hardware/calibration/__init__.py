@@ -1,1 +1,1 @@
-"""Calibration: from presses of known force to the constants of a simulated device."""
+"""Calibration: fit the constants of a simulated device to presses of known force."""

@@ -13,12 +13,12 @@ _MAD = 1.4826
 
 @dataclass(frozen=True)
 class Idle:
-    """What an untouched channel says, in the session's unit.
+    """Statistics of an untouched channel, in the session's unit.
 
     Attributes:
         offset: median, at time 0 where it drifts.
-        drift: per s; 0 where it does not pass its confidence interval of 95 %.
-        noise: 1.4826 times the median absolute deviation; under steps about as large as it, the standard
+        drift: per s; 0 if its 95 % confidence interval contains 0.
+        noise: 1.4826 times the median absolute deviation; with steps of similar size, the standard
             deviation without outliers.
     """
 
@@ -28,20 +28,20 @@ class Idle:
 
 
 def quantum(values: np.ndarray) -> float:
-    """Return the smallest step between values, 0 where they are as good as continuous.
+    """Return the smallest step between values; 0 if they are continuous.
 
-    Steps are believed where values come back often: with fewer than a fifth of them distinct.
+    Values are quantised if fewer than a fifth of them are distinct.
     """
     distinct = np.unique(values)
     if len(distinct) < 2 or len(distinct) > 0.2 * len(values):
         return 0.0
     steps = np.diff(distinct)
-    # Single precision splits one step in two that differ in their last digit.
+    # Single precision splits a step into two that differ in the last digit.
     return float(steps[steps > 1e-5 * np.abs(distinct).max()].min())
 
 
 def idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
-    """Describe idle frames.
+    """Return the statistics of idle frames.
 
     Args:
         time: s.
@@ -57,67 +57,67 @@ def idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
     offset = float(np.median(rest))
     spread = _MAD * float(np.median(np.abs(rest - offset)))
     if step > 0.8 * spread:
-        # Too coarse for a median: the deviation of what is no outlier.
+        # The steps are too coarse for a median.
         spread = float(np.std(rest[np.abs(rest - offset) <= 3 * max(spread, step)]))
-    # Rounding and undoing it evenly add the variance of a step each (Sheppard's correction).
+    # Rounding and spreading each add the variance of a step (Sheppard's correction).
     return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
 
 
 def _spread(values: np.ndarray, step: float) -> np.ndarray:
-    """Spread equal values evenly over the step they were rounded to: a median between steps needs it."""
+    """Spread equal values evenly over their rounding step, so that medians resolve less than a step."""
     if step == 0:
         return values
     _, group, count = np.unique(values, return_inverse=True, return_counts=True)
     order = np.argsort(group, kind="stable")
     rank = np.empty(len(values))
     rank[order] = np.arange(len(values)) - np.repeat(np.cumsum(count) - count, count)
-    # Ranks follow time; a fixed shuffle keeps a drift from being bent by them.
+    # Ranks follow time; a fixed shuffle keeps them from distorting a drift.
     place = (rank * 0.6180339887498949) % 1
     return values + step * (place - 0.5)
 
 
 def decay(time: np.ndarray, values: np.ndarray, floor: float) -> tuple[float, float]:
-    """Return the time constant of a decay to 0, s, and its weight; (0, 0) where fewer than 3 frames show it.
+    """Return the time constant of a decay to 0, s, and its weight; (0, 0) with fewer than 3 frames.
 
     Args:
         time: s.
-        values: from the release on, without offset.
-        floor: below this they are noise.
+        values: after the release, without offset.
+        floor: level of the noise.
     """
     below = np.flatnonzero(values <= floor)
     count = below[0] if len(below) else len(values)
     if count < 3:
         return 0.0, 0.0
-    weights = values[:count]  # of the logarithm, whose error is the noise over the value
+    weights = values[:count]  # of the logarithm, whose error is noise / value
     slope = np.polyfit(time[:count], np.log(values[:count]), 1, w=weights)[0]
     if slope >= 0:
         return 0.0, 0.0
     return float(-1 / slope), float((weights**2).sum())
 
 
-def clip_and_gain(true: np.ndarray, said: np.ndarray, noise: float) -> tuple[float, float, float | None]:
-    """Return the slope of said over true readings, its standard error, and the plateau, None if not reached.
+def clip_and_gain(true: np.ndarray, measured: np.ndarray, noise: float) -> tuple[float, float, float | None]:
+    """Return the slope of measured over true readings, its standard error, and the plateau or None.
 
     Args:
         true: (n,), loading frames.
-        said: (n,), without offset.
+        measured: (n,), without offset.
         noise: of a frame.
     """
     top = true >= 0.9 * true.max()
-    level = float(np.median(said[top]))
-    slope, _ = _slope(true[said < 0.7 * level], said[said < 0.7 * level])
+    level = float(np.median(measured[top]))
+    slope, _ = _slope(true[measured < 0.7 * level], measured[measured < 0.7 * level])
     margin = max(2 * noise, 0.02 * level)
     if not slope * np.median(true[top]) > level + margin:
-        return *_slope(true, said), None
-    level = float(np.median(said[slope * true > level + margin]))
+        return *_slope(true, measured), None
+    level = float(np.median(measured[slope * true > level + margin]))
     below = slope * true < level - margin
-    return *_slope(true[below], said[below]), level
+    return *_slope(true[below], measured[below]), level
 
 
-def _slope(true: np.ndarray, said: np.ndarray) -> tuple[float, float]:
-    """Return the Theil-Sen slope and its standard error; infinite error where it rests on nothing."""
+def _slope(true: np.ndarray, measured: np.ndarray) -> tuple[float, float]:
+    """Return the Theil-Sen slope and its standard error; NaN and infinity with too few readings."""
     if len(true) < 3 or np.ptp(true) == 0:
         return math.nan, math.inf
     some = np.unique(np.linspace(0, len(true) - 1, _POINTS).astype(int))
-    slope, _, low, high = theilslopes(said[some], true[some])
+    slope, _, low, high = theilslopes(measured[some], true[some])
     return float(slope), float(high - low) / (2 * 1.96)

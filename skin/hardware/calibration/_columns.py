@@ -22,7 +22,7 @@ _log = logging.getLogger("skin.hardware.record")
 
 
 def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
-    """Return a table and what is known about it: JSON in a Parquet schema, or in ``x.csv.json`` beside it.
+    """Return a table and its metadata: JSON in the Parquet schema, or in ``x.csv.json`` beside a CSV.
 
     Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of skin record are
     skipped, with a warning.
@@ -45,7 +45,7 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
             sidecar = path.with_name(path.name + ".json")
             about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
         if not isinstance(about, dict):
-            raise ValueError(f"it says {about!r} of itself, needed is an object, as in {{}}")
+            raise ValueError(f"its metadata are {about!r}, and must be an object, as in {{}}")
         if not len(table):
             raise ValueError("it has no rows below its header")
     except InputError:
@@ -56,7 +56,7 @@ def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
 
 
 def _rows(path: Path) -> bytes:
-    """Return a CSV without comments, and without damaged lines where it is known what lines look like."""
+    """Return a CSV without comments and, for sessions of skin record, without damaged lines."""
     lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
     rows = [(number, line) for number, line in enumerate(lines, 1) if not line.startswith(b"#")]
     header = rows[0][1] if rows else b""
@@ -72,7 +72,7 @@ def _rows(path: Path) -> bytes:
 
 
 def save_table(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
-    """Write what :func:`load_table` reads, under a temporary name first.
+    """Write a table and its metadata atomically, in the format of :func:`load_table`.
 
     Raises:
         InputError: another ending, or the file cannot be written.
@@ -91,7 +91,7 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
     """Return a column as float64; empty cells are NaN.
 
     Raises:
-        InputError: the column is missing or holds something else than numbers.
+        InputError: the column is missing or is not numeric.
     """
     try:
         # A copy, because Arrow's memory cannot be written to and torch warns of that.

@@ -1,4 +1,4 @@
-"""A bench session beside the simulated true readings of its presses."""
+"""A bench session with the simulated true readings of its presses."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from skin.hardware.calibration.bench_session import BenchSession
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.hardware.calibration.protocol import true_readings
 
-_BEFORE, _AFTER = 0.2, 1.0  # s around a press in which a skin is not idle
+_BEFORE, _AFTER = 0.2, 1.0  # s around a press that are not idle
 _FEWEST = 50  # idle frames
 _SUDDEN = 2  # frames that a release may take
 
 
 @dataclass(frozen=True)
 class BenchData:
-    """What was said and what presses it, frame by frame.
+    """Measured readings and simulated true readings of a bench session, frame by frame.
 
     Attributes:
         session: the raw readings.
-        gauge: what pressed it.
+        gauge: force and position of the presses.
         each: true readings per N of every press, (P, S).
     """
 
@@ -43,7 +43,7 @@ class BenchData:
 
     @cached_property
     def idle(self) -> np.ndarray:
-        """Frames in which nothing presses, (T,), bool."""
+        """Frames without a press, (T,), bool."""
         time, busy = self.session.time, np.zeros(len(self.session.time), dtype=bool)
         ends = np.append(self.gauge.first[1:], len(self.gauge.time)) - 1
         for start, end in zip(self.gauge.time[self.gauge.first], self.gauge.time[ends], strict=True):
@@ -76,7 +76,7 @@ class BenchData:
 
     @cached_property
     def releases(self) -> list[slice]:
-        """Frames from each sudden release to the next press, one slice per press that ends so."""
+        """Frames from each sudden release to the next press, one slice per such release."""
         force, press = self.applied
         found = []
         for number in range(len(self.gauge)):
@@ -90,10 +90,10 @@ class BenchData:
 
 
 def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Gauge | None) -> BenchData:
-    """Set a session beside the simulation of its presses on the skin as it is designed.
+    """Simulate the presses of a session on the skin as designed.
 
     Raises:
-        InputError: no gauge, another number of sensors, or times of gauge and session that do not meet.
+        InputError: no gauge, another number of sensors, or times of gauge and session that do not overlap.
     """
     rows = gauge or session.gauge
     if rows is None:
@@ -110,6 +110,6 @@ def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Ga
         raise InputError("no frame of the session falls into a press: check the clocks, see calibrate.delay")
     if found.idle.sum() < _FEWEST:
         raise InputError(
-            f"{found.idle.sum()} idle frames, needed are {_FEWEST}: leave the skin alone for some seconds"
+            f"{found.idle.sum()} idle frames, needed are {_FEWEST}: do not touch the skin for some seconds"
         )
     return found

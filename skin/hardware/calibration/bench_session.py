@@ -19,17 +19,17 @@ _OTHER = ("time", "t_us", "seq", *GAUGE)
 @checked("session")
 @dataclass(frozen=True)
 class BenchSession:
-    """What a skin said, and what pressed it meanwhile.
+    """Raw readings of a skin, and the force gauge during the same time.
 
     Attributes:
         time: (T,), s.
         raw: (T, S), in ``unit``; NaN where a frame was lost.
         unit: ``N``, or ``adc`` for counts of a converter.
-        gauge: rows that were in the same file; None where they are elsewhere.
-        bits: of the converter; None where nobody knows.
+        gauge: rows of the force gauge in the same file; None if they are in another file.
+        bits: of the converter; None if unknown.
 
     Raises:
-        InputError: another unit, or times that do not grow.
+        InputError: another unit, or times that do not increase.
     """
 
     time: np.ndarray
@@ -59,18 +59,18 @@ def read_bench_session(
 ) -> BenchSession:
     """Read a session.
 
-    It has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, whatever
-    their names; ``seq`` is ignored. Columns of a gauge may stand beside them, empty outside the presses. Unit
+    The file has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, of
+    any name; ``seq`` is ignored. Columns of a gauge may stand beside them, empty outside the presses. Unit
     and bits may stand in the Parquet schema or in ``x.csv.json``: ``{"unit": "adc", "bits": 10}``.
 
     Args:
         path: .csv or .parquet.
-        indenter: of gauge rows that name none.
-        radius: m, of gauge rows that have none.
-        unit: ``N`` or ``adc`` where the file does not say; None: as the file says, else N.
+        indenter: of gauge rows without one.
+        radius: m, of gauge rows without one.
+        unit: ``N`` or ``adc``; None: the unit in the file, else N.
 
     Raises:
-        InputError: a file that cannot be used.
+        InputError: the file is invalid.
     """
     table, about = load_table(path, "session")
     names = [name for name in table.column_names if name not in _OTHER]
@@ -92,7 +92,7 @@ def read_bench_session(
 
 
 def write_bench_session(session: BenchSession, path: str | Path) -> Path:
-    """Write a session with its gauge, whole; single precision is enough for what a converter says.
+    """Write a session with its gauge atomically; readings have single precision.
 
     Raises:
         InputError: another ending than .csv or .parquet, or the file cannot be written.

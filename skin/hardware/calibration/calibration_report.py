@@ -1,4 +1,4 @@
-"""Print what a calibration found."""
+"""Print the result of a calibration."""
 
 from typing import Any
 
@@ -13,13 +13,13 @@ _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N
 
 
 def held_out_summary(outcome: HeldOutErrors) -> dict[str, Any]:
-    """Return the figures of an outcome for a file, rounded."""
+    """Return the rounded errors on held-out presses, for the calibration file."""
     rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
     return {"held_out": list(outcome.held_out), "rmse": rmse}
 
 
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
-    """Print the constants over all sensors that live, the broken ones, and how held-out presses came out."""
+    """Print the constants of working sensors, the broken sensors, and the errors on held-out presses."""
     table = Table("", "median", "least", "largest", "", box=None, pad_edge=False)
     for name in QUANTITIES:
         known = [value for value in calibration.sensors[name] if value is not None]

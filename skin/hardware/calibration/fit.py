@@ -13,7 +13,7 @@ from skin.hardware.calibration.bench_data import BenchData
 from skin.sensor_dynamics import first_order_lag, running_peak
 from skin.signal.calibration import Calibration
 
-_PRESSED = 0.05  # of the largest true reading: less tells no gain
+_PRESSED = 0.05  # of the largest true reading: less determines no gain
 _SURE = 6.0  # standard errors above 0: less is no answer either
 _LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated
 _DEAD = 0.05  # of the median gain: less is no answer
@@ -21,7 +21,7 @@ _DEAD = 0.05  # of the median gain: less is no answer
 
 @dataclass
 class _Channel:
-    """What was found of one channel, in the session's unit; gain per N, None where nothing was."""
+    """Constants of one channel, in the session's unit; gain per N; None if unknown."""
 
     idle: Idle
     quantum: float
@@ -37,14 +37,14 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     """Fit every channel to the simulated true readings of presses, never to the gauge's force.
 
     Idle frames give offset, drift and noise; the release the time constant; the loading branch the gain and
-    the clip; the way back hysteresis. All but the idle frames come from ``presses``.
+    the clip; the unloading branch hysteresis. All but the idle frames are taken from ``presses``.
 
     Args:
         bench: the session.
-        presses: numbers of those that are used; None: all.
+        presses: numbers of the presses to use; None: all.
 
     Raises:
-        InputError: no channel answers to a press.
+        InputError: no channel responds to a press.
     """
     used = bench.of(range(len(bench.gauge)) if presses is None else presses)
     channels = [_at_rest(bench, number) for number in range(bench.each.shape[1])]
@@ -53,13 +53,15 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     answering = [int(n) for n in np.flatnonzero(pressed) if channels[n].broken is None]
     for number in answering:
         channels[number].time_constant = _time_constant(bench, used, number, channels[number])
-    felt, bends = _regressors(bench.true, [channel.time_constant for channel in channels], bench.session.time)
+    lagged, bends = _regressors(
+        bench.true, [channel.time_constant for channel in channels], bench.session.time
+    )
     for number in answering:
-        _answer(bench, used, number, channels[number], felt[:, number], bends[:, number])
+        _answer(bench, used, number, channels[number], lagged[:, number], bends[:, number])
     gains = [gain for n in answering if (gain := channels[n].gain)]
     typical = float(np.median(gains)) if gains else 0.0
     if not gains:
-        raise InputError("no channel answers to a press: check layout, indenter and the session's clock")
+        raise InputError("no channel responds to a press: check layout, indenter and the session's clock")
     for number in answering:
         if (channels[number].gain or 0.0) < _DEAD * typical:
             channels[number].broken = "dead"
@@ -67,23 +69,25 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
 
 
 def _at_rest(bench: BenchData, number: int) -> _Channel:
-    """Describe a channel's idle frames; one that never moves is broken."""
+    """Return the idle statistics of a channel; one that never changes is broken."""
     raw = bench.session.raw
-    said = raw[:, number]
-    there = np.isfinite(said)
+    measured = raw[:, number]
+    there = np.isfinite(measured)
     if not there.any():
         return _Channel(Idle(0.0, 0.0, 0.0), 0.0, broken="dead")
-    if np.ptp(said[there]) == 0:
-        level = float(said[there][0])
+    if np.ptp(measured[there]) == 0:
+        level = float(measured[there][0])
         full = 2**bench.session.bits - 1 if bench.session.bits else np.inf
         limit = level >= min(full, _LIMIT * float(np.nanmax(raw))) > 0
         kind = "dead" if level == 0 else "saturated" if limit else "stuck"
         return _Channel(Idle(level, 0.0, 0.0), 0.0, broken=kind)
-    step = _channel.quantum(said[there])
+    step = _channel.quantum(measured[there])
     quiet = there & bench.idle
     if quiet.sum() < 10:
-        raise InputError(f"channel {number} has {quiet.sum()} idle frames: leave the skin alone for seconds")
-    return _Channel(_channel.idle(bench.session.time[quiet], said[quiet], step), step)
+        raise InputError(
+            f"channel {number} has {quiet.sum()} idle frames: do not touch the skin for some seconds"
+        )
+    return _Channel(_channel.idle(bench.session.time[quiet], measured[quiet], step), step)
 
 
 def _rest_taken(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
@@ -92,14 +96,14 @@ def _rest_taken(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
 
 def _time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
     """Return the weighted mean over releases of presses that reach the channel, s."""
-    said, time = _rest_taken(bench, number, channel), bench.session.time
-    # Until it has come down from its plateau a reading says nothing of the lag.
-    most = 0.8 * np.nanmax(said)
+    measured, time = _rest_taken(bench, number, channel), bench.session.time
+    # Clipped readings contain no information on the lag.
+    most = 0.8 * np.nanmax(measured)
     found = []
     for release in bench.releases:
         if not used[release.start - 2] and not used[release.start - 1]:
             continue
-        values = said[release]
+        values = measured[release]
         start = int(np.argmax(values < most)) if len(values) and (values < most).any() else 0
         floor = max(8 * channel.idle.noise, 3 * channel.quantum, 1e-9)
         found.append(_channel.decay(time[release][start:], np.nan_to_num(values[start:]), floor))
@@ -108,7 +112,7 @@ def _time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Ch
 
 
 def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return true readings behind the lag, and what a hysteresis of 1 would add to them, each (T, S), N."""
+    """Return lagged true readings, and the effect of a hysteresis of 1 on them, each (T, S), N."""
     force = torch.from_numpy(true)[None]
     peak = running_peak(force)
     bend = torch.where(peak > 0, 6 * force * (1 - force.abs() / peak.clamp(min=1e-30)), 0.0)
@@ -119,23 +123,23 @@ def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> t
 
 
 def _answer(
-    bench: BenchData, used: np.ndarray, number: int, channel: _Channel, felt: np.ndarray, bend: np.ndarray
+    bench: BenchData, used: np.ndarray, number: int, channel: _Channel, lagged: np.ndarray, bend: np.ndarray
 ) -> None:
-    """Fit gain and clip on the loading branch, hysteresis on the way back."""
-    said = _rest_taken(bench, number, channel)
-    there = used & np.isfinite(said) & (bench.true[:, number] > 0)
+    """Fit gain and clip on the loading branch, hysteresis on the unloading branch."""
+    measured = _rest_taken(bench, number, channel)
+    there = used & np.isfinite(measured) & (bench.true[:, number] > 0)
     up = there & bench.loading
     if up.sum() < 10:
         return
-    gain, channel.error, channel.clip = _channel.clip_and_gain(felt[up], said[up], channel.idle.noise)
-    # A slope within its error is that of noise.
+    gain, channel.error, channel.clip = _channel.clip_and_gain(lagged[up], measured[up], channel.idle.noise)
+    # A slope within its error may be noise.
     channel.gain = gain if gain > _SURE * channel.error else 0.0
     limit = np.inf if channel.clip is None else 0.9 * channel.clip
-    # A gap no larger than the noise tells nothing.
-    down = there & bench.unloading & (said < limit) & (bend > 0.05 * felt.max())
+    # A gap no larger than the noise is not used.
+    down = there & bench.unloading & (measured < limit) & (bend > 0.05 * lagged.max())
     if down.sum() < 10 or not channel.gain:
         return
-    rest, lever = said[down] - gain * felt[down], gain * bend[down]
+    rest, lever = measured[down] - gain * lagged[down], gain * bend[down]
     keep = np.abs(rest - np.median(rest)) <= 6 * np.median(np.abs(rest - np.median(rest)))
     share = float((rest[keep] * lever[keep]).sum() / (lever[keep] ** 2).sum())
     error = float(np.std(rest[keep] - share * lever[keep]) / np.sqrt((lever[keep] ** 2).sum()))
@@ -143,9 +147,9 @@ def _answer(
 
 
 def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Calibration:
-    """Bring channels to N, and span ranges over those that live."""
+    """Convert channels to N, and compute ranges over the working ones."""
     alive = [channel.broken is None for channel in channels]
-    # Counts have a zero of their own, common to all; in N a zero has been agreed on.
+    # Counts have an unknown zero, common to all channels; readings in N do not.
     counts = [channel.idle.offset for channel, live in zip(channels, alive, strict=True) if live]
     zero = 0.0 if bench.session.unit == "N" else float(np.median(counts))
     in_newton: dict[str, list[float | None]] = {

@@ -1,4 +1,4 @@
-"""Force-gauge data: when what pressed where, and how hard."""
+"""Force-gauge data: time, position, indenter and force of presses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from skin.simulator.base import AbstractSimulator
 from skin.touch.shapes import Shapes
 
 GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
-"""Columns beside ``time``; the first three are needed."""
+"""Columns besides ``time``; the first three are required."""
 _PAUSE = 1.0  # s without a row end a press
 
 
@@ -27,9 +27,9 @@ class Gauge:
     Attributes:
         time: (N,), s, by the clock of the session.
         force: (N,), N.
-        place: (N, 2), m: where the middle of the indenter is, x right and y down from the upper left corner.
+        place: (N, 2), m: centre of the indenter, x right and y down from the upper left corner.
         radius: (N,), m: half the larger extent of the indenter.
-        angle: (N,), rad: by which it is turned, from x towards y.
+        angle: (N,), rad: rotation from x towards y.
         indenter: (N,), names as in ``touch.shapes``.
         press: (N,): number of the press.
     """
@@ -51,7 +51,7 @@ class Gauge:
         return np.searchsorted(self.press, np.arange(len(self)))
 
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the force at some times, (T,), N, and the press they belong to, (T,), -1 outside of any."""
+        """Return force, (T,), N, and number of the press, (T,), -1 outside of presses, at times (T,), s."""
         row = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 1)
         after = np.minimum(row + 1, len(self.time) - 1)
         press = np.where(self.press[row] == self.press[after], self.press[row], -1)
@@ -61,23 +61,23 @@ class Gauge:
 
 
 def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
-    """Read a gauge's file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
+    """Read a gauge file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
 
     Args:
         path: .csv or .parquet.
-        indenter: of a file that names none.
-        radius: m, of a file that has none.
-        delay: s, added to the file's times to have the session's.
+        indenter: of a file without this column.
+        radius: m, of a file without this column.
+        delay: s, added to the times of the file to match the session's.
 
     Raises:
-        InputError: a file that cannot be used.
+        InputError: the file is invalid.
     """
     table, _ = load_table(path, "gauge file")
     return gauge_from_table(table, str(path), indenter, radius, delay)
 
 
 def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
-    """Return the rows of a table that have a place; see :func:`read_gauge`."""
+    """Return a gauge from the complete rows of a table; see :func:`read_gauge`."""
     columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
     for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
         known = name in table.column_names
@@ -106,9 +106,9 @@ def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, 
 
 
 def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -> np.ndarray:
-    """Return what every sensor truly reads per N of a press, (P, S).
+    """Return the true readings of every sensor per N of each press, (P, S).
 
-    Simulators are positively homogeneous, so one frame of 1 N tells a press of any force.
+    Simulators are positively homogeneous, so one frame of 1 N determines a press of any force.
 
     Raises:
         InputError: a place outside the sheet, a radius that is not above 0, or an unknown indenter.
@@ -138,7 +138,7 @@ def _answers(
     names = sorted(set(indenter))
     shapes = Shapes(names, body)
     kind = np.array([names.index(name) for name in indenter])
-    # A picture has a black rim, so its outline reaches less far than its texture.
+    # The image has a black border, so its outline is smaller than its texture.
     reach = np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
     scale = radius / reach[kind]
     area = float(np.prod(body.cell))

@@ -13,22 +13,22 @@ from skin.sensor_dynamics import first_order_lag
 from skin.signal.calibration import Calibration
 from skin.signal.imperfection import Imperfection
 
-_FELT = 0.05  # of the press's strongest reading: sensors that count
+_RESPONDING = 0.05  # of the press's strongest reading: sensors that count
 _LOADED = 0.2  # of a press's peak: frames in which its force is estimated
 _CLIPPED = 0.95
 
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Simulated against real readings of presses that the calibration had not seen.
+    """Errors on presses that were not used for the calibration.
 
     Attributes:
-        simulated: RMSE of the true readings as they are (gain 1, no offset), N.
-        tared: the same with each sensor's offset, N.
+        simulated: RMSE of the simulated true readings (gain 1, no offset), N.
+        tared: RMSE with each sensor's offset added, N.
         calibrated: RMSE of the calibrated simulation, N.
         held_out: numbers of these presses.
-        force: estimated force over the gauge's, the median of each held-out press on its way up, (n,); empty
-            where no sensor could tell it.
+        force: ratio of estimated force to the gauge's, median over the loading of each held-out press, (n,);
+            empty if no sensor could be used.
     """
 
     simulated: float
@@ -39,26 +39,26 @@ class HeldOutErrors:
 
     @property
     def helps(self) -> bool:
-        """Whether the calibration is worth more than to tare."""
+        """Whether the calibrated simulation has a smaller error than taring alone."""
         return self.calibrated < min(self.simulated, self.tared)
 
 
 def hold_out(bench: BenchData, share: float) -> list[int]:
-    """Return presses to judge by: the last of those that have the same strongest sensor, a share of all.
+    """Return the held-out presses: a share of all, each with an earlier press at the same strongest sensor.
 
     Raises:
-        InputError: no sensor has two presses, so none can be spared.
+        InputError: no sensor has two presses.
     """
     strongest = bench.each.argmax(axis=1)
     spare = [n for n in range(len(strongest)) if (strongest[:n] == strongest[n]).any()]
     if not spare:
-        raise InputError("no press can be held out: press the neighbourhood of every sensor at least twice")
+        raise InputError("no press can be held out: press near every sensor at least twice")
     count = min(len(spare), max(1, round(share * len(strongest))))
     return [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
 
 
 def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
-    """Fit without some presses, and compare the simulation of these with what was read.
+    """Calibrate without some presses, and compare their simulation with the measured readings.
 
     Args:
         bench: the session.
@@ -67,13 +67,13 @@ def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
     held = hold_out(bench, share)
     found = fit_calibration(bench, [n for n in range(len(bench.gauge)) if n not in held])
     press, each = bench.applied[1], bench.each
-    felt = each[press] > _FELT * each[press].max(axis=1, keepdims=True)
+    responding = each[press] > _RESPONDING * each[press].max(axis=1, keepdims=True)
     alive = ~found.values()["dead"] & np.isfinite(bench.session.raw)
-    counted = bench.of(held)[:, None] & felt & alive
-    said, true = found.newtons(bench.session.raw), bench.true
+    counted = bench.of(held)[:, None] & responding & alive
+    measured, true = found.newtons(bench.session.raw), bench.true
 
     def rmse(guess: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((guess[counted] - said[counted]) ** 2)))
+        return float(np.sqrt(np.mean((guess[counted] - measured[counted]) ** 2)))
 
     offset = found.values()["offset"]
     return HeldOutErrors(
@@ -86,7 +86,7 @@ def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
 
 
 def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
-    """Return what a device of this calibration would say to the presses without noise, (T, S), N."""
+    """Return the simulated readings of a calibrated device without noise, (T, S), N."""
     imperfection = Imperfection(calibration=calibration)
     randomness = np.random.default_rng(0)
     constants = imperfection.constants(bench.each.shape[1], randomness)
@@ -97,7 +97,7 @@ def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
 
 
 def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """Return the force of a press from what was read, (...), N: least squares over sensors that can tell.
+    """Estimate the force of a press from readings, (...), N, by least squares over usable sensors.
 
     Args:
         raw: (..., S), in the session's unit.
@@ -106,18 +106,18 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
         calibration: of this skin.
 
     Returns:
-        NaN where every sensor that feels the press is broken or at its limit.
+        NaN if every sensor that responds to the press is broken or at its limit.
     """
     true, values = calibration.corrected(raw), calibration.values()
     below = calibration.newtons(raw) - values["offset"] < _CLIPPED * values["clip"]
-    weights = np.where(below & np.isfinite(true) & (each > _FELT * each.max()), each, 0.0)
+    weights = np.where(below & np.isfinite(true) & (each > _RESPONDING * each.max()), each, 0.0)
     square = (weights**2).sum(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
 
 
 def _forces(bench: BenchData, presses: Sequence[int], calibration: Calibration) -> np.ndarray:
-    """Return the estimated force over the gauge's, which sensors feel behind their lag, of each press."""
+    """Return the ratio of estimated force to the lagged force of the gauge, of each press."""
     force, press = bench.applied
     lag = torch.tensor([float(np.median(calibration.known("time_constant")))]).double()
     late = first_order_lag(torch.from_numpy(force)[None, :, None], lag, torch.from_numpy(bench.session.time))

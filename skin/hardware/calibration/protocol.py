@@ -1,4 +1,4 @@
-"""The press protocol of a bench, and an emulated device's response to it."""
+"""The press protocol of a bench, and its simulation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,13 +16,14 @@ from skin.settings import configured
 
 @dataclass(frozen=True)
 class Protocol:
-    """Idle, then staircases, one place after the other: up, down, up to the peak, and a sudden release.
+    """Idle time, then a staircase at each place: up, down, up to the peak, and a sudden release.
 
-    The steps up tell gains, those down hysteresis, the release the lag, the rests offset, noise and drift.
+    The upward steps determine gains, the downward steps hysteresis, the release the lag, and idle time
+    offset, noise and drift.
 
     Attributes:
         peak: largest force of every press, N.
-        steps: shares of the peak on the way up; the way down takes them backwards.
+        steps: shares of the peak on the way up, and reversed on the way down.
         hold: at every step, s.
         ramp: from one step to the next, s; the release takes none.
         idle: before the first press, s.
@@ -65,9 +66,9 @@ class Protocol:
 
     def places(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
         """Return two places per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
-        home = device.sensors.positions[:, :2]
-        beside = home + generator.uniform(-0.003, 0.003, home.shape)
-        return np.clip(np.concatenate([home, beside]), 0, device.size)
+        centre = device.sensors.positions[:, :2]
+        beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
+        return np.clip(np.concatenate([centre, beside]), 0, device.size)
 
 
 def emulate_session(
@@ -77,20 +78,20 @@ def emulate_session(
     generator: np.random.Generator,
     bits: int | None = None,
 ) -> BenchSession:
-    """Return what a simulated device says while a gauge presses it, in N, or, given bits, in counts.
+    """Simulate a session of a device under the presses of a gauge, in N, or in counts if ``bits`` is given.
 
-    Counts are of a converter whose middle is at 0 N and whose ends are at twice the device's clip.
+    The middle of the converter is at 0 N and its ends are at twice the device's clip.
     """
     frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
     time = np.arange(frames) / protocol.rate
     true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
-    said = device.imperfection.raw(
+    measured = device.imperfection.raw(
         torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
     )[0].numpy()
     if bits is None:
-        return BenchSession(time, said.astype(float), "N", gauge)
+        return BenchSession(time, measured.astype(float), "N", gauge)
     middle = 2 ** (bits - 1)
-    counts = np.clip(np.round(middle + said * middle / (2 * device.imperfection.clip)), 0, 2**bits - 1)
+    counts = np.clip(np.round(middle + measured * middle / (2 * device.imperfection.clip)), 0, 2**bits - 1)
     return BenchSession(time, counts, "adc", gauge, bits)
 
 
@@ -101,15 +102,15 @@ def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarra
 
 
 def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
-    """Write what an emulated device says to the protocol, and return a line about it.
+    """Write the simulated session of a device under the protocol; return a summary.
 
     Args:
-        device: whose constants are to be found.
+        device: the simulated device.
         settings: ``conf/calibrate.yaml`` under ``calibrate``.
         path: .csv or .parquet.
 
     Raises:
-        InputError: a protocol that cannot be used.
+        InputError: the protocol is invalid.
     """
     protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
     randomness = np.random.default_rng(device.seed)

@@ -1,4 +1,4 @@
-"""The emulated skin: plays gestures into an outlet in real time."""
+"""The emulated skin: sends gestures to a port in real time."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,21 +24,21 @@ from skin.wire.segmentation import label_text
 from skin.wire.text import Header, encode_header, encode_line
 
 _HEADER = 1.0  # s from one header to the next
-_LOOK = 0.05  # s between two looks whether somebody came
+_LOOK = 0.05  # s between two checks for a reader
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmulatorSettings:
-    """How an emulated skin plays.
+    """Settings of an emulated skin.
 
     Attributes:
         rate: of the device, Hz.
-        speed: of its clock against the wall's; another than 1 is for tests.
+        speed: of its clock relative to real time; values other than 1 are for tests.
         bits: of its converter; None: it sends N.
-        check: what protects a line: ``crc16``, ``xor`` or ``none``.
+        check: checksum of a line: ``crc16``, ``xor`` or ``none``.
         idle: before the first gesture, s.
         gap: between two windows, s.
-        announce: tell every gesture before it is played, in the text format.
+        announce: send an announcement before each gesture, in the text format.
         seed: of the gestures and of the faults; the device's own noise follows ``device.seed``.
         id: its name.
     """
@@ -55,21 +55,21 @@ class EmulatorSettings:
 
 
 class Emulator:
-    """Plays a simulated device's gestures, with its imperfections and faults, as firmware would send them.
+    """Sends the gestures of a simulated device, with imperfections and faults, like firmware.
 
-    It waits for the first reader; from then on it sends whether somebody listens or not.
+    It waits for the first reader and then sends with or without one.
 
     Args:
-        device: the skin; its rate is the model's.
-        port: where it is plugged in.
-        settings: how it plays.
-        faults: what goes wrong.
-        binary: COBS frames instead of lines; there are no announcements among them.
-        on_event: is given a sentence about what happens, with the device's time, s.
+        device: the skin; its rate is that of the model.
+        port: the port it sends to.
+        settings: rate, converter and format.
+        faults: injected faults.
+        binary: send COBS frames instead of lines, without announcements.
+        on_event: called with the device's time, s, and a message about each event.
 
     Attributes:
-        converter: from N to what is sent.
-        frames: sent so far.
+        converter: from N to counts.
+        frames: number of frames sent.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Emulator:
         self._listed = {kind: faults.moments(kind, settings.rate) for kind in KINDS}
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
-        """Play until ``count`` gestures or ``seconds`` of the device are over, or until :meth:`stop`."""
+        """Send until ``count`` gestures or ``seconds`` of device time are over, or until :meth:`stop`."""
         self.await_reader()
         end = None if seconds is None else round(seconds * self.settings.rate)
         self._start = monotonic()
@@ -106,16 +106,16 @@ class Emulator:
                 return
 
     def stop(self) -> None:
-        """Let :meth:`run` return before its next frame, wherever it waits; from another thread."""
+        """Make :meth:`run` return before its next frame; called from another thread."""
         self._over.set()
 
     def await_reader(self) -> None:
-        """Wait until somebody opens the port."""
+        """Wait until a reader opens the port."""
         while not self.port.connected() and not self._over.wait(_LOOK):
             pass
 
     def _pieces(self, count: int | None) -> Iterator[tuple[np.ndarray, tuple[int, Gesture] | None]]:
-        """Yield what the converter says at rest, then gesture by gesture, each with the gap behind it."""
+        """Yield counts at rest, then of each gesture with the gap after it."""
         settings, sensors = self.settings, len(self.device.sensors)
         yield self._felt(np.zeros((round(settings.idle * settings.rate), sensors))), None
         gap = np.zeros((round(settings.gap * settings.rate), sensors))
@@ -124,17 +124,17 @@ class Emulator:
             yield self._felt(np.concatenate([true, gap])), (number, gesture)
 
     def _felt(self, true: np.ndarray) -> np.ndarray:
-        """Return what is sent for true readings (F, S), N."""
+        """Return the counts for true readings (F, S), N."""
         if len(true) < 2:
             return np.zeros((0, true.shape[1]))
         time = torch.from_numpy((self._number + np.arange(len(true))) / self.settings.rate)
-        said = self.device.imperfection.raw(
+        output = self.device.imperfection.raw(
             torch.from_numpy(true)[None].float(), self.device.constants, self._noise, time
         )
-        return self.converter(said[0].double().numpy())
+        return self.converter(output[0].double().numpy())
 
     def _play(self, values: np.ndarray, end: int | None) -> bool:
-        """Send frames when they are due; return whether it is over."""
+        """Send frames when they are due; return whether the run is over."""
         rate = self.settings.rate
         chances = {kind: self.faults.happen(kind, len(values), rate, self._chance) for kind in KINDS}
         for place, row in enumerate(values):
@@ -156,7 +156,7 @@ class Emulator:
         seq = self._number - self._zero
         t_us = round(seq * 1e6 / self.settings.rate) % 2**32
         if self.binary:
-            # Counts are whole and N are not.
+            # Only counts are whole numbers.
             data = encode_frame(row, seq, t_us, "f32" if self.settings.bits is None else "u16")
         else:
             numbers = row.tolist() if self.settings.bits is None else row.astype(int).tolist()
@@ -179,7 +179,7 @@ class Emulator:
         return row
 
     def _begin(self) -> None:
-        """Start counting, as a board does that has just got its power."""
+        """Start counting, like a board after power-on."""
         self._zero = self._number
         if self.faults.banner:
             self._send(BANNER)
@@ -213,7 +213,7 @@ class Emulator:
         self._begin()
 
     def _unplug(self) -> None:
-        """Vanish, with the power: the clock stands still and begins anew."""
+        """Disconnect and power off; the clock starts from 0 afterwards."""
         self._on_event(self._number / self.settings.rate, f"unplugged for {self.faults.away:g} s")
         self.port.unplug()
         if self._over.wait(self.faults.away / self.settings.speed):

@@ -1,4 +1,4 @@
-"""Endless gestures as the counts of an emulated skin's converter."""
+"""Endless gestures for an emulated skin, and its converter."""
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -18,12 +18,12 @@ _EDGE = 0.25  # of a frame, in which force rises and falls
 
 @dataclass(frozen=True)
 class Gesture:
-    """A gesture as it is felt.
+    """A simulated gesture.
 
     Attributes:
         labels: name -> 0 or 1.
         force: true readings, (T, S), N, at the model's rate.
-        applied: what presses on the skin altogether, (T,), N.
+        applied: total force on the skin, (T,), N.
     """
 
     labels: Mapping[str, int]
@@ -33,9 +33,9 @@ class Gesture:
 
 @dataclass(frozen=True)
 class Converter:
-    """Turns N into what is sent.
+    """Converts N to counts.
 
-    The middle of a converter is at 0 N and its ends are at twice the clip, as in
+    The middle of the converter is at 0 N and its ends are at twice the clip, as in
     skin.hardware.calibration.protocol.
 
     Attributes:
@@ -48,11 +48,11 @@ class Converter:
 
     @property
     def scale(self) -> float:
-        """N per count; 1 where N are sent."""
+        """N per count; 1 if N are sent."""
         return 1.0 if self.bits is None else 2 * self.clip / 2 ** (self.bits - 1)
 
     def __call__(self, newtons: np.ndarray) -> np.ndarray:
-        """Return what is sent, float64."""
+        """Return counts, or N if ``bits`` is None, float64."""
         if self.bits is None:
             return np.asarray(newtons, dtype=np.float64)
         middle = 2 ** (self.bits - 1)
@@ -60,9 +60,9 @@ class Converter:
 
 
 def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
-    """Yield gestures that no training can draw, in an order of ``seed`` alone, balanced in sixteens."""
+    """Yield gestures that are not used for training, balanced in batches of 16."""
     with ThreadPoolExecutor(1, "skin-gestures") as ahead:
-        # Drawn while the ones before are played: a device does not pause.
+        # Drawn while the previous ones are sent, so that there is no pause.
         coming = ahead.submit(_batch, device, seed, 0)
         for number in count(1):
             ready = coming.result()
@@ -92,11 +92,11 @@ def _drawn(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Genera
 
 
 def upsample(force: np.ndarray, model_rate: float, rate: float) -> np.ndarray:
-    """Return true readings (F, S), N, at a device's rate.
+    """Upsample true readings to the rate of a device; return (F, S), N.
 
-    A frame of the model stands for what happened since the one before, so it is held for its interval, and
-    rises and falls within a quarter of it at the edges towards a smaller neighbour. Its maximum over the
-    interval is the frame itself: what is reduced again is what was drawn, and no touch grows longer.
+    A frame of the model is held for its interval, with ramps of a quarter of the interval towards smaller
+    neighbours. The maximum over the interval is the frame itself, so resampling restores the original frames
+    and no touch becomes longer.
 
     Args:
         force: (T, S), N.

@@ -16,10 +16,10 @@ _PAUSE = 0.002  # s until a full buffer is tried again
 
 
 class AbstractPort(ABC):
-    """A port that somebody may be connected to; one thread may write while another unplugs it.
+    """Base class of ports; one thread may write while another unplugs the port.
 
     Attributes:
-        address: what ``device.port`` takes.
+        address: value for ``device.port``.
     """
 
     address: str
@@ -30,22 +30,22 @@ class AbstractPort(ABC):
 
     @abstractmethod
     def connected(self) -> bool:
-        """Return whether somebody listens."""
+        """Return whether a reader is connected."""
 
     @abstractmethod
     def unplug(self) -> None:
-        """Vanish."""
+        """Close the port."""
 
     @abstractmethod
     def plug(self) -> None:
-        """Appear at the same address."""
+        """Open the port again at the same address."""
 
     @abstractmethod
     def _send(self, data: bytes) -> int:
-        """Write some of ``data`` without waiting and return how much; the lock is held."""
+        """Write part of ``data`` without waiting and return its length; the lock is held."""
 
     def write(self, data: bytes) -> None:
-        """Write; what nobody takes within a second is lost."""
+        """Write; bytes that are not read within a second are lost."""
         deadline = monotonic() + _PATIENCE
         while data and monotonic() < deadline:
             with self._lock:
@@ -62,14 +62,14 @@ class AbstractPort(ABC):
 
 
 def open_port(port: str, link: str | None) -> AbstractPort:
-    """Return what ``port`` names: ``pty``, or ``tcp:NUMBER`` (0: any that is free).
+    """Open a port: ``pty``, or ``tcp:NUMBER`` (0: any free number).
 
     Args:
         port: as above.
-        link: a path by which the pseudo-terminal can be found, and found again after it was unplugged.
+        link: symbolic link to the pseudo-terminal, which stays the same after unplugging.
 
     Raises:
-        InputError: another name, a number in use, or a link that cannot be made.
+        InputError: an unknown port, a number in use, or a link that cannot be created.
     """
     kind, _, number = port.partition(":")
     if kind == "pty" and not number:
@@ -102,7 +102,7 @@ class _Pty(AbstractPort):
             tty.setraw(slave)
             os.set_blocking(self._master, False)
             name = os.ttyname(slave)
-            # Opened and closed once, it tells when somebody opens it.
+            # Opened and closed once, it signals when a reader opens it.
             os.close(slave)
         self.address = name if self._link is None else str(self._link)
         if self._link is not None:
@@ -157,7 +157,7 @@ class _Tcp(AbstractPort):
                 self._client.close()
                 self._client = None
             if self._client is None:
-                with suppress(OSError):  # nobody comes, or it is unplugged
+                with suppress(OSError):  # no reader, or unplugged
                     self._client, _ = self._server.accept()
                     self._client.setblocking(False)
             return self._client is not None

@@ -19,11 +19,11 @@ FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "
 
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
-_CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is asked about
-_AHEAD = 0.5  # s before these
-_LONG = "600 s"  # in the names of courses of minutes
+_CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is classified
+_AHEAD = 0.5  # s before the beginning and the end
+_LONG = "600 s"  # in the names of courses that last minutes
 _MINUTE = 60.0  # s
-_SPARSE = 0.1, 5.0  # s from one frame that is asked about to the next otherwise, and in a touch of minutes
+_SPARSE = 0.1, 5.0  # s between two classified frames otherwise, and in touches of minutes
 _SEGMENTS = count()  # of the device's clock: every touch begins with an empty window
 _TAP = {"dynamic": 0, "press": 0, "dangerous": 1}
 _PRESS = {"dynamic": 0, "press": 1, "dangerous": 1}
@@ -49,19 +49,19 @@ COURSES: Mapping[str, Callable[[np.ndarray], np.ndarray] | None] = {
     "hold 600 s, 30 % load": _held(600.0, 0.3),
     "ramp 10 s": _ramp(10.0),
 }
-"""How the load of a dangerous touch goes on over time; None: as the gesture itself does."""
+"""Load of a dangerous touch over time; None: that of the gesture."""
 
 
 @dataclass(frozen=True)
 class AlarmTiming:
-    """What an engine said of one dangerous touch.
+    """Timing of the alarm for one dangerous touch.
 
     Attributes:
         peak: largest true reading, N.
-        raised: s from the first force to the alarm; None: there was none.
-        kept: once raised, the alarm stayed until the force ended.
-        cleared: s from the end of the force to the end of the alarm; None: there was none, or it stayed.
-        early: an alarm before the touch.
+        raised: s from the first force to the alarm; None without an alarm.
+        kept: the alarm lasted until the end of the force.
+        cleared: s from the end of the force to the end of the alarm; None without an alarm or its end.
+        early: an alarm was raised before the touch.
     """
 
     peak: float
@@ -74,12 +74,12 @@ class AlarmTiming:
 def dangerous_touches(
     device: AbstractSimulated, course: str, number: int, seed: int = 0
 ) -> Iterator[np.ndarray]:
-    """Yield the true readings (T, S), N, of dangerous touches that stand still, at the model's rate.
+    """Yield the true readings (T, S), N, of dangerous static touches at the model's rate.
 
     Args:
-        device: its gestures, which no training draws.
+        device: source of the gestures, which are not used for training.
         course: a name in ``COURSES``.
-        number: how many; half of them are big.
+        number: of touches; half of them are big.
         seed: of the gestures.
 
     Raises:
@@ -105,11 +105,11 @@ def dangerous_touches(
 def play_touch(
     engine: Engine, device: AbstractSimulated, force: np.ndarray, rate: float, seed: int = 0
 ) -> AlarmTiming:
-    """Let an engine follow a touch frame by frame.
+    """Feed a touch to an engine frame by frame; return the timing of the alarm.
 
     Args:
         engine: new, or at rest.
-        device: feels the touch with its imperfections; its baseline is known as after a tare.
+        device: measures the touch with its imperfections, after a tare.
         force: true readings, (T, S), N, at the model's rate.
         rate: of the device, Hz.
         seed: of the noise.
@@ -118,7 +118,7 @@ def play_touch(
     true = np.concatenate([rest[0], upsample(force, device.rate, rate), rest[1]])
     noise, time = generator(Stream.NOISE, seed, Stream.TEST, 6), np.arange(len(true)) / rate
     imperfection, constants = device.imperfection, device.constants
-    said = (
+    measured = (
         imperfection.raw(torch.from_numpy(true)[None].float(), constants, noise, torch.from_numpy(time))[0]
         .double()
         .numpy()
@@ -130,7 +130,7 @@ def play_touch(
     step = max(1, round(_SPARSE[bool(end - begin > _MINUTE)] * rate))
     engine.reset()
     answers: list[tuple[float, bool]] = []
-    for number, (t, row) in enumerate(zip(time.tolist(), said, strict=True)):
+    for number, (t, row) in enumerate(zip(time.tolist(), measured, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
         close = any(-_AHEAD <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
         if not close and number % step:
@@ -154,9 +154,9 @@ def _outcome(answers: list[tuple[float, bool]], peak: float, begin: float, end: 
 def timing_row(course: str, found: Sequence[AlarmTiming]) -> list[str]:
     """Return a line with the columns of ``FIELDS``.
 
-    These are: the course; how many touches there were, how many raised the alarm, kept it to their end, and
-    found it raised before; median and 95th percentile of the time to the alarm, and median of the time from
-    the end of the touch to the end of the alarm, s.
+    These are: the course; the numbers of touches, of those with an alarm, with an alarm kept to the end, and
+    with an alarm before the touch; median and 95th percentile of the time to the alarm, and median of the
+    time from the end of the touch to the end of the alarm, s.
     """
     raised = [one.raised for one in found if one.raised is not None]
     cleared = [one.cleared for one in found if one.cleared is not None]
@@ -174,14 +174,14 @@ def time_courses(
     rate: float,
     track: Callable[..., Iterable[np.ndarray]],
 ) -> Iterator[list[str]]:
-    """Play every course before an engine and yield a line of each, as :func:`timing_row` gives it.
+    """Feed every course to an engine and yield a row for each, as :func:`timing_row` gives it.
 
     Args:
         engine: at rest.
         device: as in :func:`play_touch`.
-        number: touches of each course; a tenth of it of those of minutes.
+        number: touches per course; a tenth of it for courses of minutes.
         rate: of the device, Hz.
-        track: wraps the touches of a course, to show how far it is, as ``rich.progress.track``.
+        track: wraps the touches of a course to show progress, as ``rich.progress.track``.
     """
     for course in COURSES:
         many = max(1, number // 10) if _LONG in course else number

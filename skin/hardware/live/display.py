@@ -10,20 +10,20 @@ from skin.hardware.live.verdict import Verdict
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion
 
-_KEPT = 8192  # frames that a view may be late by
+_KEPT = 8192  # frames that are kept for slow views
 
 
 @dataclass(frozen=True)
 class DisplayInfo:
-    """What does not change while a skin is watched.
+    """Constant information about a live view.
 
     Attributes:
         title: of the run.
-        port: where frames come from.
+        port: source of the frames.
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m.
-        top: N at the end of the colour scale.
-        window: s that a verdict is about.
+        top: upper end of the colour scale, N.
+        window: length of the classified window, s.
     """
 
     title: str
@@ -36,18 +36,18 @@ class DisplayInfo:
 
 @dataclass(frozen=True)
 class DisplayState:
-    """What there is to show now.
+    """State of the live view at one moment.
 
     Attributes:
-        number: of frames so far; ask the next time for what came since.
-        values: (S,), N, the largest of each sensor since the last look, so that no peak is missed; the limit
-            of a saturated sensor, 0 of an unknown one.
-        valid: (S,), bool, of the latest frame: False where a sensor's force is unknown.
-        saturated: (S,), bool, since the last look: the force is at least the value.
-        verdict: None where there is none now.
-        trouble: why there is none, for a person; empty if all is well.
-        alarm: the latest verdict there was is dangerous, and nobody knows that the contact has ended.
-        line: rate, lost frames and latency, for a person.
+        number: of frames so far, to be passed to the next :meth:`Display.state`.
+        values: (S,), N, the largest of each sensor since the last call, so that no peak is missed; the limit
+            of a saturated sensor, 0 of an invalid one.
+        valid: (S,), bool, of the latest frame.
+        saturated: (S,), bool, since the last call: the force is at least the value.
+        verdict: the latest one; None if there is none now.
+        trouble: message about why there is no verdict; else empty.
+        alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
+        line: text with rate, lost frames and latency.
     """
 
     number: int
@@ -61,12 +61,12 @@ class DisplayState:
 
 
 class Display:
-    """The latest frames, verdict and state; one thread writes, any number look.
+    """The latest frames, verdict and status, shared by one writing thread and any number of views.
 
     Attributes:
         info: as given.
-        closed: set at the end.
-        tare: set by a view whose operator asks for a new baseline; cleared by the one who takes it.
+        closed: event, set at the end.
+        tare: event, set by a view to request a new baseline; cleared by the live loop.
     """
 
     def __init__(self, info: DisplayInfo) -> None:
@@ -81,7 +81,7 @@ class Display:
         self._trouble, self._line = "waiting for the first frame", ""
 
     def add_frame(self, frame: Frame, conversion: UnitConversion) -> None:
-        """Take a frame as the device sent it, and what its values mean."""
+        """Add a frame as sent, with the conversion of its values to N."""
         values, valid = conversion(frame.values, frame.valid)
         saturated = np.zeros_like(valid) if frame.saturated is None else frame.saturated & valid
         with self._lock:
@@ -90,18 +90,18 @@ class Display:
             self._valid = valid
 
     def set_verdict(self, verdict: Verdict | None, trouble: str = "", alarm: bool = False) -> None:
-        """Take a verdict, or why there is none and whether an alarm has not ended."""
+        """Set the verdict; or None with the reason and whether an alarm continues."""
         with self._lock:
             self._verdict, self._trouble = verdict, trouble
             self._alarm = alarm if verdict is None else verdict.dangerous
 
     def set_status(self, line: str) -> None:
-        """Take the line about rate, lost frames and latency."""
+        """Set the text with rate, lost frames and latency."""
         with self._lock:
             self._line = line
 
     def state(self, since: int = 0) -> DisplayState:
-        """Return what there is to show to whom has seen ``since`` frames."""
+        """Return the state, with the largest values after the first ``since`` frames."""
         with self._lock:
             fresh = min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]

@@ -1,4 +1,4 @@
-"""From frames to verdicts, without input or output."""
+"""Classify a stream of frames, without input or output."""
 
 from dataclasses import dataclass
 
@@ -21,16 +21,16 @@ from skin.wire.conversion import UnitConversion
 @checked("detection")
 @dataclass(frozen=True)
 class Detection:
-    """What counts as a contact.
+    """Settings of the contact detection.
 
     Attributes:
         threshold: N above the tared baseline.
-        drift: N/s, how fast the baseline may follow the untouched skin.
-        learned: the model's own answer that something touches counts too.
-        longest: s, the longest touch that the model was trained on.
+        drift: N/s, largest rate at which the baseline follows the untouched skin.
+        learned: use the model's label ``touch`` in addition.
+        longest: s, longest touch of the training.
 
     Raises:
-        InputError: a value that cannot be used.
+        InputError: an invalid value.
     """
 
     threshold: PositiveFloat
@@ -40,20 +40,20 @@ class Detection:
 
 
 class Engine:
-    """Says at every frame what the window that ends there shows.
+    """Classifies at every frame the window that ends there.
 
-    An alarm is latched: once raised, it stays until the contact ends, whatever the model says. A contact that
-    lasts longer than any touch of the training is shown to the model as a press of the present readings that
-    follows the last idle readings: in the plain window nothing would tell it from an untouched skin.
+    An alarm is latched: once raised, it stays until the contact ends, whatever the model predicts. A contact
+    that lasts longer than any touch of the training is presented to the model as a press with the present
+    readings after the last idle readings; otherwise a constant load would look like an untouched skin.
 
     Args:
         learner: trained.
-        task: what its labels mean.
+        task: its labels.
         positions: (S, 3), m.
         frames: T, frames of its window.
-        rate: that it was trained at, Hz.
-        detection: what counts as a contact.
-        patience: how long answers must hold.
+        rate: of its training, Hz.
+        detection: settings of the contact detection.
+        patience: settings of debouncing.
 
     Attributes:
         alarm: the latest verdict was dangerous, and the contact has not ended.
@@ -80,11 +80,11 @@ class Engine:
         self.reset()
 
     def reset(self) -> None:
-        """Forget alarm and contact: the operator says that nothing touches the skin."""
+        """Reset alarm and contact, after a tare of the untouched skin."""
         self._contact.reset()
         shape = self.window.frames, self.window.sensors
         self._idle = np.zeros(shape, dtype=np.float32), np.ones(shape, dtype=bool)
-        self.alarm, self._highest = False, 0.0
+        self.alarm, self._peak_probability = False, 0.0
         self._restart()
 
     def _restart(self) -> None:
@@ -95,7 +95,7 @@ class Engine:
         self._labels |= {"dangerous": Debounce(patience.alarm, patience.calm)}
 
     def add(self, frame: Frame) -> None:
-        """Let the window slide without asking: for frames that have waited while another was classified.
+        """Add a frame to the window without classifying it.
 
         Args:
             frame: as the device sent it.
@@ -106,11 +106,11 @@ class Engine:
         self.window.add(frame)
 
     def push(self, frame: Frame, conversion: UnitConversion) -> Verdict | None:
-        """Return what the window that ends with this frame is said to show.
+        """Return the verdict on the window that ends with this frame.
 
         Args:
             frame: as the device sent it.
-            conversion: what its values mean.
+            conversion: of its values to N.
 
         Returns:
             None while the window is not full, unless an alarm is latched.
@@ -123,18 +123,18 @@ class Engine:
         return self._waiting(frame, conversion) if seen is None else self._verdict(seen, frame, conversion)
 
     def _waiting(self, frame: Frame, conversion: UnitConversion) -> Verdict | None:
-        """Keep a latched alarm while the window fills again after a restart of the device."""
+        """Return a latched alarm while the window fills again after a restart of the device."""
         if not self.alarm:
             return None
         seen = self.window.read(partial=True)
         if seen is not None and not self._contact.update(*conversion(seen.values, seen.valid), frame.t_host):
             self.alarm = False
             return None
-        chances, said = {"dangerous": self._highest}, {"dangerous": True}
-        return Verdict(frame.t, frame.t_host, chances, True, said, True, True, (), self._since(frame))
+        chances, labels = {"dangerous": self._peak_probability}, {"dangerous": True}
+        return Verdict(frame.t, frame.t_host, chances, True, labels, True, True, (), self._since(frame))
 
     def _since(self, frame: Frame) -> float | None:
-        """Return for how long the contact has lasted, s."""
+        """Return the duration of the contact, s; None without contact."""
         since = self._contact.since
         return None if since is None else frame.t_host - since
 
@@ -144,35 +144,35 @@ class Engine:
         risen = bool(self._contact.rises(readings, valid).any())
         if not contact and not risen:
             self._idle = readings, valid
-        chances = self._asked(readings, valid, self._since(frame) or 0.0)
+        chances = self._probabilities(readings, valid, self._since(frame) or 0.0)
         touched = contact or risen or (self._detection.learned and chances[self.task.gate or ""] > 0.5)
         masked = tuple(np.flatnonzero(~valid.any(axis=0)).tolist())
         period = self.window.period
 
-        def settled(debounce: Debounce, answer: bool) -> bool:
+        def debounced(debounce: Debounce, answer: bool) -> bool:
             return debounce(answer, frame.t, period)
 
         chance = chances.get("dangerous", 0.0)
-        # A probability that is no number is no reason to call a touch safe.
-        raised = settled(self._labels["dangerous"], touched and not chance <= self._above)
+        # A NaN probability must not make a touch safe.
+        raised = debounced(self._labels["dangerous"], touched and not chance <= self._above)
         self.alarm = raised or (self.alarm and contact)
-        self._highest = max(self._highest, chance) if self.alarm else 0.0
-        # An alarm does not wait until the touch is settled.
-        shown = settled(self._touch, touched) or self.alarm
+        self._peak_probability = max(self._peak_probability, chance) if self.alarm else 0.0
+        # An alarm does not wait for the debounced touch.
+        shown = debounced(self._touch, touched) or self.alarm
         answer = self._answers(chances)
-        said = {
-            name: settled(self._labels[name], answer[name]) for name in self.task.gated if name != "dangerous"
+        labels = {
+            name: debounced(self._labels[name], answer[name])
+            for name in self.task.gated
+            if name != "dangerous"
         }
         if "dangerous" in self.task.names:
-            said["dangerous"] = self.alarm
-            chances["dangerous"] = max(self._highest, chance)
-        since = self._since(frame)
-        return Verdict(
-            frame.t, frame.t_host, chances, shown, said if shown else {}, self.alarm, seen.gap, masked, since
-        )
+            labels["dangerous"] = self.alarm
+            chances["dangerous"] = max(self._peak_probability, chance)
+        labels, since = labels if shown else {}, self._since(frame)
+        return Verdict(frame.t, frame.t_host, chances, shown, labels, self.alarm, seen.gap, masked, since)
 
     @torch.inference_mode()
-    def _asked(self, readings: np.ndarray, valid: np.ndarray, lasted: float) -> dict[str, float]:
+    def _probabilities(self, readings: np.ndarray, valid: np.ndarray, lasted: float) -> dict[str, float]:
         """Return label -> probability of a window (T, S), N, at the end of a contact of ``lasted`` s."""
         if lasted * self.window.rate > self._held:
             before = (len(readings) - self._held) // 2
@@ -186,7 +186,7 @@ class Engine:
         return dict(zip(self.task.names, answers, strict=True))
 
     def _answers(self, chances: dict[str, float]) -> dict[str, bool]:
-        """Return which labels hold in this window: the likeliest one where they exclude each other."""
+        """Return the predicted labels of this window: the likeliest one if they exclude each other."""
         if self.task.kind == "exclusive":
             best = max(chances, key=chances.__getitem__)
             return {name: name == best for name in chances}

@@ -1,4 +1,4 @@
-"""Make an engine from a finished run."""
+"""Build an engine from a finished run."""
 
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from skin.signal.contact_detection import DRIFT
 from skin.signal.contact_threshold import ContactThreshold, rise
 from skin.trained import Trained
 
-_FAINT = 0.3  # N that end a contact where nothing else is known
-_MANY = 4000  # windows of streams, a tenth of which tunes what touch is
+_FAINT = 0.3  # N, default contact threshold
+_MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
 
 
 def make_engine(
@@ -23,14 +23,14 @@ def make_engine(
 
     Args:
         of: the run.
-        patience: how long answers must hold.
-        touch: N above its baseline from which on a reading is a touch; None: tuned on simulated streams of
-            its device, and what the run has learned about touch counts too.
-        drift: N in ten minutes that the baseline may follow while nothing touches.
+        patience: settings of debouncing.
+        touch: contact threshold, N above the baseline; None: tuned on simulated streams of its device, and
+            the learned label ``touch`` is used too.
+        drift: N in ten minutes that the baseline may follow without touch.
 
     Raises:
-        InputError: neither learned nor given, and no device that has streams; or no probability can raise
-            the alarm of the run.
+        InputError: ``touch`` is neither given nor learned and the device has no streams; or the run cannot
+            raise an alarm.
     """
     if patience.above is None and of.point is not None:
         if of.point.silent:
@@ -44,7 +44,7 @@ def make_engine(
 
 
 def _longest(of: Trained) -> float:
-    """Return the longest touch that a run was trained on, s; two thirds of its window if nobody knows."""
+    """Return the longest touch that a run was trained on, s; two thirds of its window if unknown."""
     frames = of.window * 2 / 3
     if of.device.simulation is not None:
         frames = of.device.simulation.sampler.settings.press[1]
@@ -55,9 +55,7 @@ def _tuned(device: AbstractDevice, learned: bool) -> float:
     if device.simulation is None:
         if learned:
             return _FAINT
-        raise InputError(
-            "this run does not know what no touch is: give live.touch=0.3 (N), or train on streams"
-        )
+        raise InputError("this run has no contact threshold: give live.touch=0.3 (N), or train on streams")
     known = device.simulation.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches(
         "validation"
     )
@@ -66,11 +64,11 @@ def _tuned(device: AbstractDevice, learned: bool) -> float:
 
 
 def simulator_warning(stored: DictConfig, device: AbstractDevice) -> str | None:
-    """Return what to say of a run that watches a real skin with what it learned from equation 10, or None.
+    """Return a warning if a run trained with equation 10 is used on a real skin; else None.
 
     Args:
         stored: the run's configuration.
-        device: what is watched.
+        device: the watched device.
     """
     reading = OmegaConf.select(stored, "device.simulator.reading")
     if reading != "equation10" or device.wired is None:

@@ -12,14 +12,14 @@ from skin.settings import configured
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """What ``live:`` holds (``conf/live.yaml``).
+    """Settings under ``live:`` (``conf/live.yaml``).
 
     Attributes:
-        web_port: of the page; 0 takes a free one.
-        top: N at the end of the colour scale.
-        touch: N above baseline that are a touch; None: as the run learned it.
-        drift: N in ten minutes that the baseline may follow while nothing touches.
-        patience: how long answers must hold.
+        web_port: port of the page; 0: any free one.
+        top: upper end of the colour scale, N.
+        touch: contact threshold, N above the baseline; None: that of the run.
+        drift: N in ten minutes that the baseline may follow without touch.
+        patience: settings of debouncing.
     """
 
     web_port: Annotated[int, Ge(0), Le(65535)]
@@ -30,10 +30,10 @@ class LiveSettings:
 
     @classmethod
     def of(cls, live: Mapping[str, Any]) -> "LiveSettings":
-        """Return the settings in plain containers.
+        """Return checked settings from plain containers.
 
         Raises:
-            InputError: one that is unknown or cannot be used.
+            InputError: a setting is unknown or invalid.
         """
         patience = configured(DebounceSettings, live["patience"], "live.patience")
         return configured(cls, {**live, "patience": patience}, "live")

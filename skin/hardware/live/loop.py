@@ -12,26 +12,26 @@ from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
 from skin.wire.tare import Tare
 
-_PATIENCE = 0.3  # s of silence after which no verdict holds
+_PATIENCE = 0.3  # s without frames after which the verdict is removed
 _AT_ONCE = 1024  # frames
-_TOLD = 0.5  # s between two lines about the state
-_DELAYS = 2000  # verdicts over which the delay is taken
+_STATUS = 0.5  # s between two updates of the status
+_DELAYS = 2000  # verdicts for the percentile of the delay
 
 
 class LiveLoop:
-    """Watches a skin until its recording ends, the time is over, or Ctrl-C.
+    """Classifies the frames of a skin until the recording ends, the time is over, or Ctrl-C.
 
-    Frames that came while another was classified slide through the window unasked, so the verdict is always
-    about the latest; what they showed is still in the window.
+    Frames that arrive during a classification are added to the window without classifying each, so the
+    verdict is always about the latest frame.
 
     Args:
         skin: open.
-        tare: finds out what its values mean.
-        engine: what gives verdicts.
-        display: where they are shown.
+        tare: gives the conversion of values to N.
+        engine: gives verdicts.
+        display: shows them.
 
     Attributes:
-        verdicts: how many there were.
+        verdicts: number of verdicts so far.
     """
 
     def __init__(self, skin: Skin, tare: Tare, engine: Engine, display: Display) -> None:
@@ -41,10 +41,13 @@ class LiveLoop:
         self.verdicts = 0
 
     def run(self, seconds: float | None = None) -> None:
-        """Watch.
+        """Run the loop.
+
+        Args:
+            seconds: duration, s; None: no limit.
 
         Raises:
-            InputError: nothing can be read, the stream is too slow, or its numbers have no known meaning.
+            InputError: nothing can be read, the stream is too slow, or its scale is unknown.
         """
         until = np.inf if seconds is None else monotonic() + seconds
         while monotonic() < until:
@@ -64,7 +67,7 @@ class LiveLoop:
         return float(np.percentile(self._delays, 99)) if self._delays else float("nan")
 
     def _waiting(self) -> list[Frame]:
-        """Return what else has come."""
+        """Return the other frames that have arrived."""
         try:
             return self._skin.read(_AT_ONCE, 0.0)
         except (SkinTimeout, SkinDisconnected) as few:
@@ -98,13 +101,13 @@ class LiveLoop:
 
     def _update_status(self) -> None:
         now = monotonic()
-        if now - self._updated_at >= _TOLD:
+        if now - self._updated_at >= _STATUS:
             self._updated_at = now
             self._display.set_status(self.line)
 
     @property
     def line(self) -> str:
-        """Rate, what was lost, sensors that say nothing, and delay, for a person."""
+        """Text with rate, lost frames, broken sensors and delay."""
         stats = self._skin.stats
         counts = {
             "bad": stats.bad_frames,
@@ -113,15 +116,15 @@ class LiveLoop:
             "restarts": stats.resets,
             "reconnected": stats.reconnects,
         }
-        sick = [
+        faulty = [
             f"sensor {number} {state}" for number, state in enumerate(self._skin.channels) if state != "ok"
         ]
         parts = [
             self._tare.status if self._tare.conversion is not None else "",
             f"{stats.rate_hz:.1f} Hz",
             *(f"{count} {name}" for name, count in counts.items() if count),
-            *sick[:3],
-            f"and {len(sick) - 3} more" if len(sick) > 3 else "",
+            *faulty[:3],
+            f"and {len(faulty) - 3} more" if len(faulty) > 3 else "",
             f"frame to verdict {1e3 * self.p99:.1f} ms (p99)" if self._delays else "",
             stats.trouble,
         ]

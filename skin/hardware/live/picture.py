@@ -1,4 +1,4 @@
-"""The skin as a picture: readings interpolated between the sensors."""
+"""Picture of the skin: readings interpolated between the sensors."""
 
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay
@@ -11,16 +11,16 @@ _INWARDS = 1e-6
 
 
 class SkinPicture:
-    """Interpolates between the sensors: to look at, not to measure.
+    """Interpolates readings between the sensors, for display only.
 
     Linear inside the sensors' hull, as ``representation=interp`` does; outside, as at the nearest point of
-    the hull, so that there is no edge. Nearest where no triangle can be made.
+    the hull, so that there is no edge. Nearest neighbour if there is no triangle.
 
     Args:
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m.
         pixels: edge length of the picture, which is stretched over the sheet.
-        top: N that are shown brightest.
+        top: N at the brightest value.
     """
 
     def __init__(self, positions: np.ndarray, size: tuple[float, float], pixels: int, top: float) -> None:
@@ -48,7 +48,7 @@ class SkinPicture:
 
         Args:
             values: N.
-            known: (S,), bool; the others are left out, not shown as 0; None: all are known.
+            known: (S,), bool; other sensors are left out, not shown as 0; None: all are known.
         """
         known = np.ones(len(values), dtype=bool) if known is None else known
         if not np.array_equal(known, self._known):
@@ -59,7 +59,7 @@ class SkinPicture:
 
 
 def _inside(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return targets (P, 2), those outside of the hull of points (S, 2) moved to the nearest place in it."""
+    """Return targets (P, 2), those outside of the hull of points (S, 2) moved to its nearest point."""
     outside = Delaunay(points).find_simplex(targets) < 0
     corners = points[ConvexHull(points).vertices]
     along = np.roll(corners, -1, axis=0) - corners
@@ -68,6 +68,6 @@ def _inside(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
     nearest = ((feet - targets[outside, None]) ** 2).sum(axis=2).argmin(axis=1)
     moved = targets.copy()
     on_edge = feet[np.arange(len(feet)), nearest]
-    # A little inwards, for rounding must not leave them outside.
+    # A little inwards, so that rounding does not leave them outside.
     moved[outside] = on_edge + _INWARDS * (corners.mean(axis=0) - on_edge)
     return moved

@@ -1,4 +1,4 @@
-"""The skin in a terminal; if output is no terminal, one line per change of the verdict."""
+"""Live view in a terminal; without a terminal, one line per change of the verdict."""
 
 import signal
 import sys
@@ -24,7 +24,7 @@ from skin.wire.segmentation import typed_lines
 _HERTZ = 8
 _PIXELS = 24
 _BAR = 20  # characters
-_SHORT, _LONG = 3.0, 60.0  # s of contact after which it is told, and after which it may be drift
+_SHORT, _LONG = 3.0, 60.0  # s of contact after which it is shown, and after which it may be drift
 _KEYS = "t and Enter: a new tare, nothing may touch the skin; Ctrl-C ends"
 # Dark blue, teal, yellow, white: lighter means more to any eye.
 _SCALE = ((13, 22, 48), (24, 92, 122), (92, 170, 120), (240, 200, 70), (255, 250, 230))
@@ -37,11 +37,11 @@ _COLOURS = ["#{:02x}{:02x}{:02x}".format(*rgb) for rgb in np.round(_MIXED).astyp
 
 @contextmanager
 def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
-    """Show the board while the block runs, and hear what the operator types."""
+    """Show the display while the block runs, and read typed commands."""
     with suppress(AttributeError, ValueError):  # Windows; another thread than the main one
-        # Where the program is sent to the background, keys are no longer heard; it must not be stopped.
+        # In the background the program reads no keys; it must not be stopped.
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
-    Thread(target=_hear, args=(display,), name="skin-keys", daemon=True).start()
+    Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
     live = Live(get_renderable=_Screen(display), console=console, refresh_per_second=_HERTZ, transient=True)
     with live if console.is_terminal else _printed(display, console):
         try:
@@ -60,8 +60,8 @@ def _printed(display: Display, console: Console) -> Iterator[None]:
         thread.join(2)
 
 
-def _hear(display: Display) -> None:
-    """Ask for a new tare at every line ``t``, until the input ends."""
+def _read_keys(display: Display) -> None:
+    """Request a new tare at every line ``t``, until the input ends."""
     with suppress(OSError, ValueError):  # no input, or a closed one
         for text in typed_lines(sys.stdin.fileno()):
             if text.strip().lower() == "t":
@@ -69,13 +69,13 @@ def _hear(display: Display) -> None:
 
 
 def print_changes(display: Display, console: Console) -> None:
-    """Print what is said whenever it changes, until the board is closed."""
+    """Print the verdict whenever it changes, until the display is closed."""
     before = ""
     while True:
-        said = _sentence(display.state())
-        if said != before:
-            console.print(said, markup=False, highlight=False, soft_wrap=True)
-            before = said
+        text = _sentence(display.state())
+        if text != before:
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+            before = text
         if display.closed.wait(1 / (4 * _HERTZ)):
             return
 
@@ -90,7 +90,7 @@ def _sentence(state: DisplayState) -> str:
 
 
 class _Screen:
-    """Renders the board anew each time it is asked."""
+    """Renders the display at each call."""
 
     def __init__(self, display: Display) -> None:
         info = display.info
@@ -104,16 +104,16 @@ class _Screen:
 
 
 def screen(display: Display, state: DisplayState, picture: SkinPicture) -> RenderableType:
-    """Return the skin beside what is said of it, and the line about the stream below."""
+    """Return the skin beside the verdict, with the status of the stream below."""
     info, beside = display.info, Table.grid(padding=(0, 3))
-    beside.add_row(_map(picture(state.values, state.valid)), _said(state))
+    beside.add_row(_map(picture(state.values, state.valid)), _verdict(state))
     border = "bold red" if state.alarm else "dim"
     panel = Panel(beside, title=f"{info.title} on {info.port}", border_style=border, expand=False)
     return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
 
 
 def _map(image: Any) -> Text:
-    """Return a picture of half blocks, two rows of pixels a line."""
+    """Return a picture of half blocks, two rows of pixels per line."""
     text = Text()
     for upper, lower in zip(image[::2], image[1::2], strict=True):
         for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
@@ -122,7 +122,7 @@ def _map(image: Any) -> Text:
     return text
 
 
-def _said(state: DisplayState) -> RenderableType:
+def _verdict(state: DisplayState) -> RenderableType:
     verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
     if verdict is None:
         trouble = Text(state.trouble or "waiting", style="yellow")
@@ -136,10 +136,10 @@ def _said(state: DisplayState) -> RenderableType:
 
 
 def contact_text(contact: float | None) -> str:
-    """Return since when something touches the skin, by the clock on the wall; empty if nothing does.
+    """Return a text with the time since which something touches the skin; empty without contact.
 
     Args:
-        contact: for how long, s.
+        contact: duration of the contact, s; None without contact.
     """
     if contact is None or contact < _SHORT:
         return ""

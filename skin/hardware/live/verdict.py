@@ -1,4 +1,4 @@
-"""The verdict on a window, and how long it must persist before it is shown."""
+"""The verdict on a window, and its debouncing."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -12,19 +12,19 @@ from skin.settings import checked
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a window is said to show.
+    """Classification of a window.
 
     Attributes:
         t: s, the device's clock at the latest frame.
         t_host: s, the host's clock at that frame.
         chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
-            raised, as long as it lasts.
-        touched: debounced; False: nothing touches the skin, and the labels mean nothing.
-        labels: label -> debounced answer; empty without touch.
-        dangerous: what alarms, until the contact ends; never without touch.
-        gap: frames are missing in the window.
-        masked: sensors that say nothing in the whole window.
-        contact: for how long something has touched the skin, s; None: nothing does now.
+            raised, while it lasts.
+        touched: debounced; if False, nothing touches the skin and the labels are meaningless.
+        labels: label -> debounced prediction; empty without touch.
+        dangerous: the alarm, which lasts until the contact ends.
+        gap: whether frames are missing in the window.
+        masked: sensors without a valid reading in the whole window.
+        contact: duration of the contact, s; None without contact.
     """
 
     t: float
@@ -38,7 +38,7 @@ class Verdict:
     contact: float | None = None
 
     def words(self) -> list[tuple[str, float]]:
-        """Return what is said in words, each with its probability in this window; nothing without touch."""
+        """Return the predicted classes, each with its probability in this window; empty without touch."""
         pairs = [
             (name, self.chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - self.chances[name])
             for name, yes in self.labels.items()
@@ -49,17 +49,17 @@ class Verdict:
 @checked("live.patience")
 @dataclass(frozen=True)
 class DebounceSettings:
-    """How long an answer must hold before it is said, and be gone before it is taken back, s.
+    """Durations for which a prediction must last before it is shown, and be absent before it is removed, s.
 
     Attributes:
         label: of any label but ``dangerous``, and of touch.
-        alarm: of ``dangerous`` before it is said; after more than 0.03 s it would be said too late,
-            50 ms after the frame that shows it.
-        calm: before it is taken back.
-        above: probability above which a touch is said to be dangerous; None: as the run stores it.
+        alarm: of ``dangerous`` before it is shown; more than 0.03 s would delay the alarm beyond 50 ms after
+            the frame.
+        calm: without ``dangerous`` before the alarm is removed.
+        above: probability above which a touch is dangerous; None: the threshold stored with the run.
 
     Raises:
-        InputError: a negative time, an alarm that would come too late, or no probability.
+        InputError: a negative time, an alarm that would be too late, or a value that is no probability.
     """
 
     label: NonNegativeFloat = 0.15
@@ -70,14 +70,14 @@ class DebounceSettings:
 
 @dataclass
 class Debounce:
-    """Says yes once that was the answer for ``rise`` seconds, and no after ``fall`` seconds of no.
+    """Turns on after ``rise`` seconds of True, and off after ``fall`` seconds of False.
 
-    Where frames come less often than that, one frame is enough.
+    If frames are further apart than that, one frame is enough.
 
     Attributes:
         rise: s.
         fall: s.
-        state: what is said.
+        state: the debounced value.
     """
 
     rise: float
@@ -86,7 +86,7 @@ class Debounce:
     _since: float | None = field(default=None, repr=False)
 
     def __call__(self, answer: bool, t: float, period: float) -> bool:
-        """Return what is said after an answer at ``t`` that holds for ``period``, s."""
+        """Return the debounced value after an answer at ``t`` that lasts for ``period``, s."""
         if answer == self.state:
             self._since = None
             return self.state

@@ -1,4 +1,4 @@
-"""The skin on a local web page; pictures are sent as server-sent events."""
+"""Live view on a local web page; pictures are sent as server-sent events."""
 
 import asyncio
 import base64
@@ -24,7 +24,7 @@ from skin.hardware.live.display import Display, DisplayState
 from skin.hardware.live.picture import SkinPicture
 from skin.hardware.live.terminal import contact_text
 
-HERTZ = 33  # pictures a second: 30, and what a busy machine costs
+HERTZ = 33  # pictures per second: 30, with a margin for a busy machine
 _PIXELS = 64
 _HOST = "127.0.0.1"
 _PAGE = Path(__file__).with_name("page.html")
@@ -32,11 +32,11 @@ _PAGE = Path(__file__).with_name("page.html")
 
 @contextmanager
 def serve_page(display: Display, port: int) -> Iterator[str]:
-    """Serve the page while the block runs; give its address.
+    """Serve the page while the block runs; yield its address.
 
     Args:
-        display: what is shown.
-        port: 0 takes a free one.
+        display: the display to show.
+        port: 0: any free one.
 
     Raises:
         InputError: the port is in use or not allowed.
@@ -61,11 +61,11 @@ def serve_page(display: Display, port: int) -> Iterator[str]:
 
 
 def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
-    """Return what a page is sent for each picture: forces in N, the picture as base64 of uint8 row by row."""
+    """Return the data of each picture: forces in N, the picture as base64 of uint8 row by row."""
     verdict = state.verdict
-    said = None
+    answer = None
     if verdict is not None:
-        said = {
+        answer = {
             "touched": verdict.touched,
             "dangerous": verdict.dangerous,
             "gap": verdict.gap,
@@ -78,7 +78,7 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
         "valid": state.valid.tolist(),
         "saturated": state.saturated.tolist(),
         "picture": base64.b64encode(picture(state.values, state.valid).tobytes()).decode(),
-        "verdict": said,
+        "verdict": answer,
         "trouble": state.trouble,
         "alarm": state.alarm,
         "line": state.line,
@@ -107,7 +107,7 @@ def _application(display: Display) -> Starlette:
         display.tare.set()
         return Response(status_code=204)
 
-    # Names that lead here from elsewhere are refused: another site's page must not read the skin.
+    # Other host names are refused, so that pages of other sites cannot read the skin.
     here = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
     routes = [Route("/", page), Route("/skin.json", skin), Route("/pictures", pictures)]
     routes.append(Route("/tare", tare, methods=["POST"]))

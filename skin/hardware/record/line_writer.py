@@ -1,4 +1,4 @@
-"""A file that grows by whole lines and has one writer at a time."""
+"""A file to which one writer at a time appends whole lines."""
 
 import json
 import os
@@ -17,10 +17,10 @@ _SUM = ', "sum": "'
 
 
 class LineWriter:
-    """Adds lines to the end of a file. Where one does not fit on the disk, nothing of it stays.
+    """Appends lines to a file. A line that does not fit on the disk is removed completely.
 
     Args:
-        path: of the file, which exists.
+        path: of an existing file.
 
     Raises:
         InputError: the file cannot be written.
@@ -28,7 +28,7 @@ class LineWriter:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with _said(path):
+        with _input_error(path):
             # Windows would write two bytes for the end of a line.
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_BINARY", 0))
             self._size = os.fstat(self._file).st_size
@@ -37,13 +37,13 @@ class LineWriter:
         """Add a line.
 
         Raises:
-            InputError: the disk is full or fails; the file ends with the line before.
+            InputError: the disk is full or fails; the file then ends with the previous line.
         """
         rest = data = text.encode() + b"\n"
-        with _said(self._path):
+        with _input_error(self._path):
             try:
-                # One call is the rule: a program that is killed has written all of a line or nothing of it.
-                # A disk that is nearly full takes a part.
+                # Usually one call, so that a killed program has written all of a line or nothing. A nearly
+                # full disk accepts a part.
                 while rest:
                     rest = rest[os.write(self._file, rest) :]
             except OSError:
@@ -53,30 +53,30 @@ class LineWriter:
         self._size += len(data)
 
     def sync(self) -> None:
-        """Let all lines reach the disk; InputError as above."""
-        with _said(self._path):
+        """Flush all lines to the disk; InputError as above."""
+        with _input_error(self._path):
             os.fsync(self._file)
 
     def close(self) -> None:
         """Close the file; InputError as above."""
-        with _said(self._path):
+        with _input_error(self._path):
             os.close(self._file)
 
 
 @contextmanager
-def _said(path: Path) -> Iterator[None]:
+def _input_error(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
         raise InputError(
-            f"cannot write {path}: {error.strerror}; what it holds is kept, and the same command goes on "
-            "once there is room"
+            f"cannot write {path}: {error.strerror}; its content is kept; make room and run the same "
+            "command again"
         ) from error
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep other programs from recording to a file. The lock ends with the process, however that ends.
+    """Keep other programs from recording to a file. The lock ends with the process.
 
     The empty file ``.NAME.lock`` that carries the lock stays beside it.
 
@@ -101,20 +101,20 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def encode_event(event: str, **what: Any) -> tuple[str, str]:
-    """Return an event as a line of JSON behind #, with its checksum, and the checksum."""
+    """Return an event as a line of JSON after #, with its checksum, and the checksum."""
     text = "# " + json.dumps({"event": event, **what})
     token = f"{zlib.crc32(text.encode()):08x}"
     return f'{text[:-1]}{_SUM}{token}"}}', token
 
 
 def decode_event(line: str) -> tuple[dict[str, Any], str]:
-    """Return what :func:`encode_event` was given and the checksum, empty in an older session that has none.
+    """Decode a line of :func:`encode_event`; return event and checksum, which is empty in older sessions.
 
     Raises:
-        ValueError: no JSON, or another checksum.
+        ValueError: no JSON, or a wrong checksum.
     """
-    said = json.loads(line[1:])
-    token = said.pop("sum", "")
+    content = json.loads(line[1:])
+    token = content.pop("sum", "")
     if token and f"{zlib.crc32((line.rpartition(_SUM)[0] + '}').encode()):08x}" != token:
         raise ValueError("wrong checksum")
-    return said, token
+    return content, token

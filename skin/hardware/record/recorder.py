@@ -26,17 +26,17 @@ _log = logging.getLogger("skin.hardware.record")
 def record_session(
     device: AbstractWired, path: Path, seconds: float | None, free: bool, notify: Callable[[str], None]
 ) -> None:
-    """Write frames until all gestures are done, ``seconds`` are over, or a person ends it.
+    """Record frames until all gestures are done, ``seconds`` are over, or the user ends it.
 
     Args:
-        device: where they come from, and which gestures.
-        path: x.csv; one that exists is resumed.
-        seconds: of the session, an unplugged skin's too; None: no limit.
-        free: whatever is done counts, in windows one after the other.
-        notify: says a sentence to the person.
+        device: source of the frames, with the planned gestures.
+        path: x.csv; an existing session is resumed.
+        seconds: duration of the session, with disconnections; None: no limit.
+        free: record consecutive windows without labels.
+        notify: called with each message for the user.
 
     Raises:
-        InputError: another process records to the file, or it cannot be written; what it holds is kept.
+        InputError: another process records to the file, or it cannot be written; its content is kept.
     """
     with locked(path):
         _record(device, path, seconds, free, notify)
@@ -53,7 +53,7 @@ def _record(
             log.conversion(conversion)
             for frame in first:
                 log.frame(frame)
-            # By the session's time, because the device's begins anew with each start.
+            # In time of the session, because the device's clock restarts with each session.
             begin = log.time - (first[-1].t - first[0].t)
             if log.done:
                 notify(f"{path} has {len(log.done)} gestures: going on")
@@ -80,7 +80,7 @@ def _record(
 
 
 def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
-    """Return what stands beside a session."""
+    """Return the metadata of a session."""
     return {
         "format": 2,
         "unit": header.unit if header and header.unit else "adc",
@@ -98,10 +98,10 @@ def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
 
 
 def convert_session(device: AbstractWired, path: Path) -> tuple[Path, int]:
-    """Write the whole gestures of a session as a recording beside it; return it and how many there are.
+    """Write the complete gestures of a session as a recording beside it; return its path and their number.
 
     Raises:
-        InputError: no session, none whole, or a session of another layout, window, rate or labels.
+        InputError: no session, no complete gesture, or another layout, window, rate or labels.
     """
     stored = read_session(path)
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
@@ -119,13 +119,13 @@ def convert_session(device: AbstractWired, path: Path) -> tuple[Path, int]:
 def _same_labels(
     names: Sequence[str], path: Path, stored: StoredSession
 ) -> list[tuple[RecordedGesture, UnitConversion]]:
-    """Return the whole gestures that have the labels, or all that have none where none has some."""
+    """Return the complete gestures with the labels; if no gesture has them, those without labels."""
     gestures = [stored.gestures[number] for number in sorted(stored.gestures)]
     if not gestures:
         raise InputError(
             "; ".join(
                 [
-                    f"{path} has {stored.frames} frames and no whole gesture: record some more",
+                    f"{path} has {stored.frames} frames and no complete gesture: record some more",
                     *stored.warnings,
                 ]
             )

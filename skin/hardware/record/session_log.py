@@ -1,9 +1,9 @@
-"""A session on disk: raw frames as they arrive, and the events between them.
+"""Write a session: raw frames as they arrive, and events.
 
-A CSV that skin calibrate reads too: ``time`` (s since the start), ``seq`` and a column of raw
-values per sensor. Lines that start with # are JSON: what values mean, where a gesture begins and ends, gaps,
-invalid channels. Unit, layout and start time stand in ``x.csv.json``. Lines are only ever added, each in one
-piece, so the file is valid up to its last whole frame whatever ends the program.
+A session is a CSV file that skin calibrate reads too: ``time`` (s since the start), ``seq`` and a column of
+raw values per sensor. Lines that start with # are JSON: unit conversion, beginning and end of gestures, gaps,
+invalid channels. Unit, layout and start time are in ``x.csv.json``. Whole lines are appended, so the file is
+valid up to its last complete frame if the program is interrupted.
 
 The reader skips damaged lines: see :func:`skin.hardware.record.session_reader.read_session`. Events have
 checksums. The line that begins a gesture repeats the invalid and saturated channels, and refers to the unit
@@ -30,19 +30,18 @@ from skin.wire.segmentation import RecordedGesture
 
 
 class SessionLog:
-    """A session that is being written; one that exists is resumed.
+    """Writes a session; an existing one is resumed.
 
     Args:
         path: x.csv.
-        about: what is written beside it; a resumed session keeps its own.
+        about: metadata; a resumed session keeps its own.
         sensors: S.
 
     Attributes:
-        done: numbers of the gestures that are whole.
+        done: numbers of the complete gestures.
 
     Raises:
-        InputError: the file cannot be written, is no session, or one of another device, layout, window or
-            rate.
+        InputError: the file cannot be written, or is not a session of this device, layout, window and rate.
     """
 
     def __init__(self, path: Path, about: Mapping[str, Any], sensors: int) -> None:
@@ -65,41 +64,41 @@ class SessionLog:
 
     @staticmethod
     def _resume(path: Path, about: Mapping[str, Any], header: str) -> StoredSession | None:
-        """Return what is there; None if that is a header at most."""
+        """Return the existing session; None if there is at most a header."""
         whole = path.read_bytes() if path.exists() else b""
         if header.encode().startswith(whole):
             return None
         stored = read_session(path)
         check_session(path, stored.about, about)
-        # What a power cut left of a last line would make the next one wrong.
+        # An incomplete last line, after a power cut, would damage the next one.
         os.truncate(path, whole.rfind(b"\n") + 1)
         return stored
 
     def mark(self, event: str, **what: Any) -> None:
-        """Say what happens before the next frame."""
+        """Write an event before the next frame."""
         self._lines.add(encode_event(event, **what)[0])
 
     def conversion(self, conversion: UnitConversion) -> None:
-        """Say what values from now on mean; its ``zero`` is the baseline."""
-        said = {name: value.tolist() for name, value in vars(conversion).items()}
-        line, self._conversion_checksum = encode_event("meaning", **said)
+        """Write the conversion of the following values to N; its ``zero`` is the baseline."""
+        arrays = {name: value.tolist() for name, value in vars(conversion).items()}
+        line, self._conversion_checksum = encode_event("meaning", **arrays)
         self._lines.add(line)
 
     def begin(self, gesture: RecordedGesture, frame: Frame) -> None:
-        """Say that a gesture's window begins at or just before a frame."""
+        """Write that the window of a gesture begins at or just before a frame."""
         begin = round(self._time(frame) - (frame.t - gesture.begin), 9)
         known = {"number": gesture.number, "time": begin, "labels": gesture.labels}
         self.mark("begin", **known, meaning=self._conversion_checksum, **self._marked)
 
     def end(self, gesture: RecordedGesture) -> None:
-        """Say that it is over, and let it reach the disk."""
+        """Write that a gesture is over, and flush the file to the disk."""
         self.mark("broken" if gesture.broken else "end", number=gesture.number, lost=gesture.lost)
         self._lines.sync()
         if not gesture.broken:
             self.done.add(gesture.number)
 
     def frame(self, frame: Frame) -> None:
-        """Add a frame, raw."""
+        """Write a raw frame."""
         if frame.after:
             self.mark("gap", after=frame.after, lost=frame.lost)
         none = np.zeros(len(frame.values), dtype=bool)
@@ -115,11 +114,11 @@ class SessionLog:
 
     @property
     def time(self) -> float:
-        """When the last frame came, s since the session began."""
+        """Time of the last frame, s since the start of the session."""
         return self._last
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._lines.close()
 
     def _time(self, frame: Frame) -> float:
@@ -133,7 +132,7 @@ class SessionLog:
 
 
 def check_session(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise InputError where a session was recorded otherwise than the configuration or the device is now."""
+    """Raise InputError if a session does not match the configuration or the device."""
     differ = {
         name: (about[name], value) for name, value in now.items() if name in about and about[name] != value
     }

@@ -1,4 +1,4 @@
-"""Read a session from disk, also when some of its lines are damaged."""
+"""Read a session, skipping damaged lines."""
 
 import json
 import logging
@@ -20,8 +20,8 @@ from skin.wire.segmentation import RecordedGesture
 _log = logging.getLogger("skin.hardware.record")
 
 _IN_FRAMES = b"0123456789+-.e,\r"
-_IN_EVENTS = b' #"[]{}:\0'  # and never in a frame; a power cut leaves NUL where any line may have been
-_SPOILT = 2  # bytes of a frame that may be none of its own
+_IN_EVENTS = b' #"[]{}:\0'  # not in frames; after a power cut any line may consist of NUL
+_SPOILT = 2  # damaged bytes in a line that still counts as a frame
 _SLACK = 1e-6  # s: times are rounded
 _BEFORE = 512  # frames
 _STARTS = ("cut", "reset", "reconnect")
@@ -29,14 +29,14 @@ _BAD = (ValueError, LookupError, TypeError, AttributeError, OverflowError, Recur
 
 
 def read_session(path: Path) -> StoredSession:
-    """Return what a session holds, and warn of what it lost.
+    """Read a session; warn of damaged lines and gestures.
 
-    Half a line at its end and gestures without an end are left out. A damaged line is skipped and counted.
-    Within a gesture, a damaged frame counts as lost; where the line may have been an event, the gesture is
-    left out, for nobody knows what its frames mean. So is one whose line with the baseline is damaged.
+    An incomplete line at the end and incomplete gestures are left out. A damaged line is skipped and counted.
+    Within a gesture, a damaged frame counts as lost. If the line may have been an event, or if the line with
+    the unit conversion is damaged, the gesture is left out.
 
     Raises:
-        InputError: no such file, or no session of skin record.
+        InputError: no such file, or not a session of skin record.
     """
     beside = path.with_name(path.name + ".json")
     if path.exists() and not beside.exists():
@@ -62,7 +62,7 @@ def read_session(path: Path) -> StoredSession:
 
 
 def _about(beside: Path) -> dict[str, Any]:
-    """Return what stands beside a session; one of the errors in _BAD if that is not what belongs there."""
+    """Return the metadata of a session; an error of _BAD if they are invalid."""
     about = json.loads(beside.read_text(encoding="utf-8"))
     if not isinstance(about, dict) or not {"positions", "started_unix"} <= set(about):
         raise ValueError("it has no positions or no started_unix")
@@ -93,15 +93,15 @@ class _Reading:
         self._gesture: RecordedGesture | None = None
         self._conversion: tuple[str, UnitConversion] | None = None
         self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
-        # Frames before the gesture: they tell the device's rate, as they do in the live view.
+        # Frames before the gesture determine the device's rate, as in the live view.
         self._before: deque[Frame] = deque(maxlen=_BEFORE)
         self._missing = 0
         self._spoilt, self._doubtful = 0, False
-        # The last two frames, each with the number of its line: whether time grows.
+        # The last two frames, each with the number of its line, to check that time increases.
         self._last: list[tuple[int, Frame]] = []
 
     def line(self, number: int, data: bytes) -> None:
-        """Take a line without its end."""
+        """Process a line without its end."""
         try:
             text = data.decode("ascii")
             if number == 1:
@@ -153,7 +153,7 @@ class _Reading:
         (self._before if self._gesture is None else self._gesture.frames).append(frame)
 
     def _in_time(self, frame: Frame) -> None:
-        """Time only grows: of two frames that deny this, the one that fits those around it is right."""
+        """Check that time increases; of two contradicting frames, drop the one that does not fit."""
         if not self._last or frame.t >= self._last[-1][1].t:
             return
         if len(self._last) == 2 and frame.t < self._last[0][1].t:
@@ -166,30 +166,30 @@ class _Reading:
         if held and held[-1] is wrong:
             held.pop()
 
-    def _event(self, said: dict[str, Any], token: str) -> None:
-        match said.pop("event"):
+    def _event(self, content: dict[str, Any], token: str) -> None:
+        match content.pop("event"):
             case "meaning":
-                arrays = {name: np.array(value) for name, value in said.items()}
+                arrays = {name: np.array(value) for name, value in content.items()}
                 if any(
                     len(array) != self._sensors or not np.isfinite(array).all() for array in arrays.values()
                 ):
-                    raise ValueError("a meaning of other sensors")
+                    raise ValueError("a conversion of other sensors")
                 self._conversion = token, UnitConversion(**arrays)
                 self._marked = {"invalid": [], "saturated": []}
                 self._gesture, self._doubtful = None, False
             case "begin":
-                self._begin(said)
+                self._begin(content)
             case "end":
-                self._end(int(said["number"]), int(said["lost"]))
+                self._end(int(content["number"]), int(content["lost"]))
             case "gap":
-                # After it the device's clock begins anew; a gesture may begin with the frame behind it.
-                if said["after"] in _STARTS:
+                # The device's clock restarts; a gesture may begin with the next frame.
+                if content["after"] in _STARTS:
                     self._before.clear()
                     if self._gesture is not None and self._gesture.frames:
                         self._gesture = None
-                self._missing += max(1, int(said["lost"]))
+                self._missing += max(1, int(content["lost"]))
             case ("invalid" | "saturated") as event:
-                self._marked[event] = self._channels(said["channels"])
+                self._marked[event] = self._channels(content["channels"])
             case "broken":
                 self._gesture = None
             case other:
@@ -200,17 +200,17 @@ class _Reading:
             raise ValueError(f"no channels {channels}")
         return channels
 
-    def _begin(self, said: dict[str, Any]) -> None:
-        number, labels = int(said["number"]), said["labels"]
-        if not isfinite(said["time"]) or not set((labels or {}).values()) <= {0, 1}:
+    def _begin(self, content: dict[str, Any]) -> None:
+        number, labels = int(content["number"]), content["labels"]
+        if not isfinite(content["time"]) or not set((labels or {}).values()) <= {0, 1}:
             raise ValueError("no gesture")
-        self._gesture, self._spoilt = RecordedGesture(number, labels, float(said["time"]), 0), 0
-        # Older sessions do not say which baseline is meant.
-        meant = said.get("meaning")
+        self._gesture, self._spoilt = RecordedGesture(number, labels, float(content["time"]), 0), 0
+        # Older sessions do not refer to a conversion.
+        meant = content.get("meaning")
         if self._conversion is None or (self._doubtful if meant is None else meant != self._conversion[0]):
-            self._leave_out("the line that says what its values mean is damaged")
+            self._leave_out("the line with its unit conversion is damaged")
         for event, channels in self._marked.items():
-            self._marked[event] = self._channels(said.get(event, channels))
+            self._marked[event] = self._channels(content.get(event, channels))
 
     def _window(self, gesture: RecordedGesture) -> Resampled:
         about = self.stored.about
@@ -222,7 +222,7 @@ class _Reading:
 
     def _end(self, number: int, lost: int) -> None:
         gesture, self._gesture = self._gesture, None
-        # Another number: the line where this one ended or that one began is damaged.
+        # Another number: the line of an end or a beginning is damaged.
         if gesture is None or gesture.number != number or self._conversion is None:
             return
         inside = [

@@ -11,15 +11,15 @@ _NAMED = 5  # lines or gestures, in a sentence
 
 @dataclass
 class StoredSession:
-    """What a session holds.
+    """Content of a session.
 
     Attributes:
-        about: the JSON beside it.
-        gestures: whole gestures by number, each with what its values mean; the last one of a number counts.
-        frames: how many.
+        about: metadata in the JSON file beside it.
+        gestures: complete gestures by number, each with its unit conversion; the last one of a number counts.
+        frames: number of frames.
         end: time of the last frame, s.
         damaged: numbers of the lines that cannot be read; the header is line 1.
-        left_out: number of a gesture -> why it cannot be used.
+        left_out: number of a gesture -> reason why it cannot be used.
     """
 
     about: dict[str, Any]
@@ -31,14 +31,14 @@ class StoredSession:
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know of lines and gestures that are missing."""
-        said = []
+        """Warnings about damaged lines and omitted gestures."""
+        warnings = []
         if count := len(self.damaged):
-            said.append(f"{count} damaged line{'s' * (count > 1)} skipped: {_some(self.damaged)}")
+            warnings.append(f"{count} damaged line{'s' * (count > 1)} skipped: {_some(self.damaged)}")
         for reason in dict.fromkeys(self.left_out.values()):
             numbers = [number for number, why in self.left_out.items() if why == reason]
-            said.append(f"gesture {_some(numbers)} left out: {reason}")
-        return said
+            warnings.append(f"gesture {_some(numbers)} left out: {reason}")
+        return warnings
 
 
 def _some(numbers: list[int]) -> str:

@@ -149,5 +149,5 @@ def test_what_cannot_be_calibrated_is_refused():
         build_bench_data(skin.replace(layout=Grid(2, 2)), found.session, None)
     silent = BenchData(found.session, found.gauge, found.each)
     silent.session.raw[:] = 0.05 * np.random.default_rng(0).standard_normal(silent.session.raw.shape)
-    with pytest.raises(InputError, match=r"no channel answers to a press|strongest"):
+    with pytest.raises(InputError, match=r"no channel responds to a press|strongest"):
         fit_calibration(silent)

@@ -90,7 +90,7 @@ def test_a_line_that_does_not_fit_leaves_nothing(tmp_path):
     with room(1005):
         for _ in range(125):
             lines.add("0123456")
-        with pytest.raises(InputError, match=r"cannot write .*/x: File too large; what it holds is kept"):
+        with pytest.raises(InputError, match=r"cannot write .*/x: File too large; its content is kept"):
             lines.add("0123456789")
     lines.add("more room")
     lines.close()

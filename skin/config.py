@@ -110,7 +110,7 @@ class Config:
     smoke: bool | None = None
     table: dict[str, Any] | None = None
     validate: dict[str, Any] | None = None
-    bench: dict[str, Any] | None = None
+    benchmark: dict[str, Any] | None = None
     peers: dict[str, Any] | None = None
 
 

@@ -1,11 +1,6 @@
-"""How long a simulator takes to build with nothing cached, and its memory; run in a process of its own.
+"""How long a simulator takes to build with nothing cached, and its memory; run in a process of its own."""
 
-python experiments/benchmarks/building.py solid 3
-"""
-
-import json
 import os
-import sys
 import tempfile
 
 from hydra.utils import instantiate
@@ -25,7 +20,3 @@ def measure_building(simulator: str, repeats: int) -> dict[str, float]:
             make(body, sensors)
 
     return {"build_seconds": median_seconds(build, repeats), "peak_memory_bytes": peak_memory()}
-
-
-if __name__ == "__main__":
-    print(json.dumps(measure_building(sys.argv[1], int(sys.argv[2]))))

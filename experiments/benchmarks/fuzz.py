@@ -1,19 +1,18 @@
 """Fuzz the decoder: it raises no exception and recovers every valid frame after the next delimiter.
 
-python experiments/benchmarks/fuzz.py 1000000 crc16 25 0
+skin bench benchmark=fuzz benchmark.count=1000000 benchmark.format=crc16
 
 Frames are encoded independently of the package. The check uses only which frames were sent intact.
 """
 
-import argparse
-import json
-import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from random import Random
+from typing import Any
 
+from pydantic import PositiveInt
 from rich.console import Console
 from rich.progress import Progress
 
@@ -215,28 +214,9 @@ class _Oracle:
             self.recovered += 1
 
 
-def main() -> None:
-    """Print the figures; exit with 1 where a frame was missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("count", type=int, help="of chunks")
-    parser.add_argument("format", choices=FORMATS)
-    parser.add_argument("sensors", type=int)
-    parser.add_argument("seed", type=int)
-    given = parser.parse_args()
+def fuzz_decoder(count: PositiveInt, format: WireFormat, sensors: PositiveInt, seed: int) -> dict[str, Any]:
+    """Fuzz the decoder with a progress bar, as :func:`fuzz` does."""
     with Progress(console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task(f"{given.format}, {given.sensors} sensors", total=given.count)
-        found = fuzz(
-            given.count,
-            given.format,
-            given.sensors,
-            given.seed,
-            lambda done: progress.update(bar, completed=done),
-        )
-    print(json.dumps({"format": given.format, "sensors": given.sensors, "seed": given.seed} | found))
-    sys.exit(1 if found["missed"] else 0)
-
-
-if __name__ == "__main__":
-    main()
+        bar = progress.add_task(f"{format}, {sensors} sensors", total=count)
+        found = fuzz(count, format, sensors, seed, lambda done: progress.update(bar, completed=done))
+    return {"format": format, "sensors": sensors, "seed": seed} | found

@@ -1,10 +1,5 @@
-"""Gestures per second and peak memory, from the seed to imperfect readings; run in a process of its own.
+"""Gestures per second and peak memory, from the seed to imperfect readings; run in a process of its own."""
 
-python experiments/benchmarks/generation.py fem 3
-"""
-
-import json
-import sys
 import time
 from statistics import median
 
@@ -36,7 +31,3 @@ def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
         "frames_per_second": speed * len(movie.frames) / len(movie),
         "peak_memory_bytes": peak_memory(),
     }
-
-
-if __name__ == "__main__":
-    print(json.dumps(measure_generation(sys.argv[1], int(sys.argv[2]))))

@@ -1,23 +1,18 @@
 """Time of PyTorch Geometric's layers over that of skin's own, forward and backward, at the sizes of two rows.
 
-python experiments/benchmarks/layers.py 9
+skin bench benchmark=layers
 
 On one thread, the median of that many repeats in turns. A batch has 64 windows of 30 frames and 25 sensors.
 """
 
-import json
-import sys
 import time
 from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 import torch
+from pydantic import PositiveInt
 from torch import Tensor, nn
 from torch_geometric.nn import DenseGCNConv, GCNConv, aggr
 
@@ -81,7 +76,7 @@ def poolings(name: Pooling, width: int, graphs: int) -> tuple[Task, dict[str, Ta
     return ours, found
 
 
-def measure_layers(repeats: int) -> dict[str, dict[str, float]]:
+def measure_layers(repeats: PositiveInt) -> dict[str, dict[str, float]]:
     """Return for each row the time of PyTorch Geometric's layers over that of skin's."""
     found = {}
     for row, (graphs, sizes) in ROWS.items():
@@ -111,9 +106,3 @@ def _alternating(tasks: list[Task], x: Tensor, repeats: int) -> list[float]:
             result.backward(torch.ones_like(result))  # as large as it is: .sum() would give a single number
             times.append(time.process_time() - began)
     return [median(times[2:]) for times in taken]
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    print(json.dumps(measure_layers(int(sys.argv[1])), indent=2))

@@ -1,11 +1,9 @@
 """Frame to verdict on one core; run in a process of its own.
 
-python experiments/benchmarks/live_latency.py 1000               # the best row, untrained
-python experiments/benchmarks/live_latency.py 1000 --run latest  # what a run has learnt
+skin bench benchmark=live_latency                       # the best row, untrained
+skin bench benchmark=live_latency benchmark.run=latest  # what a run has learnt
 """
 
-import argparse
-import json
 import time
 
 import numpy as np
@@ -99,19 +97,3 @@ def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
     wall, core = time.perf_counter(), time.thread_time()
     assert engine.push(frame, known) is not None
     return time.perf_counter() - wall, time.thread_time() - core
-
-
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("frames", type=int, nargs="?", default=1000)
-    parser.add_argument("--run", help="the beginning of the id of a finished run, or latest")
-    parser.add_argument("--uri", help="of the store that holds it, as in sqlite:///mlflow.db")
-    given = parser.parse_args()
-    print(json.dumps(measure_latency(given.frames, run=given.run, uri=given.uri)))
-
-
-if __name__ == "__main__":
-    main()

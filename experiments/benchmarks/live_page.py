@@ -1,16 +1,16 @@
 """Measure the frame rate of the live page in a headless Chromium, and take a screenshot of an alarm.
 
 skin live web=true                                          # in one terminal
-python experiments/benchmarks/live_page.py http://127.0.0.1:8765 30               # in another
-python experiments/benchmarks/live_page.py http://127.0.0.1:8765 60 --alarm live.png
+skin bench benchmark=live_page                              # in another
+skin bench benchmark=live_page benchmark.seconds=60 benchmark.alarm=live.png
 """
 
-import argparse
-import json
 import sys
 from collections import deque
 from pathlib import Path
 from time import monotonic, sleep
+
+from pydantic import PositiveFloat
 
 from experiments.benchmarks.browser import Browser, installed
 
@@ -25,7 +25,9 @@ _ALARM = "return document.body.dataset.state === 'danger' ? Math.max(...latest.v
 _LINE = "return document.getElementById('line').textContent"
 
 
-def measure_refresh(address: str, seconds: float, alarm: Path | None = None) -> dict[str, float | str]:
+def measure_refresh(
+    address: str, seconds: PositiveFloat, alarm: str | Path | None = None
+) -> dict[str, float | str]:
     """Return the drawn frames and browser refreshes of a page per second, and its last status line.
 
     Args:
@@ -46,7 +48,7 @@ def measure_refresh(address: str, seconds: float, alarm: Path | None = None) -> 
         if alarm is None:
             sleep(seconds)
         else:
-            _picture(browser, seconds, alarm)
+            _picture(browser, seconds, Path(alarm))
         passed, pictures, refreshes = (
             now - then for now, then in zip(browser.run(_STATE), before, strict=True)
         )
@@ -73,19 +75,3 @@ def _picture(browser: Browser, seconds: float, path: Path) -> None:
                 hardest = min(looks)
                 path.write_bytes(picture)
         sleep(_LOOK)
-
-
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("address")
-    parser.add_argument("seconds", type=float)
-    parser.add_argument("--alarm", type=Path, metavar="PNG", help="take a picture of the hardest alarm")
-    given = parser.parse_args()
-    print(json.dumps(measure_refresh(given.address, given.seconds, given.alarm)))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,8 @@
 """What reading a skin costs, and what survives a faulty wire: a pseudo-terminal, 1 % of its lines spoilt.
 
-python experiments/benchmarks/wire.py 600 crc16
+skin bench benchmark=wire benchmark.seconds=600
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -11,10 +10,10 @@ import sys
 import time
 from dataclasses import dataclass, field
 from functools import partial
-from typing import get_args
 
 import numpy as np
 import psutil
+from pydantic import PositiveFloat
 
 from skin.signal.frame import Check, Frame
 from skin.wire.decoder import Decoder
@@ -41,7 +40,7 @@ def decode_core_share(rate: float = 1000.0, frames: int = 20_000) -> float:
     return (time.process_time() - began) / frames * rate
 
 
-def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[str, float]:
+def soak(seconds: PositiveFloat, check: Check = "crc16", rate: PositiveFloat = 500.0) -> dict[str, float]:
     """Read from a pseudo-terminal that another process fills, one line of a hundred spoilt.
 
     A spoilt line has two bits flipped, has lost two bytes, has lost its end and glues to the next, has a run
@@ -58,7 +57,8 @@ def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[st
     master, slave = os.openpty()
     tty.setraw(slave)
     tally = _Tally(round(seconds * rate), after=min(_MINUTE, seconds / 10))
-    command = [sys.executable, __file__, str(seconds), check, str(rate), "--send", str(master)]
+    code = f"from {__name__} import _send; _send({master}, {seconds}, {check!r}, {rate})"
+    command = [sys.executable, "-c", code]
     sender = subprocess.Popen(command, pass_fds=[master], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert sender.stdin is not None
     assert sender.stdout is not None
@@ -215,24 +215,3 @@ def _send(master: int, seconds: float, check: Check, rate: float) -> None:
     passed = time.monotonic() - began
     share = (time.process_time() - worked) / passed
     print(json.dumps({"rate_hz": count / passed, "late": late, "sender_core_share": share}), flush=True)
-
-
-def main() -> None:
-    """Print the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("seconds", type=float, nargs="?", default=60.0)
-    parser.add_argument("check", choices=get_args(Check), nargs="?", default="crc16")
-    parser.add_argument("rate", type=float, nargs="?", default=500.0, help="Hz")
-    parser.add_argument("--send", type=int, metavar="DESCRIPTOR", help="be the sender of a soak")
-    given = parser.parse_args()
-    if given.send is not None:
-        _send(given.send, given.seconds, given.check, given.rate)
-        return
-    found = soak(given.seconds, given.check, given.rate)
-    print(json.dumps({"decode_core_share": decode_core_share()} | found, indent=2))
-
-
-if __name__ == "__main__":
-    main()

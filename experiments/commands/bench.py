@@ -1,44 +1,49 @@
 """Measure speed and memory, each against a peer in the same run.
 
     skin bench
+    skin bench benchmark=wire benchmark.seconds=600 benchmark.check=crc16
 
-Writes bench.json into out=.
+benchmark=all measures each in relation to a peer. Writes bench.json, or bench_<benchmark>.json, into out=.
 """
 
 import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from skin.command import command
 from skin.config import plain
 from skin.files import results
-from skin.paths import ROOT
-from skin.settings import check_settings
+from skin.settings import check_settings, import_target
 
-HERE = ROOT / "experiments"
 SIMULATORS = ("naive", "fem", "solid")
 PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "scikit-fem", "PyNiteFEA")
 
 
 @command("bench")
 def main(config: DictConfig) -> None:
-    """Run all benchmarks and write bench.json; progress goes to standard error."""
-    settings = plain(config)["bench"]
-    check_settings(figures, settings, "bench")
+    """Run a benchmark and write its results; exit code 1 if the decoder missed frames."""
+    part = plain(config)["benchmark"]
+    check_settings(import_target(part["_target_"], "benchmark"), part, "benchmark")
 
     from skin.files import write
 
-    text = json.dumps(figures(**settings), indent=2)
-    write(text + "\n", results(config.out) / "bench.json")
+    found = instantiate(part)
+    chosen = HydraConfig.get().runtime.choices["benchmark"]
+    text = json.dumps(found, indent=2)
+    write(text + "\n", results(config.out) / f"bench{'' if chosen == 'all' else f'_{chosen}'}.json")
     print(text)
+    sys.exit(1 if found.get("missed") else 0)
 
 
-def figures(
+def run_all(
     repeats: Annotated[int, Ge(3)],
     rows: Sequence[Literal["temporal_graph", "temporal_image", "sequence_graph", "sequence_image"]],
 ) -> dict[str, Any]:
@@ -57,17 +62,21 @@ def figures(
     say = Console(stderr=True).print
     found: dict[str, Any] = {"repeats": repeats, "machine": machine(), "versions": versions(PACKAGES)}
     say("generation, device, live")
-    found["generation"] = {name: _own("generation", name, str(repeats)) for name in SIMULATORS}
+    found["generation"] = {
+        name: run_alone("generation", "measure_generation", name, repeats) for name in SIMULATORS
+    }
     found["device"] = {"decode_core_share": decode_core_share()}
-    found["live"] = _own("live_latency", "1000")
+    found["live"] = run_alone("live_latency", "measure_latency", 1000)
     say("operator")
-    found["operator"] = {name: _own("building", name, str(repeats)) for name in SIMULATORS}
+    found["operator"] = {
+        name: run_alone("building", "measure_building", name, repeats) for name in SIMULATORS
+    }
     say("peers of the finite-element skins: about two minutes")
     _compare(found["generation"], repeats, say)
     say("start")
     command = [sys.executable, "-m", "skin", "train", "--help"]
-    help_seconds = median_seconds(lambda: subprocess.run(command, capture_output=True, check=True), repeats)
-    found["startup"] = {"help_seconds": help_seconds}
+    start = partial(subprocess.run, command, capture_output=True, check=True)
+    found["startup"] = {"help_seconds": median_seconds(start, repeats)}
     found["training"] = {}
     for row in rows:
         say(f"training of {row}")
@@ -92,7 +101,8 @@ def _compare(generation: dict[str, dict[str, float]], repeats: int, say: Callabl
         own["ratio_to_direct_solve"] = direct * own["frames_per_second"]
 
 
-def _own(module: str, *arguments: str) -> dict[str, float]:
-    """Run a benchmark in its own process, with its own peak memory and threads."""
-    command = [sys.executable, str(HERE / "benchmarks" / f"{module}.py"), *arguments]
+def run_alone(module: str, function: str, *arguments: object) -> dict[str, float]:
+    """Run a benchmark in its own process, so that its peak memory and its threads are its own."""
+    imports = f"import json; from experiments.benchmarks.{module} import {function}"
+    command = [sys.executable, "-c", f"{imports}; print(json.dumps({function}(*{arguments!r})))"]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)

@@ -6,17 +6,13 @@ import sys
 
 import pytest
 
-from skin.paths import ROOT
-
-GENERATION = ROOT / "experiments" / "benchmarks" / "generation.py"
+from experiments.commands.bench import run_alone
 
 
 def test_generation_reports_rates_and_its_own_memory():
     # 400 MB in this process must not count in the one that is measured.
     ballast = bytearray(400_000_000)
-    command = [sys.executable, str(GENERATION), "naive", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
-    figures = json.loads(done.stdout)
+    figures = run_alone("generation", "measure_generation", "naive", 1)
     assert set(figures) == {"gestures_per_second", "frames_per_second", "peak_memory_bytes"}
     # a gesture shows between one frame (static) and twenty (the longest slide)
     assert 1 < figures["frames_per_second"] / figures["gestures_per_second"] < 20
@@ -25,9 +21,9 @@ def test_generation_reports_rates_and_its_own_memory():
 
 
 def test_bad_arguments_exit_with_2(run, tmp_path):
-    done = run(tmp_path, "bench", "bench.repeats=1", store=False)
+    done = run(tmp_path, "bench", "benchmark.repeats=1", store=False)
     assert done.returncode == 2
-    assert "repeats" in done.stderr
+    assert done.stderr.startswith("benchmark.repeats=1 must be greater")
 
 
 def test_the_table_refuses_bad_arguments(run, tmp_path):
@@ -36,10 +32,9 @@ def test_the_table_refuses_bad_arguments(run, tmp_path):
     assert "table.seeds=0 must be greater" in done.stderr
 
 
-def test_building_starts_cold_each_time(run, tmp_path, monkeypatch):
+def test_building_starts_cold_each_time(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    done = run(tmp_path, "benchmarks/building.py", "fem", "1", store=False)
-    figures = json.loads(done.stdout)
+    figures = run_alone("building", "measure_building", "fem", 1)
     # a warm operator is there in a hundredth of that
     assert figures["build_seconds"] > 0.02
     assert 1e8 < figures["peak_memory_bytes"] < 1.5e9
@@ -58,7 +53,19 @@ def test_what_is_not_installed_is_left_out():
 
 @pytest.mark.slow
 def test_a_verdict_is_timed_by_the_wall_and_by_the_core(run, tmp_path):
-    done = run(tmp_path, "benchmarks/live_latency.py", "30", store=False)
-    figures = json.loads(done.stdout)
+    done = run(tmp_path, "bench", "benchmark=live_latency", "benchmark.count=30", store=False)
+    figures = json.loads((tmp_path / "results" / "bench_live_latency.json").read_text())
+    assert json.loads(done.stdout) == figures
     assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share"}
     assert 0 < figures["p50_ms"] <= figures["p99_ms"]
+
+
+@pytest.mark.slow
+def test_the_decoder_is_fuzzed(run, tmp_path):
+    done = run(tmp_path, "bench", "benchmark=fuzz", "benchmark.count=2000", store=False)
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    assert (figures["missed"], figures["format"]) == (0, "crc16")
+    done = run(tmp_path, "bench", "benchmark=fuzz", "benchmark.format=crc32", store=False)
+    assert done.returncode == 2
+    assert "benchmark.format=crc32 must be 'crc16'" in done.stderr

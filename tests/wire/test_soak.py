@@ -1,4 +1,4 @@
-"""Five seconds of a faulty wire; experiments/benchmarks/wire.py takes as many minutes as one likes."""
+"""Five seconds of a faulty wire; `skin bench benchmark=wire` takes any duration."""
 
 import importlib.util
 

@@ -57,7 +57,7 @@ def soak(seconds: PositiveFloat, check: Check = "crc16", rate: PositiveFloat = 5
     master, slave = os.openpty()
     tty.setraw(slave)
     tally = _Tally(round(seconds * rate), after=min(_MINUTE, seconds / 10))
-    code = f"from {__name__} import _send; _send({master}, {seconds}, {check!r}, {rate})"
+    code = f"from experiments.benchmarks.wire import _send; _send({master}, {seconds}, {check!r}, {rate})"
     command = [sys.executable, "-c", code]
     sender = subprocess.Popen(command, pass_fds=[master], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert sender.stdin is not None

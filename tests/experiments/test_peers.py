@@ -123,8 +123,8 @@ def test_the_script_reads_what_the_device_felt(learn, exchanged):
     touches = device.touches("test")
     assert not touches.valid.all()
     expected = touches.readings.where(touches.valid, 0).mT.numpy()
-    assert np.array_equal(learn.readings(folder, "same_0"), expected)
-    found = np.stack(list(learn.labels(folder, "same_0").values()), axis=1)
+    assert np.array_equal(learn.load_readings(folder, "same_0"), expected)
+    found = np.stack(list(learn.load_labels(folder, "same_0").values()), axis=1)
     assert np.array_equal(found, touches.labels.numpy())
 
 

@@ -134,5 +134,5 @@ def test_a_shape_that_has_room_only_as_a_small_one_is_small():
     assert (shape[big] == 0).all()
     assert 200 < (shape[~big] == 1).sum() < 300
     told, error = accuracy_from_shape(shape, big)
-    with pytest.warns(RuntimeWarning, match="tells big"):
-        check_label_leakage({"labels": {"big": {"told": told, "error": error}}}, GestureSettings())
+    with pytest.warns(RuntimeWarning, match="predicts big"):
+        check_label_leakage({"labels": {"big": {"accuracy": told, "error": error}}}, GestureSettings())

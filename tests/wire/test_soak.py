@@ -1,24 +1,13 @@
 """Five seconds of a faulty wire; `skin bench benchmark=wire` takes any duration."""
 
-import importlib.util
-
 import pytest
 
-from skin.paths import ROOT
+from experiments.benchmarks import wire
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def wire():
-    """Return the benchmark, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("wire", ROOT / "experiments" / "benchmarks" / "wire.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_every_intact_frame_arrives_and_no_wrong_value(wire):
+def test_every_intact_frame_arrives_and_no_wrong_value():
     found = wire.soak(5.0)
     assert found["bad_frames"] > 5
     assert (found["missed"], found["wrong"], found["dropped"], found["resets"]) == (0, 0, 0, 0)
@@ -26,7 +15,7 @@ def test_every_intact_frame_arrives_and_no_wrong_value(wire):
     assert found["intact"] < found["sent"] == 2500
 
 
-def test_every_kind_of_fault_is_one(wire):
+def test_every_kind_of_fault_is_one():
     line, kinds = wire._line(7, 0.002, "crc16"), set()
     for number in range(200):
         kinds.add(wire._kind(number)[0])
@@ -35,5 +24,5 @@ def test_every_kind_of_fault_is_one(wire):
     assert abs(wire._spoilt(100_000).mean() - 0.01) < 0.001
 
 
-def test_decoding_takes_less_than_a_twentieth_of_a_core(wire):
+def test_decoding_takes_less_than_a_twentieth_of_a_core():
     assert wire.decode_core_share() < 0.05

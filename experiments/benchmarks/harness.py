@@ -6,12 +6,13 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from skin.config import validate_config
@@ -20,7 +21,8 @@ from skin.paths import CONF
 
 def training_config(*overrides: str) -> DictConfig:
     """Return the configuration of a training with overrides."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    inside = GlobalHydra.instance().is_initialized()  # of a command
+    with nullcontext() if inside else initialize_config_dir(str(CONF), version_base="1.3"):
         return validate_config(compose("train", list(overrides)))
 
 

@@ -15,13 +15,12 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from skin.command import command
 from skin.config import plain
 from skin.files import results
-from skin.settings import check_settings, import_target
+from skin.settings import configured, import_target
 
 SIMULATORS = ("naive", "fem", "solid")
 PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "scikit-fem", "PyNiteFEA")
@@ -30,12 +29,12 @@ PACKAGES = ("torch", "pytorch-lightning", "torch-geometric", "numpy", "scipy", "
 @command("bench")
 def main(config: DictConfig) -> None:
     """Run a benchmark and write its results; exit code 1 if the decoder missed frames."""
-    part = plain(config)["benchmark"]
-    check_settings(import_target(part["_target_"], "benchmark"), part, "benchmark")
+    settings = plain(config)["benchmark"]
+    target = import_target(settings.pop("_target_"), "benchmark")
 
     from skin.files import write
 
-    found = instantiate(part)
+    found = configured(target, settings, "benchmark")
     chosen = HydraConfig.get().runtime.choices["benchmark"]
     text = json.dumps(found, indent=2)
     write(text + "\n", results(config.out) / f"bench{'' if chosen == 'all' else f'_{chosen}'}.json")

@@ -146,7 +146,8 @@ def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> No
         config: its configuration; unused groups may be left out.
         touches: of its training.
     """
-    store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(plain(config))), "config.yaml")
+    chosen = {key: value for key, value in plain(config).items() if value is not None}
+    store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(chosen)), "config.yaml")
     store.client.set_tag(run, "data_hash", touches_hash(touches))
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)

@@ -90,7 +90,8 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
         raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
     if not trust:
         check_targets(stored, f"config.yaml of run {run.info.run_id}")
-    return OmegaConf.create(stored)
+    # Older runs list the settings of all commands of their time, unset.
+    return OmegaConf.create({key: value for key, value in stored.items() if value is not None})
 
 
 def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:

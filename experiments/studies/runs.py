@@ -69,8 +69,8 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
             one = Planned(Variant(_name(run), {"row": row}, {}), run.data.tags["seed"], run)
             found.setdefault((one.variant.name, one.seed), one)
     rows = {one.variant.chosen["row"] for one in found.values()}
-    wanted = [study.rows] if isinstance(study.rows, str) else list(study.rows)
-    missing = [row for row in wanted if row not in (*rows, "all")] or ([] if rows else ["features"])
+    missing = [] if study.rows == "all" else [row for row in study.rows if row not in rows]
+    missing = missing or ([] if rows else ["features"])
     if missing:
         raise InputError(
             f"no finished run of {', '.join(missing)} on {data} data in {store.uri}: "

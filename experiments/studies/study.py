@@ -104,6 +104,8 @@ class Study:
             part = settings["measure"]
             check_settings(get_object(part["_target_"]), part, "study.measure")
             settings["measure"] = instantiate(part)
+        if isinstance(settings["rows"], str) and settings["rows"] != "all":
+            settings["rows"] = [settings["rows"]]
         return cls(**settings | {"statements": [Statement(**one) for one in settings["statements"]]})
 
 

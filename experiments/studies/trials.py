@@ -69,14 +69,16 @@ def run_trials(
         yield Trial(planned.variant, planned.seed, "", "", planned.run.info.run_id, own)
         return
     subject = _Run(store, planned.run, config)
+    given, selected = passed_overrides(), f"simulator={planned.run.data.tags.get('simulator')}"
+    # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
+    base, changes = (
+        (given, []) if planned.variant.configs else ([], [one for one in given if one != selected])
+    )
     for condition, settings in (study.conditions or {"": {}}).items():
         for number in range(1, study.devices + 1) or ("",):
             numbered = dict.fromkeys(study.numbered, number) if study.devices else {}
             line = as_overrides({**study.test, **settings, **numbered})
-            base, line = (
-                (passed_overrides(), line) if planned.variant.configs else ([], [*line, *passed_overrides()])
-            )
-            found = subject.measured(study, base, line)
+            found = subject.measured(study, base, [*line, *changes])
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
             at = planned.variant, planned.seed, condition, str(number), planned.run.info.run_id

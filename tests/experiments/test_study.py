@@ -283,3 +283,23 @@ def test_a_multirun_of_studies_is_no_run_itself(run, trained):
     assert done.returncode == 0, done.stderr
     assert [(trained / name / "study_pair.md").is_file() for name in ("one", "two")] == [True, True]
     assert runs(trained) == before
+
+
+@pytest.mark.slow
+def test_a_simulator_that_selects_runs_keeps_their_settings(run, tmp_path):
+    """Independent answer: skin evaluate, which changes nothing but the device."""
+    done = run(tmp_path, "train", "experiment=rules", "simulator=fem", "simulator.reading=interface", *SMALL)
+    assert done.returncode == 0, done.stderr
+    few = ["device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0"]
+    words = ["study=dead", "simulator=fem", "study.rows=rules", "study.devices=1", few[0]]
+    done = run(tmp_path, "study", *words)
+    assert done.returncode == 0, done.stderr
+    found = lines(tmp_path / "results" / "study_dead.csv")[0]
+    done = run(tmp_path, "evaluate", "run=latest", "device.seed=1", "device.dead=0", *few)
+    assert done.returncode == 0, done.stderr
+    with closing(sqlite3.connect(tmp_path / "m.db")) as store:
+        (value,) = store.execute(
+            "select value from latest_metrics join runs using (run_uuid) where name like 'evaluation of%' "
+            "and key = 'same/overall/accuracy'"
+        ).fetchone()
+    assert float(found["same/overall/accuracy"]) == pytest.approx(value)

@@ -101,6 +101,12 @@ def test_settings_of_the_command_line_hold_for_every_variant(composed):
         assert (config.evaluation.devices, config.tracking.experiment) == (0, "studies")
 
 
+def test_one_row_is_a_list_of_one(composed):
+    """As text, best_fresh would contain best."""
+    assert composed("study=dead", "study.rows=best_fresh")[0].rows == ["best_fresh"]
+    assert composed("study=dead")[0].rows == "all"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -6,37 +6,65 @@ from torch import Tensor
 from skin.labels import longest_run
 from skin.recording import Touches
 
-LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle; the noise is about 0.05 N
+LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle, where the noise is NOISE
+NOISE = 0.05  # N
 SHARES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)  # of the touch's own peak
 IDLE = 0.2  # a touch rests for at least a fifth of its window
 BEST = 10  # how many sorted values are kept
+# Standard deviation of normal noise, per median distance between two frames.
+_PER_MEDIAN = 1.0484
+_BELOW = 0.8416  # standard deviations from the quantile IDLE of normal noise up to its mean
 
 
 def engineered_features(touches: Touches) -> dict[str, Tensor]:
     """Return about 130 named features, (B,) each, of touches of any layout.
 
-    Nearly all are of what exceeds a sensor's idle level; readings that are not valid count as idle.
+    Nearly all are of what exceeds a sensor's idle level; readings that are not valid count as idle. Levels in
+    newtons rise with the noise of the touch: by three times what exceeds ``NOISE``, so that noise alone does
+    not pass them. Their names give the levels of a device with that noise.
     """
-    raw, x = _valid(touches), above_idle(touches)
+    raw, noise = _valid(touches), estimate_noise(touches)
+    x = above_idle(touches, noise)
     places = touches.positions[..., :2].to(x.dtype)
     frame, peak = x.sum(dim=2), x.amax(dim=2)
+    rise = 3 * (noise - NOISE).clamp(min=0)
     return {
-        **_levels(x, peak, frame),
+        "noise": noise,
+        **_levels(x, peak, frame, noise),
         **_sorted(raw, x, peak, frame),
         **_changes(x, peak, frame),
         **_sharing(x, peak, frame),
-        **_path(x, peak, places),
-        **_spread(x, places),
+        **_path(x, peak, places, rise),
+        **_spread(x, places, rise),
     }
 
 
-def above_idle(touches: Touches) -> Tensor:
+def estimate_noise(touches: Touches) -> Tensor:
+    """Return the standard deviation of the noise in each touch, (B,), N; 0 where no reading is valid.
+
+    It is estimated from the median distance between consecutive readings of all sensors, so that the frames
+    and sensors of the touch itself hardly count.
+    """
+    steps = _valid(touches).diff(dim=1).abs()
+    valid = touches.valid[:, 1:] & touches.valid[:, :-1]
+    known = torch.where(valid, steps, torch.nan).flatten(1)
+    return _PER_MEDIAN * known.nanmedian(dim=1).values.nan_to_num(0)
+
+
+def above_idle(touches: Touches, noise: Tensor | None = None) -> Tensor:
     """Return by how much each reading exceeds its sensor's idle level, (B, T, S), N; 0 where it is not valid.
 
-    That level is a low quantile over the window, so that constant offsets of a device do not matter.
+    That level is a low quantile over the window, so that constant offsets of a device do not matter. Normal
+    noise lowers the quantile, which is corrected.
+
+    Args:
+        touches: B touches of S sensors.
+        noise: standard deviation in each touch, (B,), N; None: :func:`estimate_noise`.
     """
     raw = _valid(touches)
-    return (raw - torch.quantile(raw, IDLE, dim=1, keepdim=True)) * touches.valid
+    noise = estimate_noise(touches) if noise is None else noise
+    idle = torch.quantile(raw, IDLE, dim=1, keepdim=True) + _BELOW * noise[:, None, None]
+    return (raw - idle) * touches.valid
 
 
 def _valid(touches: Touches) -> Tensor:
@@ -44,33 +72,39 @@ def _valid(touches: Touches) -> Tensor:
     return torch.where(touches.valid, touches.readings, torch.zeros(()))
 
 
-def _levels(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
-    """How long and on how many sensors a touch exceeds absolute and relative levels."""
+def _levels(x: Tensor, peak: Tensor, frame: Tensor, noise: Tensor) -> dict[str, Tensor]:
+    """How long and on how many sensors a touch exceeds absolute and relative levels, and noise."""
     highest = x.amax(dim=1)
     top = peak.amax(dim=1, keepdim=True).clamp(min=1e-6)
     at_peak = x[torch.arange(len(x)), frame.argmax(dim=1)]
     # All levels at once, for a window alone costs what the calls cost.
     levels, shares = (torch.tensor(values, dtype=x.dtype, device=x.device) for values in (LEVELS, SHARES))
-    above = peak[..., None] > levels
-    strong = peak[..., None] > (shares * top)[:, None]
-    much = frame[..., None] > (shares * frame.amax(dim=1, keepdim=True))[:, None]
+    raised = levels + 3 * (noise[:, None] - NOISE).clamp(min=0)
+    parts = torch.maximum(shares * top, 3 * noise[:, None])
+    # Noise of the sum grows with the root of the number of sensors.
+    sums = torch.maximum(
+        shares * frame.amax(dim=1, keepdim=True), 3 * x.shape[2] ** 0.5 * noise[:, None]
+    )
+    above = peak[..., None] > raised[:, None]
+    strong = peak[..., None] > parts[:, None]
+    much = frame[..., None] > sums[:, None]
     runs = longest_run(torch.cat([above, strong, much], dim=2)).float()
     lasting, strongly, summed = runs.split([len(LEVELS), len(SHARES), len(SHARES)], 1)
 
-    def most(level: float) -> Tensor:
-        return (x > level).sum(dim=2).amax(dim=1)
+    def most(level: Tensor) -> Tensor:
+        return (x > level[:, None, None]).sum(dim=2).amax(dim=1)
 
     absolute = {
         "frames above {} N": above.sum(dim=1),
         "longest run above {} N": lasting,
-        "sensors above {} N": (highest[..., None] > levels).sum(dim=1),
-        "most sensors above {} N at once": torch.stack([most(level) for level in LEVELS], dim=1),
+        "sensors above {} N": (highest[..., None] > raised[:, None]).sum(dim=1),
+        "most sensors above {} N at once": torch.stack([most(level) for level in raised.T], dim=1),
     }
     relative = {
         "longest run above {} of the peak": strongly,
         "longest run of the sum above {} of its peak": summed,
-        "sensors above {} of the peak": (highest[..., None] > (shares * top)[:, None]).sum(dim=1),
-        "sensors above {} of the peak at once": (at_peak[..., None] > (shares * top)[:, None]).sum(dim=1),
+        "sensors above {} of the peak": (highest[..., None] > parts[:, None]).sum(dim=1),
+        "sensors above {} of the peak at once": (at_peak[..., None] > parts[:, None]).sum(dim=1),
     }
     return _named(absolute, LEVELS) | _named(relative, SHARES)
 
@@ -138,12 +172,12 @@ def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
     }
 
 
-def _path(x: Tensor, peak: Tensor, places: Tensor) -> dict[str, Tensor]:
+def _path(x: Tensor, peak: Tensor, places: Tensor, rise: Tensor) -> dict[str, Tensor]:
     """How the centre of the readings moves while the touch lasts, m."""
     result: dict[str, Tensor] = {}
     active = peak > 0.25 * peak.amax(dim=1, keepdim=True)
     for power in (1, 2):
-        push = (x - 0.1).clamp(min=0) ** power
+        push = (x - 0.1 - rise[:, None, None]).clamp(min=0) ** power
         centre = push @ places / push.sum(dim=2, keepdim=True).clamp(min=1e-6)
         outside = torch.where(active[..., None], centre, torch.nan)
         step = centre.diff(dim=1).norm(dim=2) * (active[:, 1:] & active[:, :-1])
@@ -168,12 +202,12 @@ def _path(x: Tensor, peak: Tensor, places: Tensor) -> dict[str, Tensor]:
     return result
 
 
-def _spread(x: Tensor, places: Tensor) -> dict[str, Tensor]:
+def _spread(x: Tensor, places: Tensor, rise: Tensor) -> dict[str, Tensor]:
     """How wide the touch is at its strongest frame and over all, m."""
     result: dict[str, Tensor] = {}
     strongest = x[torch.arange(len(x)), x.sum(dim=2).argmax(dim=1)]
     for name, values in {"strongest frame": strongest, "maxima": x.amax(dim=1)}.items():
-        weight = (values - 0.1).clamp(min=0)
+        weight = (values - 0.1 - rise[:, None]).clamp(min=0)
         weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
         offset = places - (weight @ places)[:, None]
         moments = torch.einsum("bs,bsi,bsj->bij", weight, offset, offset)

@@ -7,14 +7,20 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from skin.errors import InputError
 from skin.sensor_dynamics import apply_hysteresis, first_order_lag, quantize
-from skin.settings import check_settings
+from skin.settings import RISING, check_settings
 from skin.signal.calibration import Calibration, read_calibration
 
 _IDLE_FRAMES = 30
+
+_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant")
+
+Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
+"""A number, or a range (least, most) of which each device draws its own."""
 
 
 class Constants(NamedTuple):
@@ -55,6 +61,9 @@ class Constants(NamedTuple):
 class ImperfectionSettings:
     """Settings of a device's imperfections (``conf/device/simulated.yaml``).
 
+    A :data:`Spread` is a number or [least, most]. A device draws one share from 0 to 1, uniformly, and takes
+    that share of all its ranges: a device that drifts much is noisy, too.
+
     Attributes:
         gain_spread: standard deviation of the logarithm of each sensor's gain; the report gives none.
         offset: standard deviation of each sensor's offset, N, constant in a device.
@@ -73,17 +82,17 @@ class ImperfectionSettings:
         rate: frames per second, Hz.
     """
 
-    gain_spread: Annotated[float, Ge(0)] = 0.05
+    gain_spread: Spread = 0.05
     offset: Annotated[float, Ge(0)] = 0.1
-    noise: Annotated[float, Ge(0)] = 0.05
+    noise: Spread = 0.05
     clip: Annotated[float, Gt(0)] = 10.0
     dead: int | Sequence[int] = 0
     tare: bool = False
     stuck: Annotated[int, Ge(0)] = 0
     saturated: Annotated[int, Ge(0)] = 0
-    drift: Annotated[float, Ge(0)] = 0.0
-    hysteresis: Annotated[float, Ge(0)] = 0.0
-    time_constant: Annotated[float, Ge(0)] = 0.0
+    drift: Spread = 0.0
+    hysteresis: Spread = 0.0
+    time_constant: Spread = 0.0
     quantum: Annotated[float, Ge(0)] = 0.0
     rate: Annotated[float, Gt(0)] = 10.0
 
@@ -153,18 +162,23 @@ class Imperfection(ImperfectionSettings):
 
     def _drawn(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
         """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
-        gain = np.exp(self.gain_spread * generator.standard_normal(shape))
+        ranges = {name: getattr(self, name) for name in _SPREADS}
+        some = any(isinstance(one, list | tuple) for one in ranges.values())
+        share = generator.random((*shape[:-1], 1)) if some else np.zeros(())
+        spread = {name: _part(one, share) for name, one in ranges.items()}
+        gain = np.exp(spread["gain_spread"] * generator.standard_normal(shape))
         offset = self.offset * generator.standard_normal(shape)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
         idle = generator.standard_normal(shape)
-        drift = self.drift * generator.standard_normal(shape) if self.drift else np.zeros(shape)
+        drifts = np.any(spread["drift"])
+        drift = spread["drift"] * generator.standard_normal(shape) if drifts else np.zeros(shape)
         count = generator.integers(*self.dead_range, (*shape[:-1], 1), endpoint=True)
         level = np.where(rank < count, 0.0, self.clip)
         if self.stuck:
             stuck = (rank >= count) & (rank < count + self.stuck)
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
-        same = ("noise", "clip", "hysteresis", "time_constant", "quantum")
-        values = {name: np.asarray(float(getattr(self, name))) for name in same}
+        values = {name: np.asarray(float(getattr(self, name))) for name in ("clip", "quantum")}
+        values |= {name: spread[name] for name in ("noise", "hysteresis", "time_constant")}
         dead = rank < count + self.stuck + self.saturated
         return values | {
             "gain": gain, "offset": offset, "dead": dead, "level": level, "drift": drift, "idle": idle
@@ -242,6 +256,12 @@ class Imperfection(ImperfectionSettings):
         if constants.quantum.any():
             output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
         return output, saturated
+
+
+def _part(spread: Spread, share: np.ndarray) -> np.ndarray:
+    """Return that share, 0 to 1, of a range; a number has none."""
+    least, most = spread if isinstance(spread, list | tuple) else (spread, spread)
+    return np.asarray(least + (most - least) * share)
 
 
 def _settings(of: ImperfectionSettings) -> dict[str, Any]:

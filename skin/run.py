@@ -34,6 +34,7 @@ from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
 from skin.recording import Touches, touches_hash
 from skin.settings import import_target
+from skin.source import note_reuse
 from skin.stored_run import TAG
 from skin.tracking import Store
 
@@ -69,6 +70,7 @@ def train(config: DictConfig) -> bool:
     store, identity = Store.open(config.tracking), tags(config)
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
+        note_reuse(finished[0])
         if PARENT not in os.environ:
             print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
             Console().print(metrics_table(finished[0].data.metrics, finished[0].info.run_name))

@@ -20,6 +20,7 @@ from skin.config import plain, validate_config
 from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.progress import SweepProgress, expected_seconds, format_duration
+from skin.source import note_reuse
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -173,6 +174,8 @@ class Sweep(Callback):
             # One that was finished before counts, unless it was to be repeated.
             runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else own)
             found.setdefault(tuple(job[key] for key in keys), []).extend(runs[:1])
+            for run in runs[:1]:
+                note_reuse(run)  # jobs in other processes warn of nothing
         whole = sum(map(len, found.values())) == len(once)
         store.client.set_terminated(parent.info.run_id, "FINISHED" if whole else "FAILED")
         if not store.find(**own):

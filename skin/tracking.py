@@ -10,7 +10,6 @@ import json
 import platform
 import signal
 import sqlite3
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -31,7 +30,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from skin.config import Tracking
 from skin.errors import InputError
 from skin.files import whole
-from skin.paths import BUNDLED, ROOT
+from skin.source import source_tags
 
 _PROCESS = "process"
 _SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
@@ -110,7 +109,7 @@ class Store:
     @contextmanager
     def run(self, name: str, tags: dict[str, str], parent: str | None = None) -> Iterator[Run]:
         """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal."""
-        tags = tags | {"commit": commit()} | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
+        tags = tags | source_tags() | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
         run = self.create(name, tags)
         status = "KILLED"
         try:
@@ -175,23 +174,6 @@ def ends_on_signal() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def commit() -> str:
-    """Return the git commit of the code, with ``+`` where files differ from it; ``unknown`` without git."""
-
-    def git(*arguments: str) -> str:
-        result = subprocess.run(
-            ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True
-        )
-        return result.stdout.strip()
-
-    try:
-        if BUNDLED != ROOT:  # a wheel, which may be installed inside another repository
-            return "unknown"
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def _make(path: Path, artifacts: Path) -> None:

@@ -12,7 +12,7 @@ LAYERS = """
 errors interrupt paths option
 trust
 settings
-error_messages fingerprint labels rng material model sensor_dynamics sensors
+error_messages fingerprint labels rng material model sensor_dynamics sensors source
 config recording body
 command
 files safe_loading recording_metadata layout summary plausibility

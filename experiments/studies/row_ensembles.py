@@ -17,6 +17,7 @@ from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_report, simulator, tags
+from skin.source import note_reuse
 from skin.stored_run import load_learner
 from skin.tracking import Store
 
@@ -84,8 +85,8 @@ def combine(
     """Evaluate ensembles of finished runs on every column and log each as a run of its own.
 
     What an ensemble of the same runs found before is not found again. Its run has the fingerprint of its
-    configuration, by which the results table finds it, the tag ``members`` with the ids of their runs, and
-    the tags ``left_out_<column>`` with the members that have no part in a column. The metrics
+    configuration, by which the results table finds it, the tag ``members`` with their fingerprints, and the
+    tags ``left_out_<column>`` with the members that have no part in a column. The metrics
     ``same/<label>/disagreement`` and ``same/any/disagreement`` are the shares of test gestures on which the
     members differ.
 
@@ -101,12 +102,14 @@ def combine(
         raise InputError(
             f"an ensemble needs two finished runs, got {', '.join(members) or 'none'}: skin train makes them"
         )
-    identity = " ".join(run.info.run_id for _, run in members.values())
+    identity = " ".join(run.data.tags["fingerprint"] for _, run in members.values())
     done = {
         name: store.find("FINISHED", fingerprint=fingerprint(config), members=identity)
         for name, config in ways.items()
     }
     if all(done.values()):
+        for found in done.values():
+            note_reuse(found[0])
         return {name: found[0] for name, found in done.items()}
     asked = _ask(store, list(members.values()), build_device(next(iter(ways.values()))))
     return {name: _log(store, config, asked, WAYS[name], identity) for name, config in ways.items()}

@@ -19,6 +19,7 @@ from skin.commands import train
 from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.run import simulator
+from skin.source import note_reuse
 from skin.stored_run import find_run
 from skin.tracking import Store
 
@@ -79,9 +80,12 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     return [found[key] for key in sorted(found)]
 
 
-def newest_finished(store: Store, config: DictConfig, **further: str) -> Run | None:
+def newest_finished(store: Store, config: DictConfig) -> Run | None:
     """Return the newest finished run of a configuration."""
-    return next(iter(store.find("FINISHED", fingerprint=fingerprint(config), **further)), None)
+    found = store.find("FINISHED", fingerprint=fingerprint(config))
+    if found:
+        note_reuse(found[0])
+    return found[0] if found else None
 
 
 def multirun(line: Sequence[str]) -> None:

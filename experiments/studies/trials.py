@@ -19,6 +19,7 @@ from experiments.studies.study import Study, Variant, as_overrides, passed_overr
 from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.config import fingerprint, validate_config
+from skin.source import note_reuse
 from skin.stored_run import TAG, apply_overrides, load_configuration
 from skin.tracking import Store
 from skin.trained import Trained, load_trained
@@ -105,10 +106,12 @@ class _Run:
         what = study.measure or Accuracy()
         asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]
         key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
-        tags = {"evaluated": self.run.info.run_id, "study": key}
+        # Not the id of the run, which another database does not have.
+        tags = {"evaluated": self.run.data.tags["fingerprint"], "study": key}
         known = self.store.find("FINISHED", **tags) if self.config.tracking.resume else []
         if not known:
             known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags)]
+        note_reuse(known[0])
         return known[0]
 
     def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str]) -> Run:

@@ -45,9 +45,9 @@ class Evaluation:
 
     devices: int
     layouts: int
-    gestures: int
     false_alarm_rate: float
-    safe_gestures: int = 5000  # older runs have none
+    safe_gestures: int = 5000
+    gestures: int | None = None  # of older runs, which evaluated other gestures on other devices
 
 
 @dataclass

@@ -17,7 +17,7 @@ RENAMED: dict[str, str] = {
 
 # Group -> settings added later, with their neutral values, which keep the hash of older runs.
 _LATER: dict[str, dict[str, Any]] = {
-    "touch": {"stretch": 4.0, "leak": 0.6, "strict": False},
+    "touch": {"stretch": 4.0, "leak": 0.6, "strict": False, "over_sensors": True},
     "layout": {"depth": None},
 }
 # Settings of Lightning's Trainer that choose the machine, not the result.

@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -27,6 +28,7 @@ from skin.errors import InputError
 from skin.evaluation.metrics_table import metrics_table
 from skin.evaluation.metrics_table import print_report as show
 from skin.evaluation.operating_point import check_evaluation, choose_operating_point
+from skin.evaluation.outcomes import OUTCOMES
 from skin.evaluation.report import Report, evaluate
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
@@ -224,6 +226,8 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
 def _write(report: Report, task: Task, folder: Path) -> None:
     """Write predictions, and confusion matrices as a picture."""
     pq.write_table(report.predictions, folder / "predictions.parquet")
+    if report.outcomes is not None:
+        np.save(folder / OUTCOMES, report.outcomes)
     if report.confusion is not None:
         named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
         save_figure(confusions(named, ("no", "yes")), folder / "confusion.png")

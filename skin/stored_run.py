@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
@@ -115,6 +116,12 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
         group = key.split(".")[0]
         if group in _FIXED:
             raise InputError(f"{key} was fixed when the run was trained: leave it out, or train another run")
+        if key == "profile":
+            # A profile is no group of settings of its own, but changes those of the device.
+            chosen = override.value()
+            named = compose(f"profile/{chosen}").device if chosen else {}
+            whole.device = OmegaConf.merge(whole.device, {name: composed.device[name] for name in named})
+            continue
         parent, _, name = key.rpartition(".")
         source = OmegaConf.select(composed, parent) if parent else composed
         # Unresolved, so that a device refers to the simulator of this run.

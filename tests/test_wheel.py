@@ -12,7 +12,7 @@ from skin.cli import verbs
 from skin.paths import ROOT
 
 SMALL = ["data.gestures=48", "device.test_gestures=48", "evaluation.safe_gestures=64"]
-SMALL += ["evaluation.devices=0", "evaluation.layouts=0", "evaluation.gestures=48"]
+SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
 
 
 @pytest.fixture(scope="module")

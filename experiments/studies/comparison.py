@@ -1,22 +1,31 @@
-"""Paired comparisons over seeds, and verdicts on statements."""
+"""Paired comparisons over seeds, devices and gestures, and verdicts on statements."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
+import numpy as np
+
+RATIOS = ("at most", "ratio")
+"""Claims about one / other; all others are about one - other."""
+
 FEWEST = 3
 """Paired seeds below which every verdict is ``undecided``."""
 
 
+Gestures = tuple[np.ndarray | None, np.ndarray | None]
+"""The figures of two variants by gesture, each (G,), NaN where a gesture does not count; None: not known."""
+
+
 @dataclass(frozen=True)
 class Paired:
-    """A difference or a ratio over seeds that two variants share.
+    """A difference or a ratio of two variants.
 
     Attributes:
-        mean: of one - other, or of one / other.
-        error: standard error of that mean; infinite with a single seed.
-        seeds: how many pairs there are.
+        mean: of one - other, or one / other.
+        error: standard error of that mean; infinite with a single pair.
+        seeds: number of pairs.
     """
 
     mean: float
@@ -24,35 +33,72 @@ class Paired:
     seeds: int
 
 
-def paired(one: Mapping[str, float], other: Mapping[str, float], ratio: bool = False) -> Paired | None:
-    """Compare two sets of figures seed by seed; None where they share no seed.
+def paired(
+    one: Mapping[str, float],
+    other: Mapping[str, float],
+    ratio: bool = False,
+    across: tuple[Mapping[str, float], Mapping[str, float]] = ({}, {}),
+    gestures: Gestures = (None, None),
+) -> Paired | None:
+    """Compare two variants; None where they share no seed (or device, where these are the first).
 
-    The error is the sample deviation of the differences (or ratios) by the root of their number, as in a
-    paired t-test.
+    Seeds, devices and gestures are a sample each, and every seed meets every device and gesture. The variance
+    of the mean is the sum of three: over seeds, over devices and over gestures, each that of the paired
+    differences, averaged over the other two, divided by their number. (The sum counts the interactions more
+    than once, so that the error is rather too large.)
 
     Args:
-        one: seed -> figure.
-        other: seed -> figure.
+        one: seed -> figure, or device -> figure.
+        other: the same.
         ratio: take one / other instead of one - other.
+        across: the same by what the first two are not by, device or seed.
+        gestures: the same by gesture, in the same unit.
     """
-    pairs = [(one[seed], other[seed]) for seed in one if seed in other]
-    each = [first / second if ratio else first - second for first, second in pairs]
-    if not each:
+    shared = [seed for seed in one if seed in other]
+    if not shared:
         return None
-    error = stdev(each) / math.sqrt(len(each)) if len(each) > 1 else math.inf
-    return Paired(fmean(each), error, len(each))
+    mean = fmean(_pairs(one, other, ratio))
+    error = _error(_pairs(one, other, ratio)) if len(shared) > 1 else math.inf
+    devices = _error(_pairs(*across, ratio))
+    return Paired(mean, math.hypot(error, devices, _gesture_error(gestures, ratio)), len(shared))
+
+
+def _pairs(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -> list[float]:
+    pairs = [(one[key], other[key]) for key in one if key in other]
+    return [first / second if ratio else first - second for first, second in pairs]
+
+
+def _error(each: Sequence[float]) -> float:
+    """Return the standard error of a mean; 0 of less than two values."""
+    return stdev(each) / math.sqrt(len(each)) if len(each) > 1 else 0.0
+
+
+def _gesture_error(gestures: Gestures, ratio: bool) -> float:
+    """Return the standard error over gestures: unpaired if their numbers differ, 0 if they are unknown."""
+    one, other = gestures
+    if one is None or other is None:
+        return 0.0
+    if len(one) != len(other):
+        return math.hypot(*(_error(list(each[~np.isnan(each)])) for each in (one, other)))
+    counted = ~(np.isnan(one) | np.isnan(other))
+    one, other = one[counted], other[counted]
+    if not ratio:
+        return _error(list(one - other))
+    # The ratio of two means, linearised (delta method).
+    below = other.mean()
+    return _error(list((one - one.mean() / below * other) / below)) if below else 0.0
 
 
 def verdict(claim: str, found: Paired | None, by: float = 0.0) -> str:
     """Return ``agree``, ``disagree`` or ``undecided``.
 
-    A claim is an interval in which the difference (for ``ratio``: the ratio) must lie. The verdict is
+    A claim is an interval in which the difference (for ``RATIOS``: the ratio) must lie. The verdict is
     ``agree`` if the mean with two standard errors on either side lies wholly inside, ``disagree`` if it lies
     wholly outside, else, and always with fewer than three paired seeds, ``undecided``.
 
     Args:
         claim: ``greater`` (0 to infinity), ``less`` (minus infinity to 0), ``alike`` (-by to by),
-            ``no better`` (minus infinity to by), ``about`` or ``ratio`` (by / 2 to 2 by).
+            ``no better`` and ``at most`` (minus infinity to by), ``about`` or ``ratio`` (by / 2 to 2 by).
         found: the comparison, None without paired seeds.
         by: in the unit of the comparison.
     """
@@ -61,6 +107,7 @@ def verdict(claim: str, found: Paired | None, by: float = 0.0) -> str:
         "less": (-math.inf, 0.0),
         "alike": (-by, by),
         "no better": (-math.inf, by),
+        "at most": (-math.inf, by),
         "about": (by / 2, 2 * by),
         "ratio": (by / 2, 2 * by),
     }[claim]

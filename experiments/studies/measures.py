@@ -14,6 +14,7 @@ from skin.errors import InputError
 from skin.evaluation.stream_settings import StreamSettings
 
 if TYPE_CHECKING:
+    import numpy as np
     from mlflow.entities import Run
     from omegaconf import DictConfig
 
@@ -91,10 +92,12 @@ class Measurement:
     Attributes:
         metrics: name -> value; shares are of 1.
         page: what is published; None where the metrics tell everything.
+        outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
     """
 
     metrics: dict[str, float]
     page: "Page | None" = None
+    outcomes: "np.ndarray | None" = None
 
 
 class Measure(Protocol):
@@ -106,16 +109,22 @@ class Measure(Protocol):
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy and the like on the test touches."""
+    """Accuracy and the like on the test touches, and alarms at the operating point of the run."""
 
     def __call__(self, subject: Subject) -> Measurement:
         from skin.evaluation.metrics import metrics
+        from skin.evaluation.outcomes import encode
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
-        chances = subject.learner.probabilities(touches)
-        found = metrics(chances, touches.labels, subject.device.task)
-        return Measurement({f"same/{name}": value for name, value in found.items()})
+        chances, task, point = (
+            subject.learner.probabilities(touches),
+            subject.device.task,
+            subject.of.trained.point,
+        )
+        found = metrics(chances, touches.labels, task, point)
+        outcomes = encode(chances, touches.labels, task, point)
+        return Measurement({f"same/{name}": value for name, value in found.items()}, outcomes=outcomes)
 
 
 @dataclass(frozen=True)

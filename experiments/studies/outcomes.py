@@ -5,9 +5,13 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Literal
 
-from experiments.studies.comparison import Paired, combine_verdicts, paired, verdict
+import numpy as np
+
+from experiments.studies.comparison import RATIOS, Paired, combine_verdicts, paired, verdict
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
+from skin.evaluation.outcomes import decode
+from skin.labels import TOUCH
 
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
 """Metrics that are no shares -> their unit."""
@@ -58,17 +62,54 @@ def values(trials: Sequence[Trial], metric: str, by: Literal["seed", "device"] =
 
     Args:
         trials: of one line.
-        metric: as logged; shares come in per cent.
+        metric: as logged; shares come in per cent. ``/error`` is what is missing of ``/accuracy``.
         by: attribute of the trials.
     """
     first, *rest = metric.split(" - ")
     scale = 1 if metric in UNITS else 100
     groups: dict[str, list[float]] = {}
     for one in trials:
-        if all(name in one.metrics for name in (first, *rest)):
-            value = one.metrics[first] - sum(one.metrics[name] for name in rest)
+        known = one.metrics | {
+            f"{name.removesuffix('accuracy')}error": 1 - value
+            for name, value in one.metrics.items()
+            if name.endswith("/accuracy")
+        }
+        if all(name in known for name in (first, *rest)):
+            value = known[first] - sum(known[name] for name in rest)
             groups.setdefault(getattr(one, by), []).append(scale * value)
     return {key: fmean(each) for key, each in groups.items()}
+
+
+def by_gesture(trials: Sequence[Trial], metric: str) -> np.ndarray | None:
+    """Return the figure of each test gesture, averaged over trials, (G,), in per cent; None: not known.
+
+    Args:
+        trials: of one line.
+        metric: one of a run on its test gestures; others have no figures by gesture.
+    """
+    codes = [one.outcomes for one in trials if one.outcomes is not None]
+    if not codes or len(codes) < len(trials) or len({len(code) for code in codes}) > 1:
+        return None
+    plain, wrong = metric.removeprefix("same/"), metric.endswith("/error")
+    if not metric.startswith("same/") or " - " in metric:
+        return None
+    if wrong:
+        plain = plain.removesuffix("error") + "accuracy"
+    found = decode(np.stack(codes), plain, TOUCH)
+    return None if found is None else 100 * (1 - found if wrong else found).mean(axis=0)
+
+
+def compare(
+    one: Sequence[Trial],
+    other: Sequence[Trial],
+    metric: str,
+    ratio: bool = False,
+    by: Literal["seed", "device"] = "seed",
+) -> Paired | None:
+    """Compare the trials of two lines, paired by seed, device and gesture; ``by`` says what is counted."""
+    across: Literal["seed", "device"] = "device" if by == "seed" else "seed"
+    first, second = ((values(one, metric, axis), values(other, metric, axis)) for axis in (by, across))
+    return paired(*first, ratio, second, (by_gesture(one, metric), by_gesture(other, metric)))
 
 
 def conclusions(statements: Sequence[Statement], trials: Sequence[Trial]) -> list[StatementResult]:
@@ -79,39 +120,42 @@ def conclusions(statements: Sequence[Statement], trials: Sequence[Trial]) -> lis
 def differences(study: Study, trials: Sequence[Trial]) -> list[Difference]:
     """Compare each condition with the first one of its variant, or each variant with the first one.
 
-    The figures are paired over devices where there are several, over seeds of the training else.
+    A comparison of devices counts these, and not the seeds of the training, as its pairs.
     """
     if study.differences is None:
         return []
     words = {"agree": "better", "disagree": "worse", "undecided": "undecided"}
     by: Literal["seed", "device"] = "device" if study.devices else "seed"
-    found, first = [], dict[str, dict[str, float]]()
+    found, first = [], dict[str, list[Trial]]()
     for (variant, condition), each in group_trials(trials).items():
-        figures = values(each, study.metrics[0], by)
-        base = first.setdefault(variant if study.conditions else "", figures)
-        if base is not figures:
-            compared = paired(figures, base)
+        base = first.setdefault(variant if study.conditions else "", each)
+        if base is not each:
+            compared = compare(each, base, study.metrics[0], by=by)
             word = words[verdict(study.differences, compared)]
             found.append(Difference(variant, condition, compared, word))
     return found
 
 
 def _outcome(statement: Statement, trials: Sequence[Trial]) -> StatementResult:
-    _, one = _figures(statement.one, statement.metric, trials)
-    others = dict(_figures(other, statement.metric, trials) for other in statement.others)
+    metric, ratio = statement.metric, statement.claim in RATIOS
+    _, one = _line(statement.one, trials)
+    lines = dict(_line(other, trials) for other in statement.others)
+    compared = {name: compare(one, other, metric, ratio) for name, other in lines.items()}
     if statement.level is not None:
-        scale = 1 if statement.metric in UNITS else 100
-        others[f"{statement.level:g}"] = dict.fromkeys(one, scale * statement.level)
-    compared = {name: paired(one, other, statement.claim == "ratio") for name, other in others.items()}
+        own, gestures = values(one, metric), by_gesture(one, metric)
+        level = (1 if metric in UNITS else 100) * statement.level
+        even = None if gestures is None else np.full_like(gestures, level)
+        compared[f"{statement.level:g}"] = paired(
+            own, dict.fromkeys(own, level), ratio, gestures=(gestures, even)
+        )
     verdicts = [verdict(statement.claim, found, statement.by) for found in compared.values()]
     return StatementResult(statement, compared, combine_verdicts(verdicts))
 
 
-def _figures(chosen: Mapping[str, str], metric: str, trials: Sequence[Trial]) -> tuple[str, dict[str, float]]:
-    """Return the name and, by seed, the figures of the first line that was so chosen."""
+def _line(chosen: Mapping[str, str], trials: Sequence[Trial]) -> tuple[str, list[Trial]]:
+    """Return the name and the trials of the first line that was so chosen; no trials without one."""
     for (variant, condition), each in group_trials(trials).items():
         known = {**each[0].variant.chosen, "condition": condition}
         if chosen.items() <= known.items():
-            name = f"{variant}, {condition}" if condition else variant
-            return name, values(each, metric)
-    return " ".join(chosen.values()), {}
+            return f"{variant}, {condition}" if condition else variant, each
+    return " ".join(chosen.values()), []

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 from hydra import compose
 from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
@@ -19,6 +20,7 @@ from experiments.studies.study import Study, Variant, as_overrides, passed_overr
 from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.config import fingerprint, validate_config
+from skin.evaluation.outcomes import OUTCOMES
 from skin.source import note_reuse
 from skin.stored_run import TAG, apply_overrides, load_configuration
 from skin.tracking import Store
@@ -38,6 +40,7 @@ class Trial:
         metrics: name -> value.
         line: for a person; empty where there is only a table.
         files: of the measure.
+        outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
     """
 
     variant: Variant
@@ -48,6 +51,7 @@ class Trial:
     metrics: Mapping[str, float]
     line: str = ""
     files: Sequence[Path] = ()
+    outcomes: np.ndarray | None = None
 
 
 def run_trials(
@@ -67,7 +71,8 @@ def run_trials(
         return
     own = planned.run.data.metrics if planned.variant.configs else {}
     if study.measure is None and not study.conditions:
-        yield Trial(planned.variant, planned.seed, "", "", planned.run.info.run_id, own)
+        outcomes = _outcomes(store, planned.run)
+        yield Trial(planned.variant, planned.seed, "", "", planned.run.info.run_id, own, outcomes=outcomes)
         return
     subject = _Run(store, planned.run, config)
     given, selected = passed_overrides(), f"simulator={planned.run.data.tags.get('simulator')}"
@@ -83,7 +88,7 @@ def run_trials(
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
             at = planned.variant, planned.seed, condition, str(number), planned.run.info.run_id
-            yield Trial(*at, metrics, said, files)
+            yield Trial(*at, metrics, said, files, _outcomes(store, found))
 
 
 class _Run:
@@ -124,15 +129,34 @@ class _Run:
             if found.page is not None:
                 stem = f"{type(what).__name__.lower()}_{own.row}_{logged.info.run_id[:8]}"
                 publish_page(found.page, subject.title, Path(made) / stem)
-                self.store.client.log_artifacts(logged.info.run_id, made)
+            if found.outcomes is not None:
+                np.save(Path(made) / OUTCOMES, found.outcomes)
+            self.store.client.log_artifacts(logged.info.run_id, made)
         return self.store.client.get_run(logged.info.run_id)
 
 
 def _fetched(store: Store, run: Run, folder: Path) -> list[Path]:
     """Copy the files of a measure to a folder and return their paths there."""
-    if not store.client.list_artifacts(run.info.run_id):
+    if not _names(store, run) - {OUTCOMES}:
         return []
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder) as holder:
         fetched = download_artifacts(run_id=run.info.run_id, dst_path=holder, tracking_uri=store.uri)
-        return [path.replace(folder / path.name) for path in sorted(Path(fetched).iterdir())]
+        made = (path for path in sorted(Path(fetched).iterdir()) if path.name != OUTCOMES)
+        return [path.replace(folder / path.name) for path in made]
+
+
+def _outcomes(store: Store, run: Run) -> np.ndarray | None:
+    """Return the outcomes of the test gestures of a run; None if it has none."""
+    if OUTCOMES not in _names(store, run):
+        return None
+    with TemporaryDirectory() as holder:
+        path = download_artifacts(
+            run_id=run.info.run_id, artifact_path=OUTCOMES, dst_path=holder, tracking_uri=store.uri
+        )
+        outcomes: np.ndarray = np.load(path)
+        return outcomes
+
+
+def _names(store: Store, run: Run) -> set[str]:
+    return {one.path for one in store.client.list_artifacts(run.info.run_id)}

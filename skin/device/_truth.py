@@ -12,6 +12,8 @@ from skin.sensors import Sensors
 from skin.simulator._relaxation import Relaxing, relaxes
 from skin.simulator.base import AbstractSimulator
 
+_ROUNDING = 1e-9  # m
+
 
 def misplaced(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
     """Return sensors beside their places.
@@ -26,6 +28,24 @@ def misplaced(sensors: Sensors, size: tuple[float, float], error: float, seed: i
     positions = sensors.positions.copy()
     positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
     return replace(sensors, positions=positions)
+
+
+def everywhere(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
+    """Return a sensor at each cell of a body whose footprint lies wholly on it.
+
+    Their footprints are the areas over which a pressure can be dangerous anywhere.
+    """
+    margins = [max(extent, cell) / 2 for extent, cell in zip(footprint, body.cell, strict=True)]
+    x, y = (
+        centres[(centres >= margin - _ROUNDING) & (centres <= size - margin + _ROUNDING)]
+        for centres, size, margin in zip(_centres(body), body.size, margins, strict=True)
+    )
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Sensors(np.column_stack([places, np.zeros(len(places))]), footprint)
+
+
+def _centres(body: AbstractBody) -> list[np.ndarray]:
+    return [(np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True)]
 
 
 def modelled(

@@ -16,7 +16,7 @@ from skin.contact.prescribed import Prescribed
 from skin.device._split import split_rows, split_slices
 from skin.device._threads import in_threads
 from skin.device._tracking import Tracker, estimated, oracle
-from skin.device._truth import misplaced, modelled, refuse_relaxation
+from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
 from skin.device.base import AbstractSimulated, Split
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
@@ -114,8 +114,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
             refuse_relaxation(self.body, "data.stream=true" if self.stream else f"device.track={self.track}")
 
     def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
-        contact = self.contact(body, model)
-        return TouchSampler(body, body.footprints(sensors), contact, self.touch, self.padded)
+        contact, settings = self.contact(body, model), GestureSettings.of(self.touch)
+        judged = sensors if settings.over_sensors else everywhere(body, sensors.footprint)
+        return TouchSampler(body, body.footprints(judged), contact, settings, self.padded)
 
     def _tracker(self) -> Tracker:
         """Return the tracker that ``track`` selects."""

@@ -129,7 +129,7 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
 
 def check_evaluation(settings: Evaluation) -> None:
     """Raise InputError where the settings of an evaluation cannot be used."""
-    for name, least in (("devices", 0), ("layouts", 0), ("gestures", 1)):
+    for name, least in (("devices", 0), ("layouts", 0)):
         if getattr(settings, name) < least:
             raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {least}")
     if not 0 < settings.false_alarm_rate < 1:

@@ -1,9 +1,8 @@
 """Evaluation of a learner on its own device, unseen devices and unseen layouts."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from math import isnan, nan
-from statistics import fmean
+from math import isnan
 from typing import Literal, Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ from skin.errors import InputError
 from skin.evaluation.alarm import Reached
 from skin.evaluation.metrics import confusion, metrics
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.outcomes import encode
 from skin.labels import Task
 from skin.layout.scattered import Scattered
 from skin.recording import Touches
@@ -44,12 +44,15 @@ class Report:
     Attributes:
         metrics: ``<column>/<label>/<metric>``, NaN where the touches do not define it. Columns: ``same``
             (test gestures on the device of the training), ``holdout`` (the last tenth of the training
-            budget), ``device_shift`` and ``unseen_layout`` (means over unseen devices and layouts).
+            budget), ``device_shift`` and ``unseen_layout`` (the test gestures, shared out among unseen
+            devices and layouts).
         cannot: column, or metric that is not defined -> why there is no value.
         confusion: (L, 2, 2), of ``same``; None where the labels are exclusive.
         predictions: a row per test gesture: labels, probabilities (``p_<label>``) and drawn parameters.
         point: where the alarm is raised; None where the task has no label ``dangerous``.
         reached: the alarms on the gestures of ``same``; None without ``point``.
+        outcomes: of the gestures of ``same`` (:func:`skin.evaluation.outcomes.encode`); None where the labels
+            have none.
     """
 
     metrics: dict[str, float]
@@ -58,6 +61,7 @@ class Report:
     predictions: pa.Table
     point: OperatingPoint | None = None
     reached: Reached | None = None
+    outcomes: np.ndarray | None = None
 
 
 def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
@@ -91,24 +95,18 @@ def evaluate(
     del others["same"]
     for column, sets in others.items():
         try:
-            each = [
-                metrics(learner.probabilities(touches), _labels(touches), task, point) for touches in sets
-            ]
+            each = [(learner.probabilities(touches), _labels(touches)) for touches in sets]
         except InputError as reason:
             cannot[column] = str(reason)
             continue
         if each:
-            found |= _named(column, {name: _mean([values[name] for values in each]) for name in each[0]})
+            said, true = (torch.cat(parts) for parts in zip(*each, strict=True))
+            found |= _named(column, metrics(said, true, task, point))
     cannot |= {name: _UNDEFINED for name, value in found.items() if isnan(value) and name.endswith(_SHOWN)}
     table = confusion(chances, _labels(same), task) if task.kind == "binary" else None
     reached = None if point is None else point.reached(chances, _labels(same), task)
-    return Report(found, cannot, table, _predictions(chances, same, task, drawn), point, reached)
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Return the mean of the values that are defined; NaN if none is."""
-    defined = [value for value in values if not isnan(value)]
-    return fmean(defined) if defined else nan
+    outcomes = encode(chances, _labels(same), task, point)
+    return Report(found, cannot, table, _predictions(chances, same, task, drawn), point, reached, outcomes)
 
 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
@@ -125,14 +123,17 @@ def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterato
 
 
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield test touches on other devices of the same kind."""
+    """Yield the share of the test touches that each of some other devices of the same kind measures."""
     for number in range(settings.devices):
-        other = device.replace(seed=_FIRST_DEVICE + number, test_gestures=settings.gestures)
-        yield other.touches("test")
+        other = device.replace(seed=_FIRST_DEVICE + number)
+        yield _share(other.touches("test"), number, settings.devices)
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield test touches on other layouts with the same number, depths and normals of sensors."""
+    """Yield the share of the test touches for other layouts with as many sensors, equally deep and tilted.
+
+    A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
+    """
     count = len(device.sensors)
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
@@ -146,7 +147,12 @@ def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touche
             depth=device.sensors.positions[:, 2],
             normals=device.sensors.normals,
         )
-        yield device.replace(layout=layout, test_gestures=settings.gestures).touches("test")
+        yield _share(device.replace(layout=layout).touches("test"), number, settings.layouts)
+
+
+def _share(touches: Touches, number: int, count: int) -> Touches:
+    """Return one of ``count`` shares of touches, which together are all of them."""
+    return touches[torch.arange(number, len(touches), count)]
 
 
 def _labels(touches: Touches) -> Tensor:

@@ -82,9 +82,7 @@ def _levels(x: Tensor, peak: Tensor, frame: Tensor, noise: Tensor) -> dict[str, 
     raised = levels + 3 * (noise[:, None] - NOISE).clamp(min=0)
     parts = torch.maximum(shares * top, 3 * noise[:, None])
     # Noise of the sum grows with the root of the number of sensors.
-    sums = torch.maximum(
-        shares * frame.amax(dim=1, keepdim=True), 3 * x.shape[2] ** 0.5 * noise[:, None]
-    )
+    sums = torch.maximum(shares * frame.amax(dim=1, keepdim=True), 3 * x.shape[2] ** 0.5 * noise[:, None])
     above = peak[..., None] > raised[:, None]
     strong = peak[..., None] > parts[:, None]
     much = frame[..., None] > sums[:, None]

@@ -31,6 +31,11 @@ class GestureSettings:
 
     Ranges are (least, most), drawn uniformly, both ends included.
 
+    Attributes:
+        over_sensors: a touch is dangerous if the mean pressure over the footprint of a sensor exceeds the
+            threshold; False: over an equal area anywhere on the sheet, so that touches between the sensors
+            count.
+
     Raises:
         InputError: a range that is empty, out of order, or on the wrong side of its threshold.
     """
@@ -60,6 +65,7 @@ class GestureSettings:
     stretch: Annotated[float, Ge(1)] = 4.0
     leak: Annotated[float, Ge(0.5), Le(1)] = 0.6
     strict: bool = False
+    over_sensors: bool = True
     gap: _Frames = (10, 60)
     stride: _Frames = (15, 45)
     thresholds: Thresholds = field(default_factory=Thresholds)

@@ -12,7 +12,7 @@ import pytest
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]
 SMALL = ["data.gestures=400", "device.test_gestures=96", "evaluation.devices=1", "evaluation.layouts=0"]
-SMALL += ["evaluation.gestures=48", "evaluation.safe_gestures=200"]
+SMALL += ["evaluation.safe_gestures=200"]
 
 
 @pytest.fixture(scope="module")

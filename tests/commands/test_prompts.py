@@ -145,7 +145,7 @@ def test_free_recording_asks_for_nothing_and_goes_on_after_a_kill(person_at, add
 def test_evaluating_a_person(run, person_at, address, tmp_path):
     own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
     small = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
-    small += ["evaluation.layouts=1", "evaluation.safe_gestures=64", "evaluation.gestures=96"]
+    small += ["evaluation.layouts=1", "evaluation.safe_gestures=64"]
     trained = run(tmp_path, "train.py", "experiment=rules", *SKIN[:-1], *small)
     assert trained.returncode == 0, trained.stderr
     there = ["device=serial", f"device.port={address}", "device.labels=prompted", "device.gestures=16"]

@@ -15,7 +15,7 @@ from skin.recording_file import read_recording
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 SMALL = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]
-SMALL += ["evaluation.layouts=1", "evaluation.safe_gestures=64", "evaluation.gestures=96"]
+SMALL += ["evaluation.layouts=1", "evaluation.safe_gestures=64"]
 COUNT = 8
 PATIENCE = 300  # s: machines are busy at times
 

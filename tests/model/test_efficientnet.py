@@ -218,7 +218,7 @@ def test_other_channels_are_refused(channels):
 @pytest.mark.slow
 def test_the_command_line_ends_with_code_2_and_the_sentence(run, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    few = ["simulator=naive", "data.gestures=20", "device.test_gestures=20", "evaluation.gestures=20"]
+    few = ["simulator=naive", "data.gestures=20", "device.test_gestures=20"]
     done = run(tmp_path, "train.py", "model=efficientnet", *few)
     assert done.returncode == 2, done.stderr
     assert "put it there from https://download.pytorch.org/models/" in done.stderr

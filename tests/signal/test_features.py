@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from skin.recording import Touches
-from skin.signal.features import engineered_features
+from skin.signal.features import above_idle, engineered_features, estimate_noise
 
 PLACES = torch.tensor([[0.02, 0.02, 0.0], [0.06, 0.02, 0.0], [0.10, 0.02, 0.0], [0.06, 0.08, 0.0]])
 
@@ -92,9 +92,12 @@ def test_an_idle_window_or_a_dead_sensor_gives_numbers():
 
 
 def random_touches(count, seed=3):
+    """Return touches of which most frames are idle, with noise of up to 0.2 N."""
     generator = torch.Generator().manual_seed(seed)
     readings = 3 * torch.rand(count, 30, 4, generator=generator)
-    readings *= torch.rand(count, 30, 4, generator=generator) > 0.5
+    readings *= torch.rand(count, 30, 4, generator=generator) > 0.8
+    spread = 0.2 * torch.rand(count, 1, 1, generator=generator)
+    readings += spread * torch.randn(count, 30, 4, generator=generator)
     valid = torch.rand(count, 30, 4, generator=generator) > 0.1
     return Touches(readings, valid, PLACES, None, 10.0)
 
@@ -110,17 +113,42 @@ def test_a_window_alone_gives_what_it_gives_in_a_batch():
 def test_runs_and_counts_are_those_that_plain_python_finds():
     touches = random_touches(50)
     found = engineered_features(touches)
-    raw = touches.readings.where(touches.valid, 0)
-    x = (raw - raw.quantile(0.2, dim=1, keepdim=True)) * touches.valid
-    for place, rows in enumerate(x):
-        peak, total = rows.amax(dim=1), rows.sum(dim=1)
+    raw, noises = touches.readings.where(touches.valid, 0), estimate_noise(touches)
+    idle = raw.quantile(0.2, dim=1, keepdim=True) + 0.8416 * noises[:, None, None]
+    for place, (rows, noise) in enumerate(zip((raw - idle) * touches.valid, noises, strict=True)):
+        peak, total, more = rows.amax(dim=1), rows.sum(dim=1), 3 * (noise - 0.05).clamp(min=0)
         for series, level, name in (
-            (peak, 1.0, "longest run above 1.0 N"),
-            (peak, 0.3 * peak.max(), "longest run above 0.3 of the peak"),
-            (total, 0.7 * total.max(), "longest run of the sum above 0.7 of its peak"),
+            (peak, 1.0 + more, "longest run above 1.0 N"),
+            (peak, torch.maximum(0.3 * peak.max(), 3 * noise), "longest run above 0.3 of the peak"),
+            (
+                total,
+                torch.maximum(0.7 * total.max(), 6 * noise),
+                "longest run of the sum above 0.7 of its peak",
+            ),
         ):
             runs = [len(list(run)) for on, run in groupby((series > level).tolist()) if on]
             assert found[name][place] == max(runs, default=0), name
-        at_once = max(sum(force > 2.0 for force in row) for row in rows.tolist())
+        at_once = max(sum(force > 2.0 + more for force in row) for row in rows)
         assert found["most sensors above 2.0 N at once"][place] == at_once
-        assert found["frames above 0.6 N"][place] == sum(force > 0.6 for force in peak.tolist())
+        assert found["frames above 0.6 N"][place] == sum(force > 0.6 + more for force in peak)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.02, 0.05, 0.1, 0.2])
+def test_the_noise_of_a_device_is_found_beside_a_touch(spread):
+    generator = torch.Generator().manual_seed(5)
+    readings = spread * torch.randn(200, 30, 25, generator=generator)
+    readings[:, 8:20, :6] += 4 * torch.rand(200, 1, 6, generator=generator)  # a large touch
+    touches = Touches(readings, torch.ones_like(readings, dtype=torch.bool), torch.rand(25, 3), None, 10.0)
+    assert estimate_noise(touches).mean().item() == pytest.approx(spread, rel=0.2, abs=1e-6)
+    assert above_idle(touches)[:, :, 6:].mean().item() == pytest.approx(0, abs=0.1 * spread + 1e-6)
+
+
+def test_noise_alone_rarely_passes_a_level_of_any_device():
+    """However large the noise is, it passes the lowest level in one frame of thirty."""
+    shares = []
+    for spread in (0.05, 0.1, 0.2):
+        readings = spread * torch.randn(500, 30, 25, generator=torch.Generator().manual_seed(7))
+        valid = torch.ones_like(readings, dtype=torch.bool)
+        found = engineered_features(Touches(readings, valid, torch.rand(25, 3), None, 10.0))
+        shares.append(found["frames above 0.15 N"].float().mean().item())
+    assert shares == pytest.approx([1.0] * 3, abs=0.2)

@@ -25,7 +25,6 @@ SMALL = (
     "evaluation.devices=1",
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
-    "evaluation.gestures=48",
 )
 ROWS = ("rules", "linked_graph")
 COLUMNS = ("unseen_layout/overall/accuracy", "device_shift/overall/accuracy")

@@ -20,7 +20,6 @@ SMALL = [
     "evaluation.devices=1",
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
-    "evaluation.gestures=96",
 ]
 PATIENCE = 240  # s, on a machine that is busy with other things
 

@@ -1,0 +1,66 @@
+"""What a learner says about each test gesture, in one byte, for paired comparisons."""
+
+import numpy as np
+from torch import Tensor
+
+from skin.evaluation.operating_point import LABEL, OperatingPoint
+from skin.labels import Task
+
+OUTCOMES = "outcomes.npy"
+"""Name of the file of a run that holds the outcomes of its test gestures."""
+
+_LABELS = 6
+_ALARM, _DANGEROUS = 1 << 6, 1 << 7
+
+
+def encode(
+    probabilities: Tensor, labels: Tensor, task: Task, point: OperatingPoint | None = None
+) -> np.ndarray | None:
+    """Return the outcomes of gestures, (B,), uint8, for :func:`decode`.
+
+    Bit i is set where label i is wrong at a threshold of 0.5, bit 6 where the alarm is raised, and bit 7
+    where the gesture is dangerous.
+
+    Args:
+        probabilities: (B, L).
+        labels: (B, L), 0 or 1.
+        task: meaning of the labels.
+        point: operating point of the alarm; None: no alarm is raised.
+
+    Returns:
+        None for labels that are not binary or not always defined, or more than 6.
+    """
+    if task.kind != "binary" or task.gate or task.direction or len(task) > _LABELS:
+        return None
+    wrong = ((probabilities > 0.5) != (labels > 0.5)).numpy()
+    code = (wrong << np.arange(len(task))).sum(axis=1)
+    if LABEL in task.names:
+        place = task.names.index(LABEL)
+        code += _DANGEROUS * (labels[:, place] > 0.5).numpy()
+        if point is not None:
+            code += _ALARM * point.alarm(probabilities[:, place]).numpy()
+    return code.astype(np.uint8)
+
+
+def decode(outcomes: np.ndarray, metric: str, task: Task) -> np.ndarray | None:
+    """Return the contribution of each gesture to a metric, whose mean it is; None for other metrics.
+
+    Args:
+        outcomes: (..., B), uint8.
+        metric: ``<label>/accuracy``, ``overall/accuracy``, ``dangerous/alarm_recall`` or
+            ``dangerous/false_alarm_rate``.
+        task: meaning of the labels.
+
+    Returns:
+        (..., B), float64; NaN for gestures that do not count: safe ones for a recall, for example.
+    """
+    alarm, dangerous = (outcomes & _ALARM) > 0, (outcomes & _DANGEROUS) > 0
+    counts = {f"{LABEL}/alarm_recall": dangerous, f"{LABEL}/false_alarm_rate": ~dangerous}
+    if metric in counts:
+        return np.where(counts[metric], alarm, np.nan)
+    label, _, kind = metric.partition("/")
+    if kind != "accuracy" or label not in (*task.names, "overall"):
+        return None
+    names = task.names if label == "overall" else (label,)
+    right = [(outcomes >> task.names.index(name) & 1) == 0 for name in names]
+    return np.mean(right, axis=0)

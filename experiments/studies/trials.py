@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from hydra import compose
@@ -20,6 +21,7 @@ from experiments.studies.study import Study, Variant, as_overrides, passed_overr
 from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.config import fingerprint, validate_config
+from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.source import note_reuse
 from skin.stored_run import TAG, apply_overrides, load_configuration
@@ -81,14 +83,30 @@ def run_trials(
         (given, []) if planned.variant.configs else ([], [one for one in given if one != selected])
     )
     for condition, settings in (study.conditions or {"": {}}).items():
-        for number in range(1, study.devices + 1) or ("",):
-            numbered = dict.fromkeys(study.numbered, number) if study.devices else {}
-            line = as_overrides({**study.test, **settings, **numbered})
+        for number, own_settings in numbered_settings(study, settings):
+            line = as_overrides({**study.test, **own_settings})
             found = subject.measured(study, base, [*line, *changes])
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
-            at = planned.variant, planned.seed, condition, str(number), planned.run.info.run_id
+            at = planned.variant, planned.seed, condition, number, planned.run.info.run_id
             yield Trial(*at, metrics, said, files, _outcomes(store, found))
+
+
+def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the settings of each device of a condition, with its number; empty where there is only one.
+
+    Raises:
+        InputError: lists of different lengths.
+    """
+    lists = {key: value for key, value in condition.items() if isinstance(value, list)}
+    lists |= {key: list(range(1, study.devices + 1)) for key in study.numbered if study.devices}
+    if not lists:
+        yield "", condition
+        return
+    if len({len(each) for each in lists.values()}) > 1:
+        raise InputError(f"the lists of a condition number its devices, so they need one length, got {lists}")
+    for number, values in enumerate(zip(*lists.values(), strict=True), start=1):
+        yield str(number), {**condition, **dict(zip(lists, values, strict=True))}
 
 
 class _Run:

@@ -72,6 +72,9 @@ def test_sensors_upside_down_read_the_same():
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda path: path.stem)
 def test_shipped_layouts_run_from_the_upper_left_rightwards_and_down(option, body):
     x, y, _ = instantiate(OmegaConf.load(option)).sensors(body).positions.T
+    if option.stem == "random":  # which has no rows
+        assert (np.diff(y) >= 0).all()
+        return
     rows = y.reshape(5, 5)
     assert (np.diff(x.reshape(5, 5), axis=1) > 0).all()
     assert (rows[1:].min(axis=1) > rows[:-1].max(axis=1)).all()

@@ -59,13 +59,22 @@ def paired(
         return None
     mean = fmean(_pairs(one, other, ratio))
     error = _error(_pairs(one, other, ratio)) if len(shared) > 1 else math.inf
-    devices = _error(_pairs(*across, ratio))
+    devices = _across_error(*across, ratio)
     return Paired(mean, math.hypot(error, devices, _gesture_error(gestures, ratio)), len(shared))
 
 
 def _pairs(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -> list[float]:
     pairs = [(one[key], other[key]) for key in one if key in other]
     return [first / second if ratio else first - second for first, second in pairs]
+
+
+def _across_error(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -> float:
+    """Return the standard error over devices, of which one variant may have several and the other one."""
+    if len(pairs := _pairs(one, other, ratio)) > 1 or not one or not other:
+        return _error(pairs)
+    first, second = fmean(one.values()), fmean(other.values())
+    errors = _error([*one.values()]), _error([*other.values()])
+    return math.hypot(errors[0], first / second * errors[1]) / second if ratio else math.hypot(*errors)
 
 
 def _error(each: Sequence[float]) -> float:

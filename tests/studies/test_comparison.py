@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
@@ -47,6 +48,8 @@ def test_one_seed_has_no_known_error_and_none_no_difference():
         ("no better", 1, 0.5, 0.2, "agree"),
         ("no better", 1, 0.5, 0.3, "undecided"),
         ("no better", 1, 1.5, 0.2, "disagree"),
+        ("at most", 0.5, 0.47, 0.01, "agree"),
+        ("at most", 0.5, 0.49, 0.01, "undecided"),
         ("about", 3, 2.0, 0.2, "agree"),
         ("about", 3, 7.0, 0.2, "disagree"),
         ("ratio", 10, 12.0, 1.0, "agree"),
@@ -75,3 +78,40 @@ def test_two_seeds_decide_nothing():
 )
 def test_a_statement_about_several_holds_against_each(each, whole):
     assert combine_verdicts(each) == whole
+
+
+@pytest.mark.parametrize("ratio", [False, True])
+def test_the_error_is_that_of_repeated_comparisons(ratio):
+    """Monte Carlo: seeds, devices and gestures drawn anew give means that spread by the error."""
+    random = np.random.default_rng(1)
+    means, errors = [], []
+    for _ in range(400):
+        parts = [
+            scale * random.standard_normal((2, *shape))
+            for scale, shape in ((0.4, (5, 1, 1)), (0.5, (1, 4, 1)), (3.0, (1, 1, 100)), (1.0, (5, 4, 100)))
+        ]
+        one, other = sum(parts) + np.array([8.0, 20.0]).reshape(2, 1, 1, 1)
+        seeds, devices = (
+            [dict(enumerate(map(float, each.mean(axis=axes)))) for each in (one, other)]
+            for axes in ((1, 2), (0, 2))
+        )
+        gestures = one.mean(axis=(0, 1)), other.mean(axis=(0, 1))
+        found = paired(*seeds, ratio, tuple(devices), gestures)
+        means.append(found.mean)
+        errors.append(found.error)
+    assert np.mean(means) == pytest.approx(0.4 if ratio else -12, abs=0.05)
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(means), rel=0.12)
+
+
+def test_a_variant_on_one_device_is_compared_with_one_on_several():
+    seeds = {"0": 3.0, "1": 3.0}, {"0": 1.0, "1": 1.0}
+    found = paired(*seeds, across=({"1": 2.0, "2": 3.0, "3": 4.0}, {"": 1.0}))
+    assert found == Paired(2.0, pytest.approx(3**-0.5), 2)
+
+
+def test_gestures_that_are_not_the_same_are_not_paired():
+    seeds = {"0": 3.0, "1": 3.0}, {"0": 1.0, "1": 1.0}
+    found = paired(*seeds, gestures=(np.array([1.0, 2.0, 3.0, np.nan]), np.array([0.0, 2.0])))
+    assert found.error == pytest.approx(math.sqrt(1 / 3 + 2 / 2))
+    same = np.array([1.0, 2.0, 9.0, np.nan])
+    assert paired(*seeds, gestures=(same, same + 1)).error == 0

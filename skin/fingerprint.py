@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skin import __version__
+from skin.earlier_settings import in_frames
 from skin.paths import candidates
 
 RENAMED: dict[str, str] = {
@@ -27,10 +28,11 @@ _MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strateg
 def config_hash(content: dict[str, Any]) -> str:
     """Return the hash of a configuration in plain containers, 16 hexadecimal digits.
 
-    Classes enter by their first name, so that renaming a module does not change the hash.
+    Classes enter by their first name, so that renaming a module does not change the hash, and gestures in
+    frames (:func:`skin.earlier_settings.in_frames`).
     """
     files = {value: _hash_of(value) for value in _strings(content) if _file(value)}
-    first = renamed(content, {new: old for old, new in RENAMED.items()})
+    first = renamed(in_frames(content), {new: old for old, new in RENAMED.items()})
     text = json.dumps([_relevant(first), files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

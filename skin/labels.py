@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
 import torch
-from annotated_types import Gt, Lt, MinLen
+from annotated_types import Ge, Gt, Lt, MinLen
 from torch import Tensor
 
 from skin.settings import ONCE, checked
@@ -109,7 +109,7 @@ class Thresholds:
 
     Attributes:
         area: a touch is big if it covers more than this share of the sheet.
-        frames: a touch is a press if it lasts more than this many consecutive frames.
+        duration: a touch is a press if it lasts longer than this without interruption, s.
         pressure: a touch is dangerous if some sensor's surface pressure exceeds this in some frame, Pa
             (cuff algometry, Jespersen et al.).
         contact: cells above this share of the gesture's peak cell are in contact.
@@ -117,7 +117,7 @@ class Thresholds:
     """
 
     area: Annotated[float, Gt(0), Lt(1)] = 0.30
-    frames: int = 3
+    duration: Annotated[float, Ge(0)] = 0.3
     pressure: float = 90.5e3
     contact: Annotated[float, Gt(0), Lt(1)] = 0.02
     travel: float = 1e-3
@@ -138,11 +138,16 @@ class Measures(NamedTuple):
     frames: Tensor
     pressure: Tensor
 
-    def labels(self, thresholds: Thresholds) -> Tensor:
-        """Return the labels (B, 4), 0 or 1, float32, in the order of ``TOUCH``."""
+    def labels(self, thresholds: Thresholds, rate: float) -> Tensor:
+        """Return the labels (B, 4), 0 or 1, float32, in the order of ``TOUCH``.
+
+        Args:
+            thresholds: of the labels.
+            rate: frames per second of the movie, Hz.
+        """
         big = self.area > thresholds.area
         dynamic = self.travel > thresholds.travel
-        press = self.frames > thresholds.frames
+        press = self.frames > round(thresholds.duration * rate)
         dangerous = self.pressure > thresholds.pressure
         return torch.stack([big, dynamic, press, dangerous], dim=1).float()
 
@@ -210,7 +215,11 @@ def longest_run(active: Tensor) -> Tensor:
 
 
 def movie_labels(
-    pressure: Tensor, footprints: Tensor, cell: tuple[float, float], thresholds: Thresholds | None = None
+    pressure: Tensor,
+    footprints: Tensor,
+    cell: tuple[float, float],
+    thresholds: Thresholds | None = None,
+    rate: float = 10.0,
 ) -> Tensor:
     """Return the labels (B, 4) that a dense pressure movie gives.
 
@@ -219,10 +228,11 @@ def movie_labels(
         footprints: (S, H * W), area weights of each sensor that sum to 1.
         cell: extent (x, y) of a cell, m.
         thresholds: of the labels; None: those of the report.
+        rate: frames per second, Hz.
     """
     thresholds = thresholds or Thresholds()
     batch, time = pressure.shape[:2]
     index = torch.arange(batch * time, device=pressure.device).view(batch, time)
     scale = torch.ones(batch, time).to(pressure)
     measures = measure_gestures(pressure.flatten(0, 1), index, scale, footprints, cell, thresholds.contact)
-    return measures.labels(thresholds)
+    return measures.labels(thresholds, rate)

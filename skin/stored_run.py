@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from skin.build import build_device
 from skin.config import Evaluation, validate_config
 from skin.datamodule import TouchData
+from skin.earlier_settings import in_seconds
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
 from skin.fingerprint import renamed
@@ -89,6 +90,7 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
             raise InputError(f"run {run.info.run_id} has no readable config.yaml: {error}") from error
     if not isinstance(stored, dict):
         raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
+    stored = in_seconds(stored)
     if not trust:
         check_targets(stored, f"config.yaml of run {run.info.run_id}")
     # Older runs list the settings of all commands of their time, unset.
@@ -126,9 +128,6 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
         source = OmegaConf.select(composed, parent) if parent else composed
         # Unresolved, so that a device refers to the simulator of this run.
         OmegaConf.update(whole, key, _raw(source)[name], merge=False)
-    if "rate" in whole.device and whole.device.rate is None:
-        # A live device is resampled to the rate of the training.
-        whole.device.rate = stored.device.get("rate")
     whole.tracking = composed.tracking
     return validate_config(whole)
 

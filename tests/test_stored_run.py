@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from skin.build import build_data, build_device, build_learner
 from skin.config import Evaluation, Tracking, plain, validate_config
+from skin.earlier_settings import in_seconds
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.fingerprint import RENAMED
@@ -250,6 +251,20 @@ def test_a_class_that_moved_since_is_found_under_its_name_of_now(store, monkeypa
     assert found == {"learner": {"_target_": "skin.learner.rules.Rules"}}
 
 
+def test_gestures_in_frames_are_loaded_in_seconds(store):
+    touch = "touch: {window: 20, tap: [1, 3], speed: [0.003, 0.02], thresholds: {frames: 3}}"
+    text = f"{touch}\ndevice: {{rate: 10.0}}"
+    with store.run("frames", {"learned": "rules.json"}) as run:
+        store.client.log_text(run.info.run_id, text, "config.yaml")
+    assert load_configuration(store, run).touch == {
+        "rate": 10.0,
+        "window": 2.0,
+        "tap": [0.1, 0.3],
+        "speed": [0.03, 0.2],
+        "thresholds": {"duration": 0.3},
+    }
+
+
 def test_a_run_without_its_files_is_refused(store):
     with store.run("bare", {"learned": "rules.json"}) as run:
         pass
@@ -263,7 +278,7 @@ def test_a_run_of_an_earlier_version_is_evaluated(run, tmp_path):
     """Its configuration lacks what was added later, and lists settings of commands that are gone."""
     stored = OmegaConf.load(ROOT / "tests" / "earlier_run.yaml")
     stored.device.update(gestures=64, test_gestures=32)
-    config = validate_config(stored)
+    config = validate_config(OmegaConf.create(in_seconds(plain(stored))))
     learner = build_learner(config)
     data = build_data(config, build_device(config))
     data.touches("train")

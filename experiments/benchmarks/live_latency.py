@@ -56,7 +56,9 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
     data = build_data(config, device)
     learner.build(data)
     positions = data.touches("train").positions
-    return device, Engine(learner, device.task, positions, device.window, device.rate, Detection(_TOUCH))
+    return device, Engine(
+        learner, device.task, positions, device.window, device.model_rate, Detection(_TOUCH)
+    )
 
 
 def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
@@ -79,7 +81,7 @@ def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
 
 def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:
     """Return frames at 100 Hz, after the engine's window has been filled with frames."""
-    held = round(RATE / device.rate)
+    held = round(RATE / device.model_rate)
     ahead = held * device.window
     whole = device.simulate_stream((ahead + count) // held + 1).whole.touches
     values = np.repeat(whole.readings[0].double().numpy(), held, axis=0)[: ahead + count]

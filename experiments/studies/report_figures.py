@@ -22,11 +22,18 @@ from skin.simulator.naive import Naive
 from skin.touch.sampler import Movie
 from skin.tracking import Store
 
-_SPEEDS = np.linspace(0.003, 0.020, 7)
+_SPEEDS = np.linspace(0.03, 0.20, 7)  # m/s
 
 
-def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
-    """Draw figures 7 and 8 of each simulator from the test predictions of every row's first run."""
+def draw_runs(cells: Sequence[Cell], store: Store, folder: Path, rate: float) -> list[Path]:
+    """Draw figures 7 and 8 of each simulator from the test predictions of every row's first run.
+
+    Args:
+        cells: the runs.
+        store: that holds them.
+        folder: of the figures.
+        rate: of the model, Hz; predictions are stored with speeds in m per frame.
+    """
     paths = []
     for simulator in dict.fromkeys(cell.simulator for cell in cells):
         tables = {
@@ -38,7 +45,7 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path) -> list[Path]:
         for row, table in tables.items():
             matrices[row] = confusion(_column(table, "p_dangerous"), _column(table, "dangerous"))[0].numpy()
             wrong[row] = ((_column(table, "p_big") > 0.5) != (_column(table, "big") > 0.5))[:, 0].numpy()
-        speeds = _column(next(iter(tables.values())), "speed")[:, 0].numpy()
+        speeds = _column(next(iter(tables.values())), "speed")[:, 0].numpy() * rate
         drawn = figures.confusions(matrices, ("safe", "dangerous"))
         paths.append(figures.save_figure(drawn, folder / f"figure08_confusion_{simulator}.png"))
         drawn = figures.misclassified(speeds, wrong, "big", _SPEEDS)
@@ -70,9 +77,11 @@ def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> lis
         _overview(device, folder),
         *_hand(device, folder),
         figures.save_figure(image, folder / "figure04_interpolations.png"),
-        figures.save_figure(figures.traces(readings, device.rate), folder / f"figure10_naive_{name}.png"),
         figures.save_figure(
-            figures.force_and_reading(recording.force[four], touches.readings[four], device.rate),
+            figures.traces(readings, device.model_rate), folder / f"figure10_naive_{name}.png"
+        ),
+        figures.save_figure(
+            figures.force_and_reading(recording.force[four], touches.readings[four], device.model_rate),
             folder / "figure11_force_reading.png",
         ),
     ]
@@ -115,7 +124,7 @@ def _overview(device: AbstractSimulated, folder: Path) -> Path:
         readings,
         frame,
         device.sensors.positions,
-        (device.size, device.rate),
+        (device.size, device.model_rate),
     )
     return figures.save_figure(drawn, folder / "overview.png")
 

@@ -29,7 +29,7 @@ def streams_summary(found: WindowReport) -> str:
         parts.append(f"touch by {gate} {100 * _right(counts):.1f} %")
     hourly = ", ".join(f"{alarms.per_hour:.1f} ({gate})" for gate, alarms in found.alarms.items())
     parts.append(f"false alarms per hour {hourly} in {_idle(found.alarms):.2f} h without touch")
-    windows = (f"{window}: {_length(value)}" for window, value in found.lengths.items())
+    windows = (f"{window:g} s: {_length(value)}" for window, value in found.lengths.items())
     return "; ".join([*parts, "window " + ", ".join(windows)])
 
 
@@ -67,8 +67,8 @@ def _tables(found: WindowReport) -> dict[str, list[list[str]]]:
             *alarms,
         ],
         "Windows of other lengths": [
-            ["frames", "overall accuracy, %"],
-            *([str(window), _length(value)] for window, value in found.lengths.items()),
+            ["s", "overall accuracy, %"],
+            *([f"{window:g}", _length(value)] for window, value in found.lengths.items()),
         ],
     }
 
@@ -87,7 +87,7 @@ def _csv(found: WindowReport) -> list[Sequence[object]]:
         table += ([f"alarms {name}", gate, "", value] for name, value in vars(alarms).items())
     table.append(["threshold, N", "threshold", "", f"{found.threshold:.4f}"])
     table.append(["stream, h", "", "", found.hours])
-    table += (["window", "overall", window, value] for window, value in found.lengths.items())
+    table += (["window, s", "overall", f"{window:g}", value] for window, value in found.lengths.items())
     return table
 
 

@@ -51,7 +51,9 @@ def main(config: DictConfig) -> None:
         picture = gesture_page.plot_gestures(pairs, settings["shown"], folder / "compare.png")
     else:
         presses = press_comparison.read_presses(device, config.session, config.presses, settings)
-        both = press_comparison.press_touches(presses, device.sensors.positions, device.rate, device.window)
+        both = press_comparison.press_touches(
+            presses, device.sensors.positions, device.model_rate, device.window
+        )
         text = press_comparison.presses_markdown(presses, _verdicts(config, device, both), about)
         picture = press_comparison.plot_presses(presses, settings["shown"], folder / "compare.png")
     print(text, write(text, folder / "compare.md"), picture, sep="\n")

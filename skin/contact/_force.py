@@ -158,7 +158,7 @@ def _classes(pressure: torch.Tensor, problem: ContactProblem) -> tuple[np.ndarra
     frames = pressure.float().view(-1, *body.shape)
     index, once = torch.arange(len(frames))[:, None], torch.ones(len(frames), 1)
     measures = measure_gestures(frames, index, once, problem.footprints, body.cell, thresholds.contact)
-    labels = measures.labels(thresholds)[:, [0, 3]].bool()
+    labels = measures.labels(thresholds, problem.settings.rate)[:, [0, 3]].bool()
     return frames.flatten(1).amax(1).double().numpy(), labels.numpy()
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from skin.recording import Touches
+from skin.signal.device_sampling import draw_constants, measure
 from skin.signal.imperfection import Imperfection
 from skin.simulator.base import AbstractSimulator
 from skin.touch.sampler import Movie, TouchSampler
@@ -77,8 +78,9 @@ def estimated(
         movie = sampler.sample(_GESTURES, randomness)
         motion = _motion(model, movie)
         force = model.respond(movie, displacement=False).readings
-    constants = imperfection.constants(sensors, randomness, len(movie))
-    readings, *_ = imperfection.apply(force, constants, randomness)
+    rate = sampler.settings.rate
+    constants = draw_constants(imperfection, sensors, rate, randomness, len(movie))
+    readings, *_ = measure(imperfection, constants, force, rate, randomness)
     ridge = RidgeCV(_PENALTIES, fit_intercept=False, alpha_per_target=True)
     ridge.fit(readings.flatten(0, 1).double().numpy(), motion.flatten(2).flatten(0, 1).double().numpy())
     return Tracker(weights=torch.from_numpy(ridge.coef_.T.copy()).float())

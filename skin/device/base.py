@@ -119,7 +119,8 @@ class AbstractSimulated(AbstractDevice):
         model: maps pressure to the true readings of the sensors at their true positions.
         sampler: draws the gestures.
         window: frames per touch.
-        rate: frames per second, Hz.
+        model_rate: frames per second of touches, Hz.
+        rate: frames per second of the sensors, Hz; touches are resampled to ``model_rate``.
         stream: whether touches are windows of streams.
         seed: for the device's constants and noise.
         data_seed: for the gestures of the training budget.
@@ -135,6 +136,7 @@ class AbstractSimulated(AbstractDevice):
     model: "AbstractSimulator"
     sampler: "TouchSampler"
     window: int
+    model_rate: float
     rate: float
     stream: bool
     seed: int
@@ -190,7 +192,7 @@ class AbstractWired(AbstractDevice):
     Attributes:
         sensors: S sensors, one per value of a frame.
         window: frames per touch.
-        rate: frames per second that touches are resampled to, Hz; None before it is known.
+        model_rate: frames per second that touches are resampled to, Hz.
         labels: source of the labels.
         gestures: number of touches of ``test``.
         calibration: calibration file of the device; or None.
@@ -198,7 +200,7 @@ class AbstractWired(AbstractDevice):
 
     sensors: Sensors
     window: int
-    rate: float | None
+    model_rate: float
     labels: str
     gestures: int
     calibration: str | None

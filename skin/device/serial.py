@@ -1,7 +1,7 @@
 """Touches from a real or emulated skin, gesture by gesture."""
 
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from skin.recording import Recording, Touches
 from skin.signal.calibration import read_calibration
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
+from skin.touch.gesture import GestureSettings, model_window
 from skin.wire.announcement import AnnouncementListener
 from skin.wire.conversion import UnitConversion, unit_conversion
 from skin.wire.errors import SkinDisconnected, SkinTimeout
@@ -61,8 +62,7 @@ class Serial(AbstractWired):
         trigger: force above which a window begins with ``labels=none``, N.
         scale: N per unit.
         calibration: calibration file.
-        window: T, frames of the model.
-        rate: of the model, Hz; None: 10.
+        touch: rate and window of the model (``conf/touch.yaml``).
         stream: add the label ``touch``.
 
     Raises:
@@ -85,8 +85,7 @@ class Serial(AbstractWired):
     timeout: float = 10.0
     backoff: Sequence[float] = (1.0, 10.0)
     silence: float | None = 5.0
-    window: int = 30
-    rate: float | None = None
+    touch: Mapping[str, Any] | GestureSettings | None = None
     stream: bool = False
 
     def __post_init__(self) -> None:
@@ -101,7 +100,7 @@ class Serial(AbstractWired):
         self._settings: dict[str, Any] = {name: getattr(self, name) for name in _AS_OPENED}
         self._settings["limits"] = None if self.limits is None else tuple(self.limits)
         PortSettings(**self._settings)  # checks them
-        self.rate = 10.0 if self.rate is None else float(self.rate)
+        self.window, self.model_rate = model_window(self.touch)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
@@ -127,9 +126,8 @@ class Serial(AbstractWired):
 
     def blank(self) -> AbstractDevice:
         """Return a device with touches of the same shapes that are 0, so that no touch is read."""
-        assert self.rate is not None
         empty = torch.zeros(1, self.window, len(self.sensors))
-        touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.rate)
+        touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.model_rate)
         return Blank(self.task, self.size, touches)
 
     def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
@@ -148,10 +146,9 @@ class Serial(AbstractWired):
 
     def warm_up(self, skin: Skin) -> tuple[list[Frame], UnitConversion]:
         """Read the first frames: check the rate and take the baseline."""
-        assert self.rate is not None
         tare = self.taring(skin)
         try:
-            frames = warm_up(skin, tare, self.rate, self.tare, _say)
+            frames = warm_up(skin, tare, self.model_rate, self.tare, _say)
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{self.port}: {error}") from error
         assert tare.conversion is not None
@@ -159,8 +156,7 @@ class Serial(AbstractWired):
 
     def taring(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""
-        assert self.rate is not None
-        return Tare(self.conversion, self.tare, self.rate, lambda: skin.header)
+        return Tare(self.conversion, self.tare, self.model_rate, lambda: skin.header)
 
     def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
         """Return the conversion of values to N, given a baseline (S,) and the header of the device.
@@ -178,8 +174,7 @@ class Serial(AbstractWired):
         done: Collection[int] = (),
     ) -> AbstractSegmenter:
         """Return the segmenter that ``labels`` selects."""
-        assert self.rate is not None
-        window = Window(self.window, self.rate, len(self.sensors))
+        window = Window(self.window, self.model_rate, len(self.sensors))
         for frame in first:
             window.add(frame)
         if self.labels == "announced":
@@ -206,11 +201,10 @@ class Serial(AbstractWired):
 
     def _touches(self, windows: Sequence[Resampled], conversion: UnitConversion) -> Touches:
         """Return windows in the device's unit as touches."""
-        assert self.rate is not None
         values, mask, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
         readings, valid = conversion(values, mask)
         known = [torch.from_numpy(array) for array in (readings, valid, valid & saturated)]
-        return Touches(known[0], known[1], self._positions, None, self.rate, saturated=known[2])
+        return Touches(known[0], known[1], self._positions, None, self.model_rate, saturated=known[2])
 
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin stops sending, or the user ends it."""

@@ -25,7 +25,9 @@ from skin.recording import Recording, Touches, concatenate
 from skin.rng import Stream, generator
 from skin.sensors import Sensors
 from skin.settings import check_settings
+from skin.signal.device_sampling import draw_constants, idle_excess, measure
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
+from skin.signal.resampling import check_rate
 from skin.simulator.base import AbstractSimulator
 from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
@@ -59,7 +61,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
         data_seed: seed of the budget.
         seed: seed of the device's constants and noise; each seed is another device.
-        gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`.
+        gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`. The rate
+            is that of the sensors; touches are resampled to ``touch.rate``.
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
@@ -93,14 +96,16 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         self.true_sensors = misplaced(self.sensors, self.size, self.position_error, self.seed)
-        self.model = modelled(self.simulator, self.body, self.true_sensors, self.rate)
+        settings = GestureSettings.of(self.touch)
+        self.window, self.model_rate = settings.frames.window, float(settings.rate)
+        check_rate(self.rate, self.model_rate, "device.rate")
+        self.model = modelled(self.simulator, self.body, self.true_sensors, self.model_rate)
         self.sampler = self._sampler(self.body, self.true_sensors, self.model)
-        self.window = self.sampler.settings.window
         if self.sampler.settings.shear:
             self.model.refuse_shear()
         self.imperfection = Imperfection.of(self, self.calibration)
         drawn = generator(Stream.CONSTANTS, self.seed)
-        self.constants = self.imperfection.constants(len(self.sensors), drawn)
+        self.constants = draw_constants(self.imperfection, len(self.sensors), self.model_rate, drawn)
         self.tracker = self._tracker()
         self._kept: dict[str, Recording] = {}
 
@@ -134,7 +139,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
-        return (self.constants.offset - self.constants.baseline).masked_fill(self.constants.dead, 0.0)
+        excess = idle_excess(self.imperfection, self.constants, self.model_rate)
+        level = self.constants.offset - self.constants.baseline + excess
+        return level.masked_fill(self.constants.dead, 0.0)
 
     def blank(self) -> "Simulated":
         """Return a device with few gestures: to restore a run, only their shape matters."""
@@ -206,10 +213,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def _windows(self, part: slice, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
         """Cut as many windows from a stream as ``part`` is long."""
         draw, noise = generator(stream, *key), generator(Stream.NOISE, self.seed, stream, *key)
-        settings, count = self.sampler.settings, part.stop - part.start
-        starts = np.cumsum(draw.integers(*settings.stride, count, endpoint=True)) - settings.stride[0]
+        frames, count = self.sampler.settings.frames, part.stop - part.start
+        starts = np.cumsum(draw.integers(*frames.stride, count, endpoint=True)) - frames.stride[0]
         length = int(starts[-1]) + self.window
-        timeline = draw_timeline(self.sampler, length, settings.gap, draw)
+        timeline = draw_timeline(self.sampler, length, frames.gap, draw)
         true = TouchStream.of(timeline, self._true(timeline.movie, complete))
         if self.randomise:
             return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
@@ -217,11 +224,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     @torch.no_grad()
     def simulate_stream(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> TouchStream:
-        """Return a test stream in one piece; without ``gap``, [least, most], as ``touch.gap`` says."""
+        """Return a test stream in one piece; without ``gap``, [least, most] frames, as ``touch.gap`` says."""
         if self.randomise:
             return self.replace(randomise=False).simulate_stream(frames, gap, number)
         key = Stream.TEST, 1, number
-        timeline = draw_timeline(self.sampler, frames, gap or self.sampler.settings.gap, generator(*key))
+        gap = gap or self.sampler.settings.frames.gap
+        timeline = draw_timeline(self.sampler, frames, gap, generator(*key))
         true = TouchStream.of(timeline, self._true(timeline.movie, complete=False))
         return TouchStream(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
 
@@ -231,7 +239,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, float(self.rate), self.tracker.motion(movie))
+        touches = Touches(readings, valid, positions, labels, self.model_rate, self.tracker.motion(movie))
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.
@@ -240,10 +248,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""
-        force, constants = true.touches.readings, self.constants
+        force, constants, rate = true.touches.readings, self.constants, self.model_rate
         if self.randomise:
-            constants = self.imperfection.constants(len(self.sensors), noise, len(true))
-        readings, valid, saturated = self.imperfection.apply(force, constants, noise)
+            constants = draw_constants(self.imperfection, len(self.sensors), rate, noise, len(true))
+        readings, valid, saturated = measure(self.imperfection, constants, force, rate, noise)
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
         return replace(true, touches=self.tracker.estimate(touches), parameters=true.parameters | clipped)

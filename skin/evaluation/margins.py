@@ -110,7 +110,8 @@ def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: Op
     chances = learner.probabilities(touches)[:, places]
     said, known = chances > 0.5, recording.parameters
     measures = Measures(*(known[name] for name in Measures._fields))
-    shares = _shares(measures, simulation.sampler.settings.thresholds)
+    settings = simulation.sampler.settings
+    shares = _shares(measures, settings.thresholds, settings.frames.duration)
     found = {name: spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
     found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
@@ -131,12 +132,12 @@ def spans(said: Tensor, shares: Tensor) -> list[Span]:
     ]
 
 
-def _shares(measures: Measures, thresholds: Thresholds) -> Tensor:
+def _shares(measures: Measures, thresholds: Thresholds, longest_tap: int) -> Tensor:
     """Return each measure divided by its threshold, (B, 4), in the order of ``TOUCH``."""
     pairs = (
         (measures.area, thresholds.area),
         (measures.travel, thresholds.travel),
-        (measures.frames, thresholds.frames),
+        (measures.frames, longest_tap),
         (measures.pressure, thresholds.pressure),
     )
     return torch.stack([measure / threshold for measure, threshold in pairs], dim=1)

@@ -50,7 +50,7 @@ class WindowReport:
         threshold: of the gate by threshold, N.
         alarms: gate -> alarms on the long stream.
         hours: length of that stream.
-        lengths: frames of a window -> overall accuracy, or why the learner does not accept such windows.
+        lengths: length of a window, s -> overall accuracy, or why the learner does not accept such windows.
         streamed: whether the learner was trained on windows of streams.
         point: operating point of the alarm.
     """
@@ -60,7 +60,7 @@ class WindowReport:
     threshold: float
     alarms: dict[str, Alarms]
     hours: float
-    lengths: dict[int, float | str]
+    lengths: dict[float, float | str]
     streamed: bool
     point: OperatingPoint
 
@@ -80,7 +80,7 @@ class WindowReport:
             values[f"alarms/{gate}/found"] = alarms.found / max(alarms.dangerous, 1)
             values[f"alarms/{gate}/raised_by_safe"] = alarms.raised / max(alarms.safe, 1)
         for window, value in self.lengths.items():
-            values |= {} if isinstance(value, str) else {f"window/{window}/overall/accuracy": value}
+            values |= {} if isinstance(value, str) else {f"window/{window:g}/overall/accuracy": value}
         return values
 
 
@@ -168,9 +168,12 @@ def _listen(
     track: Callable[..., Any],
 ) -> dict[str, Alarms]:
     """Return the alarms of each gate on sliding windows over a long stream."""
-    frames = max(round(settings.hours * 3600 * device.rate), device.window)
-    stream = device.simulate_stream(frames, settings.gap)
-    starts = torch.arange(0, frames - device.window + 1, settings.stride)
+    rate = device.model_rate
+    frames = max(round(settings.hours * 3600 * rate), device.window)
+    gap = [_frames(seconds, rate, "gap") for seconds in settings.gap]
+    stride = _frames(settings.stride, rate, "stride")
+    stream = device.simulate_stream(frames, gap)
+    starts = torch.arange(0, frames - device.window + 1, stride)
     dangerous = task.names.index(LABEL)
     heard: dict[str, list[Tensor]] = {name: [] for name in all_gates}
     for part in track(starts.split(_CHUNK)):
@@ -180,12 +183,23 @@ def _listen(
             heard[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
     gesture = stream.timeline.window_content(starts, device.window).gesture
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
-    hours = settings.stride / device.rate / 3600
+    hours = stride / rate / 3600
     return {name: count_alarms(torch.cat(said), gesture, truth, hours) for name, said in heard.items()}
 
 
-def _length(learner: Predictor, device: AbstractSimulated, window: int) -> float | str:
-    """Return the overall accuracy on test touches in windows of another length, or why there is none.
+def _frames(seconds: float, rate: float, name: str) -> int:
+    """Return a duration in frames at a rate, Hz; InputError if it is shorter than a frame."""
+    frames = round(seconds * rate)
+    if not frames:
+        raise InputError(
+            f"study.measure.{name}={seconds:g} s is no frame at touch.rate={rate:g} Hz: "
+            f"give at least {1 / rate:g}"
+        )
+    return frames
+
+
+def _length(learner: Predictor, device: AbstractSimulated, window: float) -> float | str:
+    """Return the overall accuracy on test touches in windows of another length, s, or why there is none.
 
     All lengths have the same touches with other onsets; windows that are shorter than the longest press have
     shorter presses.

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 
 from skin.settings import RISING, checked
 
@@ -16,15 +16,15 @@ class StreamSettings:
 
     Attributes:
         hours: length of the stream on which alarms are counted.
-        gap: [least, most] idle frames between two touches.
-        stride: frames between two predictions.
-        windows: window lengths to test the learner on, frames.
+        gap: [least, most] time without touch between two touches, s.
+        stride: time between two predictions, s.
+        windows: window lengths to test the learner on, s.
 
     Raises:
         InputError: a value that cannot be used.
     """
 
     hours: PositiveFloat = 1.0
-    gap: Annotated[tuple[PositiveInt, PositiveInt], RISING] = (50, 1150)
-    stride: PositiveInt = 1
-    windows: Sequence[PositiveInt] = (20, 30, 60)
+    gap: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (5.0, 115.0)
+    stride: PositiveFloat = 0.1
+    windows: Sequence[PositiveFloat] = (2.0, 3.0, 6.0)

@@ -111,10 +111,10 @@ def misclassified(
     """Draw the share of gestures whose label is wrong against the speed of the slide (report, figure 7).
 
     Args:
-        speeds: (B,), m per frame; 0 for a static touch.
+        speeds: (B,), m/s; 0 for a static touch.
         wrong: row -> (B,), bool.
         label: which label.
-        bins: ascending edges, m per frame; static touches stand at 0 on their own.
+        bins: ascending edges, m/s; static touches stand at 0 on their own.
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
@@ -130,7 +130,7 @@ def misclassified(
         axis.errorbar(
             middles * 1e3, shares, spread, marker=mark, markersize=4, capsize=2, color=colour, label=row
         )
-    axis.set(xlabel="speed, mm per frame (0: static)", ylabel=f"share with “{label}” wrong")
+    axis.set(xlabel="speed, mm/s (0: static)", ylabel=f"share with “{label}” wrong")
     axis.set_ylim(bottom=0)
     figure.legend(loc="outside right upper", fontsize=8)
     return figure

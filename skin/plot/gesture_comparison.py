@@ -107,7 +107,7 @@ def read_gestures(device: AbstractSimulated, path: str, seed: int) -> Gestures:
         InputError: no session, no labels in it, another layout, window or rate, or another emulator's.
     """
     stored = read_session(Path(path).expanduser())
-    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
+    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
     check_session(Path(path), stored.about, now)
     takes = [entry for _, entry in sorted(stored.gestures.items()) if entry[0].labels is not None]
     if not takes:
@@ -136,7 +136,7 @@ def read_gestures(device: AbstractSimulated, path: str, seed: int) -> Gestures:
         )
     ]
     seen = [pair for pair in pairs if pair.valid.any(axis=0).any() and pair.simulated.any()]
-    return Gestures(seen, same, device.sensors.positions, device.rate)
+    return Gestures(seen, same, device.sensors.positions, device.model_rate)
 
 
 def _are(drawn: Sequence[Gesture], numbers: Sequence[int], labels: Sequence[Mapping[str, int]]) -> None:

@@ -48,7 +48,7 @@ def simulated(
     name = device.sampler.shapes.names[int(movie.parameters["shape"][0])]
     positions = np.broadcast_to(device.sensors.positions, (len(pressure), *device.sensors.positions.shape))
     return Scene(
-        readings[0].numpy(), positions, device.size, device.rate, _title(name, wanted[0], TOUCH.names),
+        readings[0].numpy(), positions, device.size, device.model_rate, _title(name, wanted[0], TOUCH.names),
         pressure.numpy(), moved, _round(device.body),
     )  # fmt: skip
 

@@ -69,21 +69,26 @@ def resample(
     return Resampled(np.where(found, highest, 0.0), found, limited)
 
 
-def check_rate(found: float, rate: float) -> None:
+def check_rate(found: float, rate: float, setting: str | None = None) -> None:
     """Check that a device is fast enough for a model.
 
     Args:
         found: rate of the device, Hz.
         rate: of the model, Hz.
+        setting: name of the setting with the rate of a simulated device; None: the device is real.
 
     Raises:
         InputError: the device is slower by more than 5 %.
     """
-    if _SLOWER * found < rate:
-        raise InputError(
-            f"the device sends {found:.3g} frames a second, the model needs {rate:g}: let the firmware send "
-            f"faster, or train a model at the device's rate, as in device.rate={found:.2g}"
-        )
+    if _SLOWER * found >= rate:
+        return
+    slow = f"the device sends {found:.3g} frames a second, the model needs {rate:g}: "
+    if setting is not None:
+        raise InputError(f"{slow}raise {setting}, or lower touch.rate, as in {setting}={rate:g}")
+    raise InputError(
+        f"{slow}let the firmware send faster, or train a model at the device's rate, as in "
+        f"touch.rate={found:.2g}"
+    )
 
 
 class Window:

@@ -42,7 +42,7 @@ def sample_paths(
         proportional: whether pressure is proportional to force.
     """
     duration, onset, sliding = gestures["duration"], gestures["onset"], gestures["speed"] > 0
-    time = np.arange(settings.window) - onset[:, None]
+    time = np.arange(settings.frames.window) - onset[:, None]
     rise = duration[:, None] // settings.ramp + 1
     level = np.clip(np.minimum(time + 1, duration[:, None] - time), 0, rise)
     scale = level / rise

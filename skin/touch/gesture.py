@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from skin.errors import InputError
 from skin.labels import Thresholds
-from skin.settings import RISING, checked, configured
+from skin.settings import RISING, check_settings, checked, configured
 from skin.touch._bodies import Fit, draw_bodies
+from skin.touch._frames import GestureFrames
 from skin.touch.shapes import Shapes
 
 Draws = dict[str, np.ndarray]
@@ -20,8 +22,6 @@ Draws = dict[str, np.ndarray]
 
 _From0 = Annotated[tuple[NonNegativeFloat, PositiveFloat], RISING]
 _Above0 = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
-_Tap = Annotated[tuple[PositiveInt, Annotated[int, Ge(2)]], RISING]  # one that slides lasts 2 frames
-_Frames = Annotated[tuple[PositiveInt, PositiveInt], RISING]
 
 
 @checked("touch")
@@ -29,7 +29,8 @@ _Frames = Annotated[tuple[PositiveInt, PositiveInt], RISING]
 class GestureSettings:
     """Ranges of the gestures; ``conf/touch.yaml`` holds the same defaults and their units.
 
-    Ranges are (least, most), drawn uniformly, both ends included.
+    Ranges are (least, most), drawn uniformly, both ends included. Durations are in s and speeds in m/s.
+    Gestures are drawn in frames of the model: a duration has ``round(seconds * rate)`` frames.
 
     Attributes:
         over_sensors: a touch is dangerous if the mean pressure over the footprint of a sensor exceeds the
@@ -40,7 +41,8 @@ class GestureSettings:
         InputError: a range that is empty, out of order, or on the wrong side of its threshold.
     """
 
-    window: PositiveInt = 30
+    rate: PositiveFloat = 10.0
+    window: PositiveFloat = 3.0
     shapes: Annotated[tuple[str, ...], MinLen(1)] = (
         "disc",
         "blurred_disc",
@@ -52,11 +54,11 @@ class GestureSettings:
     )
     small_area: _From0 = (0.01, 0.30)
     big_area: _From0 = (0.30, 0.70)
-    tap: _Tap = (1, 3)
-    press: _Frames = (4, 20)
+    tap: _Above0 = (0.1, 0.3)
+    press: _Above0 = (0.4, 2.0)
     safe_peak: _Above0 = (10e3, 90.5e3)
     dangerous_peak: _Above0 = (90.5e3, 180e3)
-    speed: _From0 = (0.003, 0.020)
+    speed: _From0 = (0.03, 0.20)
     path: NonNegativeFloat = 0.010
     spare: NonNegativeFloat = 0.010
     ramp: Annotated[int, Ge(2)] = 3
@@ -66,8 +68,8 @@ class GestureSettings:
     leak: Annotated[float, Ge(0.5), Le(1)] = 0.6
     strict: bool = False
     over_sensors: bool = True
-    gap: _Frames = (10, 60)
-    stride: _Frames = (15, 45)
+    gap: _Above0 = (1.0, 6.0)
+    stride: _Above0 = (1.5, 4.5)
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     @classmethod
@@ -82,28 +84,51 @@ class GestureSettings:
         values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         return configured(cls, values | {"thresholds": limits}, "touch")
 
+    @cached_property
+    def frames(self) -> GestureFrames:
+        """The durations in frames of the model, and the speeds per frame."""
+        return GestureFrames.of(self)
+
     def __post_init__(self) -> None:
         lines = self.thresholds
         # (name, lowest allowed, highest allowed): a range beyond its threshold would be redrawn forever.
         for name, low, high in (
             ("small_area", 0, lines.area),
             ("big_area", lines.area, 1),
-            ("tap", 1, min(lines.frames, self.window)),
-            ("press", lines.frames + 1, self.window),
             ("safe_peak", 0, lines.pressure),
             ("dangerous_peak", lines.pressure, np.inf),
         ):
             given = getattr(self, name)
             if given[0] < low or given[1] > high:
                 raise InputError(
-                    f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: touch.thresholds and "
-                    "touch.window decide"
+                    f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: "
+                    "touch.thresholds decides"
                 )
-        if self.path > self.speed[1]:
-            raise InputError(
-                f"touch.path={self.path} m is longer than the fastest touch moves in a frame "
-                f"({self.speed[1]} m): a tap of 2 frames could not slide so far; raise touch.speed"
-            )
+        self.frames.check(self)
+
+
+def model_window(touch: Mapping[str, Any] | GestureSettings | None) -> tuple[int, float]:
+    """Return the frames of the model's window, and its rate, Hz.
+
+    Only these settings are checked: a real skin draws no gestures.
+
+    Args:
+        touch: as :meth:`GestureSettings.of` takes it.
+
+    Raises:
+        InputError: a window or a rate that cannot be used.
+    """
+    if isinstance(touch, GestureSettings):
+        return touch.frames.window, float(touch.rate)
+    given = {name: value for name, value in (touch or {}).items() if name in ("window", "rate")}
+    check_settings(GestureSettings, given, "touch")
+    window, rate = (float(given.get(name, getattr(GestureSettings, name))) for name in ("window", "rate"))
+    if not round(window * rate):
+        raise InputError(
+            f"touch.window={window:g} s is no frame at touch.rate={rate:g} Hz: raise it to "
+            f"{1 / rate:g} or more"
+        )
+    return round(window * rate), rate
 
 
 def draw_gestures(
@@ -133,11 +158,12 @@ def draw_gestures(
     """
     dynamic, press = labels[:, 1], labels[:, 2]
     drawn = draw_bodies(labels[:, 0], settings, shapes, generator, fit, kept)
-    least, most = np.where(press[:, None], settings.press, settings.tap).T
-    least = np.where(dynamic, np.maximum(least, 2), least)
+    frames = settings.frames
+    least, most = np.where(press[:, None], frames.press, frames.tap).T
+    least = np.where(dynamic, np.maximum(least, frames.slide), least)
     chance = generator.random((len(labels), 2))
     duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
-    free = settings.window - duration if padded else np.zeros_like(duration)
+    free = frames.window - duration if padded else np.zeros_like(duration)
     return drawn | {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
 
 
@@ -165,8 +191,9 @@ def draw_paths(
     """
     dynamic, dangerous = labels[:, 1], labels[:, 3]
     span = size - (gestures["high"] - gestures["low"])
-    slowest = np.maximum(settings.speed[0], settings.path / np.maximum(gestures["duration"] - 1, 1))
-    speed = slowest + (settings.speed[1] - slowest) * chance[:, 3]
+    least_speed, most_speed = settings.frames.speed
+    slowest = np.maximum(least_speed, settings.path / np.maximum(gestures["duration"] - 1, 1))
+    speed = slowest + (most_speed - slowest) * chance[:, 3]
     least, most = np.where(dangerous[:, None], settings.dangerous_peak, settings.safe_peak).T
     return {
         "start": chance[:, :2] * span,

@@ -197,7 +197,7 @@ class TouchSampler:
         known |= {name: value.float() for name, value in measures._asdict().items()}
         pull = settings.shear * heading(paths.place, paths.first) if settings.shear else None
         shear = None if pull is None else torch.from_numpy(pull).float()
-        labels = measures.labels(settings.thresholds)
+        labels = measures.labels(settings.thresholds, settings.rate)
         return Movie(pressed.frames, shown, shares, labels, known, shear), pressed
 
     def _never(self, labels: np.ndarray) -> InputError:

@@ -104,8 +104,8 @@ def draw_timeline(
         gap: [least, most] idle frames between two touches, drawn uniformly, both ends included.
         generator: source of randomness.
     """
-    settings = sampler.settings
-    typical = (sum(settings.tap) + sum(settings.press)) / 4 + sum(gap) / 2
+    frames = sampler.settings.frames
+    typical = (sum(frames.tap) + sum(frames.press)) / 4 + sum(gap) / 2
     movies: list[Movie] = []
     begins: list[np.ndarray] = []
     filled = 0

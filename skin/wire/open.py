@@ -29,7 +29,7 @@ _STRIP = 600.0  # s of simulated touches in one piece
 class Streamed(Protocol):
     """A device that simulates streams of touches, such as :class:`skin.device.simulated.Simulated`."""
 
-    rate: float
+    model_rate: float
 
     def simulate_stream(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> Any:
         """Return a stream in one piece; ``whole.touches`` are its touches."""
@@ -104,7 +104,7 @@ def open_skin(
     if opener is None and port == "simulated":
         if device is None:
             raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
-        connect = _player(PlaybackFeed(_strips(device), device.rate, chosen.realtime))
+        connect = _player(PlaybackFeed(_strips(device), device.model_rate, chosen.realtime))
     elif opener is None and port.endswith((".parquet", ".csv")):
         connect = _player(_recorded(port, sensors, chosen.realtime))
     else:
@@ -161,7 +161,7 @@ def _recorded(path: str, sensors: int | None, realtime: bool) -> PlaybackFeed:
 def _strips(device: "Streamed") -> Iterator[Piece]:
     for number in count():
         yield from _pieces(
-            device.simulate_stream(max(1, round(_STRIP * device.rate)), number=number).whole.touches
+            device.simulate_stream(max(1, round(_STRIP * device.model_rate)), number=number).whole.touches
         )
 
 

@@ -18,7 +18,7 @@ from skin.hardware.record.session_reader import read_session
 from skin.recording_file import read_recording
 from skin.wire.text import Header, encode_header, encode_line
 
-SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=5"]
+SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=0.5"]
 FREE = [*SKIN, "record.free=true", "device.tare=1", "device.backoff=[0.05,0.1]"]
 PACE = 0.001  # s of the wall for 10 ms of the device
 
@@ -135,10 +135,10 @@ def test_two_recordings_at_once_do_not_mix_and_kill_9_unlocks(record, begin, tmp
     ("change", "reason"),
     [
         (
-            "touch.window=7",
-            "windows of 5 frames at 10 Hz, the configuration has 7 at 10 Hz: give touch.window=5 ",
+            "touch.window=0.7",
+            "windows of 5 frames at 10 Hz, the configuration has 7 at 10 Hz: give touch.window=0.5 ",
         ),
-        ("device.rate=5", "5 frames at 10 Hz, the configuration has 5 at 5 Hz: give .* device.rate=10$"),
+        ("touch.rate=5", "5 frames at 10 Hz, the configuration has 2 at 5 Hz: give .* touch.rate=10$"),
     ],
 )
 def test_another_window_or_rate_is_refused_in_finishing_and_going_on(record, recorded, change, reason):

@@ -162,6 +162,10 @@ def test_the_summary_counts(plain):
         ({"test_gestures": 0}, r"device.test_gestures=0 must be greater than or equal to 1"),
         ({"position_error": -0.1}, r"position_error"),
         ({"rate": 0}, r"device.rate"),
+        (
+            {"rate": 9.0},
+            r"sends 9 frames a second, the model needs 10: raise device.rate, or lower",
+        ),
         ({"dead": 25}, r"device.dead"),
         ({"seed": -1}, r"from 0 up"),
         ({"touch": {"shapes": ["potato"]}}, r"no shape potato"),
@@ -170,6 +174,43 @@ def test_the_summary_counts(plain):
 def test_bad_settings_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         device(**changes)
+
+
+def test_the_rate_of_the_device_changes_no_gesture(plain):
+    faster = plain.replace(rate=100.0)
+    mine, theirs = plain.recording("test"), faster.recording("test")
+    assert (faster.window, faster.model_rate, theirs.touches.rate) == (30, 10.0, 10.0)
+    assert torch.equal(mine.touches.labels, theirs.touches.labels)
+    assert torch.equal(mine.force, theirs.force)
+    assert mine.touches.readings.shape == theirs.touches.readings.shape
+    assert not torch.equal(mine.touches.readings, theirs.touches.readings)
+
+
+@pytest.mark.parametrize("changes", [{}, {"stream": True}, {"randomise": True, "stream": True}])
+def test_a_perfect_device_has_the_frames_of_the_model_at_any_rate(changes):
+    found = [device(**PERFECT, rate=rate, **changes).recording("test") for rate in (10.0, 30.0)]
+    slow, fast = (one.touches.readings for one in found)
+    assert (fast >= slow).all(), "the middle of an interval is a frame of the model"
+    assert (fast[found[0].force == 0] == 0).all(), "no touch becomes longer"
+    if not changes:  # a window of a stream may begin or end between two frames
+        assert torch.equal(fast.amax((1, 2)), slow.amax((1, 2)))
+
+
+@pytest.mark.parametrize("tare", [False, True])
+def test_the_idle_readings_of_a_fast_device_are_known(tare):
+    """The maximum of ten readings lies above their mean, and a tare subtracts that."""
+    fast = device(rate=100.0, tare=tare, test_gestures=200)
+    found = fast.recording("test")
+    idle = found.touches.readings[found.force == 0]
+    assert idle.mean(0).numpy() == pytest.approx(fast.idle.numpy(), abs=5 * 0.05 / np.sqrt(len(idle)))
+    assert (fast.idle.abs() < 0.05).all() == tare
+
+
+def test_the_model_may_be_faster():
+    fast = device(touch={"rate": 50.0}, rate=50.0)
+    touches = fast.touches("test")
+    assert (touches.readings.shape[1], touches.rate) == (150, 50.0)
+    assert touches.labels.mean(0).tolist() == [0.5] * 4
 
 
 def test_friction_that_nothing_feels_is_refused_at_the_door():

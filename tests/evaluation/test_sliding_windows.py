@@ -12,7 +12,7 @@ from skin.evaluation.sliding_windows import bins, evaluate_windows
 from skin.evaluation.stream_settings import StreamSettings
 from skin.labels import TOUCH, TOUCH_OR_NOT
 
-COURSE = StreamSettings(hours=0.05, gap=[20, 100], stride=3, windows=(20, 60))
+COURSE = StreamSettings(hours=0.05, gap=[2.0, 10.0], stride=0.3, windows=(2.0, 6.0))
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
 ONLY_ALARMS = replace(COURSE, windows=())
 
@@ -113,13 +113,13 @@ def test_other_lengths_are_the_same_touches_begun_elsewhere(device, whole):
     assert torch.equal(long.labels, short.labels)
     # Unpadded touches begin at once, whatever the window.
     assert (short.readings - long.readings[:, :20]).abs().max() < 0.6
-    assert found.lengths[20] == 1.0
+    assert found.lengths[2.0] == 1.0
 
 
 def test_who_takes_no_such_length_says_so(whole):
     found = whole[1]
-    assert found.lengths[60] == "another window"
-    assert "window/60/overall/accuracy" not in found.metrics()
+    assert found.lengths[6.0] == "another window"
+    assert "window/6/overall/accuracy" not in found.metrics()
 
 
 def test_bins_by_hand():

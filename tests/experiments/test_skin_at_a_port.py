@@ -42,7 +42,7 @@ def test_ctrl_c_ends_the_emulator_well(emulated, tmp_path):
 @pytest.mark.slow
 def test_a_session_that_was_killed_goes_on_and_is_played_back(run, begin, emulated, tmp_path):
     path = tmp_path / "s.csv"
-    with emulated("emulate.speed=5", "touch.window=30") as (port, _, _):
+    with emulated("emulate.speed=5", "touch.window=3") as (port, _, _):
         settings = ["device.labels=announced", "device.scale=0.0390625", f"device.port={port}"]
         command = ["record.py", *SMALL, f"out={path}", *settings]
         with begin(tmp_path, *command) as killed:

@@ -20,11 +20,11 @@ def test_a_class_that_never_occurs_divides_by_nothing():
 
 
 def test_static_touches_stand_on_their_own_and_slides_in_their_bin():
-    speeds = np.array([0, 0, 0.003, 0.009, 0.011, 0.020])
+    speeds = np.array([0, 0, 0.03, 0.09, 0.11, 0.20])
     wrong = np.array([True, False, False, True, True, True])
-    figure = misclassified(speeds, {"row": wrong}, "big", np.array([0.003, 0.010, 0.020]))
+    figure = misclassified(speeds, {"row": wrong}, "big", np.array([0.03, 0.10, 0.20]))
     x, y = figure.axes[0].containers[0].lines[0].get_data()
-    assert x == pytest.approx([0, 6.5, 15])
+    assert x == pytest.approx([0, 65, 150])
     assert y == pytest.approx([0.5, 0.5, 1.0])
 
 

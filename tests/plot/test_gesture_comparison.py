@@ -34,11 +34,11 @@ def device():
 def session(device, path, labels):
     """Write what a skin of another gain says of the emulator's gestures, in counts above 500."""
     about = {"positions": device.sensors.positions.tolist(), "unit": "adc", "labels": labels}
-    log = SessionLog(path, about | {"window": device.window, "rate": device.rate}, 9)
+    log = SessionLog(path, about | {"window": device.window, "rate": device.model_rate}, 9)
     log.conversion(UnitConversion(np.full(9, 0.01), np.full(9, 500.0), np.zeros(9, dtype=bool)))
     number, now = 0, time.monotonic()
     for one, gesture in enumerate(islice(emulated_gestures(device), COUNT)):
-        rows = 500 + GAIN * upsample(gesture.force, device.rate, RATE) / 0.01
+        rows = 500 + GAIN * upsample(gesture.force, device.model_rate, RATE) / 0.01
         gesture = RecordedGesture(one, gesture.labels, number / RATE, 0)
         for place, row in enumerate(rows):
             t = number / RATE
@@ -97,8 +97,10 @@ def test_other_gestures_layouts_and_windows_are_refused(device, tmp_path):
         compared.read_gestures(device, path, 1)
     with pytest.raises(InputError, match="another layout"):
         compared.read_gestures(device.replace(layout=Grid(1, 9)), path, 0)
-    with pytest.raises(InputError, match=r"30 frames at 10 Hz, .* at 5 Hz: give .*device\.rate=10"):
-        compared.read_gestures(device.replace(rate=5.0), path, 0)
+    with pytest.raises(InputError, match=r"30 frames at 10 Hz, .* at 5 Hz: give .*touch\.rate=10"):
+        compared.read_gestures(
+            device.replace(touch={"rate": 5.0, "tap": [0.2, 0.4], "press": [0.6, 2.0]}), path, 0
+        )
 
 
 def test_gestures_without_labels_are_refused(device, tmp_path):

@@ -83,7 +83,7 @@ def test_a_slower_stream_is_refused_with_both_rates():
     window = Window(6, 10.0, SENSORS)
     for one in stream(5.0, 20):
         window.add(one)
-    with pytest.raises(InputError, match=r"sends 5 frames a second, the model needs 10: .*device.rate=5"):
+    with pytest.raises(InputError, match=r"sends 5 frames a second, the model needs 10: .*touch.rate=5"):
         window.read()
 
 

@@ -22,7 +22,7 @@ FOUND = WindowReport(
     threshold=0.31,
     alarms={"none": Alarms(0.5, 3, 8, 7, 9, 1), "threshold": Alarms(0.5, 0, 8, 6, 9, 0)},
     hours=0.6,
-    lengths={20: 0.8125, 60: "made for 30"},
+    lengths={2.0: 0.8125, 6.0: "made for 30"},
     streamed=False,
     point=OperatingPoint(0.5, 0.02, 64, 1, 0),
 )
@@ -31,7 +31,7 @@ FOUND = WindowReport(
 def test_the_line_says_what_matters():
     assert streams_summary(FOUND) == (
         "accuracy 50.0 % at share 0-0.2, 90.0 % whole; touch by threshold 90.0 %; false alarms per hour "
-        "6.0 (none), 0.0 (threshold) in 0.50 h without touch; window 20: 81.2, 60: cannot (made for 30)"
+        "6.0 (none), 0.0 (threshold) in 0.50 h without touch; window 2 s: 81.2, 6 s: cannot (made for 30)"
     )
 
 
@@ -52,7 +52,7 @@ def test_a_person_reads_the_same(files):
         "| threshold | 90 | 10 | 20 | 180 | 90.0 |",
         "| none | 3 | 6.0 (1.2 to 17.5) | 7 of 8 | 1 of 9 |",
         "| threshold | 0 | 0.0 (0.0 to 7.4) | 6 of 8 | 0 of 9 |",
-        "| 60 | cannot (made for 30) |",
+        "| 6 | cannot (made for 30) |",
     ):
         assert row in text
     assert text.startswith("# rules fem 0\n\naccuracy 50.0 %")
@@ -65,7 +65,7 @@ def test_a_program_reads_the_same(files):
     assert values["accuracy", "press", "whole"] == "0.9000"
     assert values["idle said touched", "threshold", ""] == "10"
     assert values["alarms false", "none", ""] == "3"
-    assert values["window", "overall", "60"] == "made for 30"
+    assert values["window, s", "overall", "6"] == "made for 30"
 
 
 def test_the_picture_is_whole(files):

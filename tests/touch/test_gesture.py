@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.labels import Thresholds
-from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading
+from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading, model_window
 from skin.touch.shapes import Shapes
 
 CONF = Path(__file__).parents[2] / "conf" / "touch.yaml"
@@ -29,16 +29,27 @@ def test_the_shipped_configuration_is_the_default_difficulty():
         ({"shapes": "disc"}, r"touch.shapes=disc must be a list"),
         ({"small_area": [0.2, 0.4]}, r"touch.small_area=\[0.2, 0.4\] must lie between 0 and 0.3"),
         ({"big_area": [0.2, 0.4]}, r"touch.big_area"),
-        ({"press": [3, 20]}, r"touch.press=\[3, 20\] must lie between 4 and 30"),
-        ({"press": [4, 31]}, r"touch.press"),
-        ({"tap": [1, 4]}, r"touch.tap"),
-        ({"tap": [1, 1]}, r"touch.tap=.* must be greater than or equal to 2: as in touch.tap=\[1,3\]"),
+        (
+            {"press": [0.3, 2.0]},
+            r"touch.press=\[0.3, 2.0\] s gives 3 to 20 frames at .*, valid are 4 to 30 \(0.4 to 3 s\)",
+        ),
+        ({"press": [0.4, 3.1]}, r"touch.press=.* gives 4 to 31 frames"),
+        ({"tap": [0.1, 0.4]}, r"touch.tap=.* gives 1 to 4 frames .* valid are 1 to 3 \(0.1 to 0.3 s\)"),
+        ({"tap": [0.04, 0.3]}, r"touch.tap=\[0.04, 0.3\] s gives 0 to 3 frames"),
+        (
+            {"tap": [0.1, 0.1]},
+            r"touch.tap=.* at most 1 frames .* lasts 2 \(0.2 s\): raise touch.tap",
+        ),
+        ({"tap": [0, 0.3]}, r"touch.tap=.* must be greater than 0: as in touch.tap=\[0.1,0.3\]"),
+        ({"window": 0.04}, r"touch.window=0.04 s gives 0 frames at touch.rate=10 Hz, valid are at least 1"),
+        ({"rate": 2.0}, r"touch.tap=\[0.1, 0.3\] s gives 0 to 1 frames at touch.rate=2 Hz"),
+        ({"rate": 0}, r"touch.rate=0 must be greater than 0: as in touch.rate=10.0"),
         ({"safe_peak": [0, 90e3]}, r"touch.safe_peak=.* must be greater than 0"),
         ({"safe_peak": [0, 0]}, r"touch.safe_peak"),
         ({"safe_peak": [float("nan"), 90e3]}, r"touch.safe_peak"),
         ({"dangerous_peak": [50e3, 180e3]}, r"touch.dangerous_peak"),
         ({"speed": [0.02, 0.003]}, r"touch.speed=.* must be a range"),
-        ({"path": 0.03}, r"touch.path=0.03 m is longer"),
+        ({"path": 0.05}, r"touch.path=0.05 m at the highest touch.speed lasts 4 \(0.4 s\): raise touch.tap"),
         ({"shear": -0.1}, r"touch.shear=-0.1 must be"),
         ({"shear": float("nan")}, r"touch.shear"),
         ({"redraws": 0}, r"touch.redraws=0 must be greater than 0: as in touch.redraws=30"),
@@ -52,8 +63,46 @@ def test_settings_that_no_gesture_can_meet_are_refused(given, message):
 
 
 def test_thresholds_move_the_ranges():
-    settings = {"thresholds": {"frames": 5}, "tap": [1, 5], "press": [6, 20]}
-    assert GestureSettings.of(settings).thresholds == Thresholds(frames=5)
+    settings = {"thresholds": {"duration": 0.5}, "tap": [0.1, 0.5], "press": [0.6, 2.0]}
+    assert GestureSettings.of(settings).thresholds == Thresholds(duration=0.5)
+
+
+def test_durations_are_whole_frames_of_the_model():
+    frames = GestureSettings().frames
+    assert frames == (30, (1, 3), (4, 20), (0.003, 0.020), (10, 60), (15, 45), 3, 2)
+    faster = GestureSettings(rate=25.0).frames
+    assert (faster.window, faster.tap, faster.press, faster.duration, faster.slide) == (
+        75,
+        (2, 8),
+        (10, 50),
+        8,
+        3,
+    )
+    assert faster.speed == pytest.approx((0.0012, 0.008))
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (None, (30, 10.0)),
+        ({"rate": 50, "press": [9, 1]}, (150, 50.0)),
+        (GestureSettings(window=2.0), (20, 10.0)),
+    ],
+)
+def test_the_window_of_a_model(given, expected):
+    assert model_window(given) == expected
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"window": 0.01}, r"touch.window=0.01 s is no frame at touch.rate=10 Hz: raise it to 0.1 or more"),
+        ({"rate": "fast"}, r"touch.rate=fast must be"),
+    ],
+)
+def test_a_window_that_no_model_has_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        model_window(given)
 
 
 def test_fold_is_a_ball_between_two_walls():

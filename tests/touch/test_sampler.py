@@ -124,7 +124,7 @@ def test_sliding_is_straight_and_as_fast_as_drawn():
     """On a large sheet, where nothing is reflected within a few frames of the middle."""
     body = Sheet([1.0, 1.0], [200, 200], LAYER)
     source = TouchSampler(
-        body, np.full((1, 40000), 1 / 40000), Prescribed(), {"tap": [1, 3], "shapes": ["fingertip"]}
+        body, np.full((1, 40000), 1 / 40000), Prescribed(), {"tap": [0.1, 0.3], "shapes": ["fingertip"]}
     )
     wanted = np.tile([False, True, False, False], (40, 1))
     movie = source.sample(40, np.random.default_rng(0), wanted)

@@ -186,17 +186,22 @@ def test_a_short_stream_may_be_all_gap():
 
 
 def test_regular_strides():
-    strides = device(touch={"stride": [7, 7], "gap": [5, 9]}, noise=0.0, offset=0.0).recording("test")
+    strides = device(touch={"stride": [0.7, 0.7], "gap": [0.5, 0.9]}, noise=0.0, offset=0.0).recording("test")
     force = strides.force
     assert torch.equal(force[:-1, 7:], force[1:, :-7])
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"gap": [0, 5]}, {"gap": [9, 5]}, {"stride": [0, 0]}, {"stride": [1.5, 2]}]
+    ("wrong", "message"),
+    [
+        ({"gap": [0, 0.5]}, r"touch.gap=.* must be greater than 0: as in touch.gap=\[1.0,6.0\]"),
+        ({"gap": [0.9, 0.5]}, r"touch.gap=.* must be a range \[least, most\]: as in touch.gap="),
+        ({"gap": [0.04, 0.5]}, r"touch.gap=\[0.04, 0.5\] s gives 0 to 5 frames .* at least 1 \(0.1 s\)"),
+        ({"stride": [0.01, 0.02]}, r"touch.stride=.* s gives 0 frames at touch.rate=10 Hz"),
+    ],
 )
-def test_ranges_are_whole_frames(wrong):
-    name = next(iter(wrong))
-    with pytest.raises(InputError, match=rf"touch.{name}=\[.*must be .*: as in touch.{name}=\["):
+def test_ranges_have_a_frame(wrong, message):
+    with pytest.raises(InputError, match=message):
         GestureSettings.of(wrong)
 
 

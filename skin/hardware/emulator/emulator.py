@@ -60,7 +60,7 @@ class Emulator:
     It waits for the first reader and then sends with or without one.
 
     Args:
-        device: the skin; its rate is that of the model.
+        device: the skin; its gestures have the rate of the model.
         port: the port it sends to.
         settings: rate, converter and format.
         faults: injected faults.
@@ -120,7 +120,7 @@ class Emulator:
         yield self._felt(np.zeros((round(settings.idle * settings.rate), sensors))), None
         gap = np.zeros((round(settings.gap * settings.rate), sensors))
         for number, gesture in enumerate(islice(emulated_gestures(self.device, settings.seed), count)):
-            true = upsample(gesture.force, self.device.rate, settings.rate)
+            true = upsample(gesture.force, self.device.model_rate, settings.rate)
             yield self._felt(np.concatenate([true, gap])), (number, gesture)
 
     def _felt(self, true: np.ndarray) -> np.ndarray:
@@ -200,7 +200,7 @@ class Emulator:
             seq = self._number - self._zero
             self._send(
                 encode_announcement(
-                    Announcement(number, seq, round(frames / self.device.rate), gesture.labels)
+                    Announcement(number, seq, round(frames / self.device.model_rate), gesture.labels)
                 )
             )
 

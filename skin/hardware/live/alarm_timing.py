@@ -98,7 +98,7 @@ def dangerous_touches(
             yield gesture.force
             continue
         strongest = gesture.force[gesture.force.sum(axis=1).argmax()]
-        load = profile(np.arange(0.0, 2000.0, 1 / device.rate))
+        load = profile(np.arange(0.0, 2000.0, 1 / device.model_rate))
         yield load[: np.flatnonzero(load)[-1] + 2, None] * strongest
 
 
@@ -115,7 +115,7 @@ def play_touch(
         seed: of the noise.
     """
     rest = [np.zeros((round(seconds * rate), force.shape[1])) for seconds in (_IDLE, _AFTER)]
-    true = np.concatenate([rest[0], upsample(force, device.rate, rate), rest[1]])
+    true = np.concatenate([rest[0], upsample(force, device.model_rate, rate), rest[1]])
     noise, time = generator(Stream.NOISE, seed, Stream.TEST, 6), np.arange(len(true)) / rate
     imperfection, constants = device.imperfection, device.constants
     measured = (

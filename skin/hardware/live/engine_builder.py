@@ -45,10 +45,9 @@ def make_engine(
 
 def _longest(of: Trained) -> float:
     """Return the longest touch that a run was trained on, s; two thirds of its window if unknown."""
-    frames = of.window * 2 / 3
     if of.device.simulation is not None:
-        frames = of.device.simulation.sampler.settings.press[1]
-    return frames / of.rate
+        return of.device.simulation.sampler.settings.press[1]
+    return of.window * 2 / 3 / of.rate
 
 
 def _tuned(device: AbstractDevice, learned: bool) -> float:

@@ -90,7 +90,7 @@ def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
         "positions": device.sensors.positions.tolist(),
         "footprint": list(device.sensors.footprint),
         "size": list(device.size),
-        "rate": device.rate,
+        "rate": device.model_rate,
         "window": device.window,
         "labels": device.labels,
         "calibration": device.calibration,
@@ -104,7 +104,7 @@ def convert_session(device: AbstractWired, path: Path) -> tuple[Path, int]:
         InputError: no session, no complete gesture, or another layout, window, rate or labels.
     """
     stored = read_session(path)
-    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.rate}
+    now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
     check_session(path, stored.about, now)
     gestures = _same_labels(device.task.names, path, stored)
     whole = concatenate([device.to_recording([gesture], conversion) for gesture, conversion in gestures])

@@ -145,5 +145,5 @@ def check_session(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) 
         window, rate = about["window"], about["rate"]
         raise InputError(
             f"{path} has windows of {window} frames at {rate:g} Hz, the configuration has {now['window']} at "
-            f"{now['rate']:g} Hz: give touch.window={window} device.rate={rate:g}"
+            f"{now['rate']:g} Hz: give touch.window={window / rate:g} touch.rate={rate:g}"
         )

@@ -30,7 +30,7 @@ def trained(request, configured):
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device)
     learner.fit(data)
-    of = Trained(device, learner, device.window, data.touches("train").positions, device.rate)
+    of = Trained(device, learner, device.window, data.touches("train").positions, device.model_rate)
     return of, device.replace(stream=False)
 
 

@@ -170,11 +170,11 @@ def test_half_a_header_is_begun_anew(tmp_path, beginning):
     [
         (
             {"window": 20},
-            "windows of 30 frames at 10 Hz, the configuration has 20 at 10 Hz: give touch.window=30",
+            "of 30 frames at 10 Hz, the configuration has 20 at 10 Hz: give touch.window=3 touch.rate=10",
         ),
         (
             {"rate": 12.5},
-            r"at 10 Hz, the configuration has 30 at 12\.5 Hz: give touch\.window=30 device\.rate=10",
+            r"at 10 Hz, the configuration has 30 at 12\.5 Hz: give touch\.window=3 touch\.rate=10",
         ),
         ({"unit": "N"}, "recorded in adc, the device sends N: give another out="),
         ({"id": "arm-R"}, "recorded from the device arm-L, this is arm-R: give another out="),

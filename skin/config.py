@@ -59,6 +59,7 @@ class Tracking:
     experiment: str
     resume: bool
     threads: int | None
+    recorded: bool = True  # older runs have none
 
 
 @dataclass
@@ -112,6 +113,7 @@ class Config:
     validate: dict[str, Any] | None = None
     benchmark: dict[str, Any] | None = None
     peers: dict[str, Any] | None = None
+    results: dict[str, Any] | None = None
 
 
 def validate_config(config: DictConfig) -> DictConfig:

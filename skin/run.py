@@ -70,6 +70,7 @@ def train(config: DictConfig) -> bool:
         _join(config)
         return True
     store, identity = Store.open(config.tracking), tags(config)
+    identity["threads"] = str(torch.get_num_threads())
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
         note_reuse(finished[0])

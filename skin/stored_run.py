@@ -23,7 +23,7 @@ from skin.evaluation.operating_point import OperatingPoint, choose_operating_poi
 from skin.fingerprint import renamed
 from skin.learner.base import AbstractLearner
 from skin.safe_loading import load_yaml
-from skin.tracking import Store
+from skin.tracking import RECORDED, Store
 from skin.trust import check_targets
 
 TAG = "operating_point"
@@ -56,14 +56,20 @@ _FIXED = (
 
 
 def find_run(store: Store, name: str) -> Run:
-    """Return the finished training run whose id begins with ``name``; ``latest`` is the last finished one.
+    """Return the finished training run whose id or fingerprint begins with ``name``.
+
+    ``latest`` is the last finished one that has weights. Of runs with equal fingerprints the last one counts.
 
     Raises:
         InputError: no run or more than one matches.
     """
     runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
-    named = [run for run in runs if run.info.run_id.startswith(name)]
-    found = runs[:1] if name == "latest" else named
+    if name == "latest":
+        found = [run for run in runs if RECORDED not in run.data.tags][:1]
+    else:
+        prints = {run.data.tags.get("fingerprint", ""): run for run in reversed(runs)}
+        found = [run for run in runs if run.info.run_id.startswith(name)]
+        found = found or [run for value, run in prints.items() if value.startswith(name)]
     if not found:
         raise InputError(f"no finished training run {name} in {store.uri}: skin train makes one")
     if len(found) > 1:
@@ -136,8 +142,14 @@ def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchDa
     """Load the weights of a run into a learner.
 
     Raises:
-        InputError: the weights do not fit the touches, such as another window with early fusion.
+        InputError: the weights do not fit the touches, such as another window with early fusion, or the run
+            has none because it was imported.
     """
+    if source := run.data.tags.get(RECORDED):
+        raise InputError(
+            f"run {run.info.run_id} ({run.info.run_name}) was imported from {source} without its weights: "
+            "tracking.recorded=false trains it again"
+        )
     name = run.data.tags["learned"]
     if Path(name).name != name:
         raise InputError(

@@ -24,6 +24,7 @@ from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Run, ViewType
 from mlflow.exceptions import MlflowException
+from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -32,7 +33,11 @@ from skin.errors import InputError
 from skin.files import whole
 from skin.source import source_tags
 
-_PROCESS = "process"
+PROCESS = "process"
+"""Tag of the process that makes a run."""
+RECORDED = "recorded"
+"""Tag of a run that was imported: the name of the file. Such a run has results but no weights."""
+
 _SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
 
 
@@ -44,11 +49,13 @@ class Store:
         client: of the tracking store.
         uri: of the tracking store.
         experiment: id of the experiment.
+        recorded: whether ``find`` returns imported runs (:data:`RECORDED`).
     """
 
     client: MlflowClient
     uri: str
     experiment: str
+    recorded: bool = True
 
     @classmethod
     def open(cls, settings: Tracking) -> "Store":
@@ -74,7 +81,7 @@ class Store:
                 f"cannot use the runs in {uri}: {reason}: give another place, as in "
                 "tracking.uri=sqlite:////FOLDER/runs.db"
             ) from error
-        store = cls(client, uri, identity)
+        store = cls(client, uri, identity, settings.recorded)
         store._close_abandoned()
         return store
 
@@ -82,20 +89,24 @@ class Store:
         """Return the runs that have the tags, newest first; ``status`` as MLflow calls it (``FINISHED``)."""
         terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
         terms += [f"attributes.status = '{status}'"] if status else []
-        return list(
-            self.client.search_runs(
-                [self.experiment],
-                " and ".join(terms),
-                ViewType.ACTIVE_ONLY,
-                max_results=5000,
-                order_by=["attributes.start_time DESC"],
-            )
+        found = self.client.search_runs(
+            [self.experiment],
+            " and ".join(terms),
+            ViewType.ACTIVE_ONLY,
+            max_results=SEARCH_MAX_RESULTS_THRESHOLD,
+            order_by=["attributes.start_time DESC"],
         )
+        return [run for run in found if self.recorded or RECORDED not in run.data.tags]
 
-    def create(self, name: str, tags: dict[str, str]) -> Run:
-        """Return a new run, tagged with this process; the caller must end it."""
-        tags = tags | {_PROCESS: _me()}
-        return self.client.create_run(self.experiment, run_name=name, tags=tags)
+    def create(self, name: str, tags: dict[str, str], start: int | None = None) -> Run:
+        """Return a new run, tagged with this process; the caller must end it.
+
+        Args:
+            name: of the run.
+            tags: of the run.
+            start: when it began, ms since 1970; None: now.
+        """
+        return self.client.create_run(self.experiment, start, tags | {PROCESS: _me()}, name)
 
     def _close_abandoned(self) -> None:
         """Set the status of runs whose process no longer exists to KILLED.
@@ -103,7 +114,7 @@ class Store:
         Only processes of this machine can be checked. Runs without the tag are left unchanged.
         """
         for run in self.find("RUNNING"):
-            if _gone(run.data.tags.get(_PROCESS, "")):
+            if _gone(run.data.tags.get(PROCESS, "")):
                 self.client.set_terminated(run.info.run_id, "KILLED")
 
     @contextmanager

@@ -3,8 +3,8 @@
     skin table
     skin table table.seeds=3 table.simulators=[solid]
 
-Lets the rows of the report decide together, too. Writes table.md, table.csv and the figures of the report
-into out=; rerun to resume.
+Lets the rows of the report decide together, too. Writes table.md, table.csv, table_seeds.csv and
+the figures of the report into out=; rerun to resume.
 """
 
 import sys
@@ -61,6 +61,7 @@ def write_results(words: Sequence[str], budget: str, folder: Path) -> int:
         report_values,
         result_rows,
         results_csv,
+        seeds_csv,
     )
     from experiments.studies.table_rows import Entries
     from experiments.studies.tables import markdown
@@ -82,6 +83,7 @@ def write_results(words: Sequence[str], budget: str, folder: Path) -> int:
     paths = [
         write(markdown(display_rows(lines), title), folder / "table.md"),
         write(results_csv(lines), folder / "table.csv"),
+        write(seeds_csv(cells), folder / "table_seeds.csv"),
     ]
     name = "fem" if "fem" in skins else simulators[-1]
     device = build_device(skins[name]).simulated("the figures of the report are of a simulated skin")

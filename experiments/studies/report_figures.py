@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from mlflow.entities import Run
 from torch import Tensor
 
 from experiments.studies.results_table import Cell
@@ -20,7 +21,7 @@ from skin.representation.image import Image
 from skin.representation.interp import Interpolation
 from skin.simulator.naive import Naive
 from skin.touch.sampler import Movie
-from skin.tracking import Store
+from skin.tracking import RECORDED, Store
 
 _SPEEDS = np.linspace(0.03, 0.20, 7)  # m/s
 
@@ -33,14 +34,21 @@ def draw_runs(cells: Sequence[Cell], store: Store, folder: Path, rate: float) ->
         store: that holds them.
         folder: of the figures.
         rate: of the model, Hz; predictions are stored with speeds in m per frame.
+
+    Imported runs have no predictions; with one of them among the rows, the figures are not drawn.
     """
     paths = []
     for simulator in dict.fromkeys(cell.simulator for cell in cells):
-        tables = {
-            cell.row: _predictions(store, cell) for cell in cells if cell.simulator == simulator and cell.runs
-        }
-        if not tables:
+        first = {cell.row: cell.runs[0] for cell in cells if cell.simulator == simulator and cell.runs}
+        imported = [row for row, run in first.items() if RECORDED in run.data.tags]
+        if imported:
+            print(
+                f"figures 7 and 8 of {simulator} are not drawn: {', '.join(imported)} were imported "
+                "without predictions: tracking.recorded=false trains them again"
+            )
+        if imported or not first:
             continue
+        tables = {row: _predictions(store, run) for row, run in first.items()}
         matrices, wrong = {}, {}
         for row, table in tables.items():
             matrices[row] = confusion(_column(table, "p_dangerous"), _column(table, "dangerous"))[0].numpy()
@@ -144,9 +152,9 @@ def _pictures(readings: Tensor, positions: Tensor, size: tuple[float, float]) ->
     return {name: make(frame, valid).x[0, 0, 0] for name, make in makers.items()}
 
 
-def _predictions(store: Store, cell: Cell) -> pa.Table:
+def _predictions(store: Store, run: Run) -> pa.Table:
     with TemporaryDirectory() as folder:
-        path = store.client.download_artifacts(cell.runs[0].info.run_id, "predictions.parquet", folder)
+        path = store.client.download_artifacts(run.info.run_id, "predictions.parquet", folder)
         return pq.read_table(path, memory_map=False)
 
 

@@ -139,6 +139,20 @@ def results_csv(lines: Sequence[dict[str, str]]) -> str:
     return tables.csv_text([COLUMNS, *([line[name] for name in COLUMNS] for line in lines)])
 
 
+def seeds_csv(cells: Sequence[Cell]) -> str:
+    """Return one line per run as CSV: row, simulator, seed, fingerprint, and each number of the table."""
+    shown = [
+        _metric(column, label) for column in ("same", "device_shift", "unseen_layout") for label in LABELS
+    ]
+    lines = [
+        [cell.row, cell.simulator, run.data.tags["seed"], run.data.tags["fingerprint"]]
+        + [run.data.metrics.get(metric, "") for metric in shown]
+        for cell in cells
+        for run in cell.runs
+    ]
+    return tables.csv_text([["row", "simulator", "seed", "run", *shown], *lines])
+
+
 def _metric(column: str, label: str) -> str:
     return f"{column}/{ALARM.get(label, f'{label}/accuracy')}"
 

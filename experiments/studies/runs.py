@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -14,11 +14,11 @@ from mlflow.entities import Run
 from omegaconf import DictConfig
 
 from experiments.studies.row_ensembles import combine
-from experiments.studies.study import Study, Variant, as_overrides, passed_overrides, sweeps, variants
+from experiments.studies.study import SMOKE, Study, Variant, as_overrides, passed_overrides, sweeps, variants
 from skin.commands import train
-from skin.config import fingerprint, validate_config
+from skin.config import PARENT, fingerprint, validate_config
 from skin.errors import InputError
-from skin.run import simulator
+from skin.run import SWEPT, simulator
 from skin.source import note_reuse
 from skin.stored_run import find_run
 from skin.tracking import Store
@@ -47,7 +47,7 @@ def train_study(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]
         for _, line in sweeps(study, smoke):
             multirun(line)
     planned = _look(store, every)
-    return store, planned + _ensembles(study, store, planned)
+    return store, planned + _ensembles(study, store, planned, smoke)
 
 
 def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
@@ -92,12 +92,24 @@ def multirun(line: Sequence[str]) -> None:
     """Train the sweep of some overrides, as ``skin train -m`` does; failed runs are reported and skipped."""
     sources = HydraConfig.get().runtime.config_sources
     folder = [one.path for one in sources if one.provider == "command-line"]  # of --config-dir
+    run_command(train.main, ["-m", *(["--config-dir", *folder] if folder else []), *line])
+
+
+def run_command(main: Callable[[Sequence[str]], None], words: Sequence[str]) -> int:
+    """Run a command of Hydra inside of another one and return its exit code.
+
+    Raises:
+        SystemExit: a signal ended it.
+    """
     with _another_command():
         try:
-            train.main(["-m", *(["--config-dir", *folder] if folder else []), *line])
+            main(words)
         except SystemExit as stop:
-            if isinstance(stop.code, int) and stop.code > 128:  # a signal: train nothing more
+            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+            if code > 128:
                 raise
+            return code
+    return 0
 
 
 @contextmanager
@@ -109,6 +121,8 @@ def _another_command() -> Iterator[None]:
         yield
     finally:
         Singleton.set_state(state)
+        for name in (PARENT, SWEPT):  # of a sweep, which has ended
+            os.environ.pop(name, None)
         if shown is not None:
             os.environ["HYDRA_FULL_ERROR"] = shown
 
@@ -121,14 +135,15 @@ def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
     ]
 
 
-def _ensembles(study: Study, store: Store, members: Sequence[Planned]) -> list[Planned]:
+def _ensembles(study: Study, store: Store, members: Sequence[Planned], smoke: bool) -> list[Planned]:
     """Return the ensembles of the finished runs of each seed, in each way that the study names."""
     suffix = "" if study.rows is None else "_of_" + "_".join(study.rows)
     ways = {way: Variant(way, {"row": way}, {}) for way in study.ensembles}
     planned = []
     for seed in dict.fromkeys(one.seed for one in members) if ways else ():
         for way, variant in ways.items():
-            line = [*as_overrides(study.common), *passed_overrides(), f"seed={seed}", f"row={way}{suffix}"]
+            line = [*as_overrides(study.common), *(SMOKE if smoke else ()), *passed_overrides()]
+            line += [f"seed={seed}", f"row={way}{suffix}"]
             variant.configs[seed] = validate_config(compose("train", line))
         present = {
             one.variant.name: (one.variant.configs[seed], one.run)

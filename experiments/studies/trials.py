@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,7 +39,7 @@ class Trial:
         seed: of its training.
         condition: name; empty where the study has none.
         device: its number; empty: the run's own.
-        run: id of the run; empty where none finished.
+        run: its fingerprint; empty where none finished.
         metrics: name -> value.
         line: for a person; empty where there is only a table.
         files: of the measure.
@@ -74,7 +75,15 @@ def run_trials(
     own = planned.run.data.metrics if planned.variant.configs else {}
     if study.measure is None and not study.conditions:
         outcomes = _outcomes(store, planned.run)
-        yield Trial(planned.variant, planned.seed, "", "", planned.run.info.run_id, own, outcomes=outcomes)
+        yield Trial(
+            planned.variant,
+            planned.seed,
+            "",
+            "",
+            planned.run.data.tags["fingerprint"],
+            own,
+            outcomes=outcomes,
+        )
         return
     subject = _Run(store, planned.run, config)
     given, selected = passed_overrides(), f"simulator={planned.run.data.tags.get('simulator')}"
@@ -88,7 +97,7 @@ def run_trials(
             found = subject.measured(study, base, [*line, *changes])
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
-            at = planned.variant, planned.seed, condition, number, planned.run.info.run_id
+            at = planned.variant, planned.seed, condition, number, planned.run.data.tags["fingerprint"]
             yield Trial(*at, metrics, said, files, _outcomes(store, found))
 
 
@@ -133,19 +142,20 @@ class _Run:
         tags = {"evaluated": self.run.data.tags["fingerprint"], "study": key}
         known = self.store.find("FINISHED", **tags) if self.config.tracking.resume else []
         if not known:
-            known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags)]
+            known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags, bool(line))]
         note_reuse(known[0])
         return known[0]
 
-    def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str]) -> Run:
-        """Measure, and log it beside the run."""
+    def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str], changed: bool) -> Run:
+        """Measure, and log it beside the run; ``changed``: not on the run's own device."""
         subject = Subject(own, build_device(own), Finished(self.store, self.run, self.stored, self.trained))
         with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
             found = what(subject)
             self.store.log_metrics(logged, found.metrics)
             self.store.client.set_tag(logged.info.run_id, "outcome", found.page.about if found.page else "")
             if found.page is not None:
-                stem = f"{type(what).__name__.lower()}_{own.row}_{logged.info.run_id[:8]}"
+                run = re.sub(r"\W+", "_", self.run.info.run_name)
+                stem = f"{type(what).__name__.lower()}_{run}" + (f"_{tags['study'][:8]}" if changed else "")
                 publish_page(found.page, subject.title, Path(made) / stem)
             if found.outcomes is not None:
                 np.save(Path(made) / OUTCOMES, found.outcomes)

@@ -1,0 +1,193 @@
+"""Make every published result again, or what is missing of it.
+
+    skin results
+    skin results results.part=table
+    skin results results.action=check
+
+Writes into docs/results; rerun to resume. Results of finished runs are kept in docs/results/runs.parquet:
+results.action=import logs them in the database, results.action=export writes those that published files name.
+results.action=check trains three models again and compares them with this file.
+"""
+
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import join, split
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge, Gt
+from omegaconf import DictConfig
+
+from experiments.commands.peers import PYTHON
+from skin.command import command
+from skin.config import Tracking, overrides, plain
+from skin.errors import InputError
+from skin.settings import check_settings, configured
+
+_FRESH = {"uri": "sqlite:///results/fresh.db", "artifacts": "results/fresh"}  # of tracking
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of a part.
+
+    Attributes:
+        run: verb and overrides.
+        hours: its duration without finished runs.
+    """
+
+    run: str
+    hours: Annotated[float, Gt(0)]
+
+
+@dataclass(frozen=True)
+class Check:
+    """Trainings that the release check repeats: each of ``rows`` on a simulator with a seed."""
+
+    rows: Sequence[str]
+    simulator: str
+    seed: Annotated[int, Ge(0)]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The settings of ``conf/results.yaml``.
+
+    Raises:
+        InputError: a part that there is not.
+    """
+
+    action: Literal["publish", "import", "export", "check"]
+    part: str
+    budget: Literal["full", "smoke"]
+    file: str
+    fresh: bool
+    parts: Mapping[str, Sequence[Mapping[str, Any]]]
+    smoke: Mapping[str, Sequence[str]]
+    check: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        check_settings(Check, dict(self.check), "results.check")
+        for name, steps in self.parts.items():
+            for number, step in enumerate(steps):
+                check_settings(Step, dict(step), f"results.parts.{name}[{number}]")
+        if self.part not in ("all", *self.parts):
+            raise InputError(f"results.part={self.part} is none of all, {', '.join(self.parts)}")
+
+    def steps(self) -> list[Step]:
+        """Return the commands of the chosen part, or of all."""
+        chosen = self.parts if self.part == "all" else [self.part]
+        return [Step(**step) for name in chosen for step in self.parts[name]]
+
+
+@command("results")
+def main(config: DictConfig) -> None:
+    """Publish, import, export or check; exit code 1 if a command failed or a value differs."""
+    settings = plain(config)["results"]
+    chosen = configured(Results, settings, "results")
+
+    from skin.console import quiet
+
+    quiet()
+    code = {"publish": _publish, "import": _import, "export": _export, "check": _check}[chosen.action](
+        chosen, config
+    )
+    sys.exit(code)
+
+
+def _publish(chosen: Results, config: DictConfig) -> int:
+    """Run the commands of a part; return 1 if one failed."""
+    from skin.progress import SweepProgress, format_duration
+
+    full, failed = chosen.budget == "full", []
+    if full and not chosen.fresh:
+        _import(chosen, config)
+    lines = list(_lines(chosen, config))
+    progress = SweepProgress([3600 * hours if full else None for hours, _ in lines])
+    for number, (hours, line) in enumerate(lines):
+        left = progress.left()
+        rest = "" if left is None else f", about {format_duration(left)} left"
+        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{rest}", flush=True)
+        began = time.monotonic()
+        if _fails(line):
+            failed.append(f"skin {join(line)}")
+        took = time.monotonic() - began
+        # A command whose runs have finished before does not tell the speed of this machine.
+        progress.finish(number, took, full and took < 0.05 * 3600 * hours)
+    if failed:
+        print("failed:", *failed, sep="\n", file=sys.stderr)
+    elif full:
+        _export(chosen, config)
+    return 1 if failed else 0
+
+
+def _fails(line: Sequence[str]) -> bool:
+    """Run a command and return whether it failed; a crash is reported, and must not stop the others."""
+    from experiments.studies.runs import run_command
+    from skin import cli
+
+    try:
+        return run_command(cli.main, line) != 0
+    except Exception:
+        traceback.print_exc()
+        return True
+
+
+def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[str]]]:
+    """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
+    smoke = chosen.budget == "smoke"
+    given = [one for one in overrides() if one.split("=")[0].split(".")[0] not in ("results", "out")]
+    for step in chosen.steps():
+        verb, *words = split(step.run)
+        if smoke and verb == "peers" and not PYTHON.is_file():
+            print(f"left out without {PYTHON}, which make peers builds: skin {step.run}", file=sys.stderr)
+            continue
+        if smoke and verb not in chosen.smoke:
+            raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")
+        words += chosen.smoke[verb] if smoke else ()
+        words += [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
+        words += [f"out={_folder(chosen, config)}"] if verb in ("table", "study") else []
+        yield step.hours, [verb, *words, *given]
+
+
+def _folder(chosen: Results, config: DictConfig) -> Path:
+    """Return the folder of the published files; smoke budgets are published in a folder in it."""
+    from skin.files import results
+
+    return results(config.out or ("docs/results" if chosen.budget == "full" else "results"))
+
+
+def _tracking(chosen: Results, config: DictConfig) -> Tracking:
+    """Return the settings of the database that the commands use."""
+    given = plain(config)["tracking"]
+    own = {name: value for name, value in _FRESH.items() if chosen.fresh and given[name] is None}
+    return Tracking(**given | own)
+
+
+def _import(chosen: Results, config: DictConfig) -> int:
+    """Log the recorded runs that the database lacks."""
+    from experiments.studies.recorded_runs import import_runs
+
+    count = import_runs(_tracking(chosen, config), Path(chosen.file))
+    print(f"imported {count} runs from {chosen.file}", flush=True)
+    return 0
+
+
+def _export(chosen: Results, config: DictConfig) -> int:
+    """Write the runs that published files name."""
+    from experiments.studies.recorded_runs import export_runs
+
+    count = export_runs(_tracking(chosen, config), Path(chosen.file), _folder(chosen, config))
+    print(f"wrote {count} runs to {chosen.file}")
+    return 0
+
+
+def _check(chosen: Results, config: DictConfig) -> int:
+    """Train again and compare; return 1 if a value differs."""
+    from experiments.studies.release_check import release_check
+
+    given = [one for one in overrides() if not one.startswith(("results.", "out=", "tracking."))]
+    return release_check(Path(chosen.file), **chosen.check, words=given)

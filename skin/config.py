@@ -111,7 +111,6 @@ class Config:
     table: dict[str, Any] | None = None
     validate: dict[str, Any] | None = None
     benchmark: dict[str, Any] | None = None
-    peers: dict[str, Any] | None = None
 
 
 def validate_config(config: DictConfig) -> DictConfig:

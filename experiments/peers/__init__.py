@@ -1,3 +1,8 @@
-"""Other libraries on the same touches; data go to their environment and back as files."""
+"""Models of other libraries, in an environment of their own, as learners."""
 
-PEERS = ("lightgbm", "minirocket", "multirocket_hydra", "ridge")
+from pathlib import Path
+
+CONF = Path(__file__).parent / "conf"
+"""Their options and rows, for ``--config-dir``."""
+
+ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

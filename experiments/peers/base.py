@@ -29,12 +29,12 @@ PYTHON = "SKIN_PEERS_PYTHON"
 
 # No setting of a run, because a stored run must not choose the program that reads it.
 _BUILT = ROOT / ".venv-peers" / "bin" / "python"
-_WORKER = Path(__file__).with_name("worker.py")
+_WORKER = "experiments.peers.worker"
 _PART = 8192  # touches
 
 
 class AbstractPeer(AbstractLearner):
-    """Fits and applies a model in a process of the other environment (``worker.py``), with files of arrays.
+    """Fits and applies a model in a process of the other environment (``worker/``), with files of arrays.
 
     The process starts when it is needed and ends with the learner.
 
@@ -125,7 +125,7 @@ class AbstractPeer(AbstractLearner):
         """Send a request to the process and return its answer."""
         if self._process is None:
             self._process = subprocess.Popen(
-                [_python(), "-P", str(_WORKER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                [_python(), "-m", _WORKER], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
             )
             weakref.finalize(self, _end, self._process)
         process = self._process

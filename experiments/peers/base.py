@@ -1,7 +1,6 @@
 """The interface of learners whose model runs in the environment of another library."""
 
 import json
-import os
 import subprocess
 import weakref
 from abc import abstractmethod
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from experiments.peers import python
 from skin.errors import InputError
 from skin.learner.base import AbstractLearner
 from skin.paths import ROOT
@@ -24,11 +24,6 @@ if TYPE_CHECKING:
 
     from skin.datamodule import TouchData
 
-PYTHON = "SKIN_PEERS_PYTHON"
-"""Environment variable with the Python of the libraries; by default, `make peers` builds it."""
-
-# No setting of a run, because a stored run must not choose the program that reads it.
-_BUILT = ROOT / ".venv-peers" / "bin" / "python"
 _WORKER = "experiments.peers.worker"
 _PART = 8192  # touches
 
@@ -146,7 +141,8 @@ class AbstractPeer(AbstractLearner):
 
 def _python() -> str:
     """Return the Python of the other environment."""
-    path = Path(os.environ.get(PYTHON, _BUILT))
+    # It is no setting, because a stored run must not choose a program.
+    path = python()
     if not path.is_file():
         raise InputError(f"there is no {path}: make peers builds it")
     return str(path)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from experiments.peers.base import PYTHON
+from experiments.peers import PYTHON
 
 
 @pytest.fixture

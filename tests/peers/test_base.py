@@ -7,7 +7,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
-from experiments.peers.base import PYTHON
+from experiments.peers import PYTHON
 from experiments.peers.rocket import Rocket
 from skin.datamodule import TouchData
 from skin.errors import InputError

@@ -7,19 +7,17 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from experiments import peers
-from experiments.peers.base import PYTHON
 from experiments.studies.table_rows import Entries
 from skin.build import build_learner
 from skin.config import Tracking, fingerprint, plain, validate_config
 from skin.datamodule import TouchData
-from skin.paths import CONF, ROOT
+from skin.paths import CONF
 from skin.tracking import Store
 from skin.trust import check_targets
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
-ENVIRONMENT = ROOT / ".venv-peers" / "bin" / "python"
 SMALL = [
     "data.gestures=160",
     "device.test_gestures=96",
@@ -52,7 +50,7 @@ def ran(run, tmp_path_factory):
     def command(verb, *words):
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("COLUMNS", "200")
-            patch.setenv(PYTHON, sys.executable)
+            patch.setenv(peers.PYTHON, sys.executable)
             return run(folder, verb, *words)
 
     train = ["--config-dir", str(peers.CONF), "experiment=ridge", "simulator=naive", *SMALL]
@@ -86,7 +84,7 @@ def test_a_study_evaluates_a_finished_peer_under_its_conditions(ran):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not ENVIRONMENT.is_file(), reason="no .venv-peers: make peers builds it")
+@pytest.mark.skipif(not peers.python().is_file(), reason="no .venv-peers: make peers builds it")
 @pytest.mark.parametrize("row", sorted({*peers.ROWS} - {"ridge"}))
 def test_peers_learn_in_their_own_environment(configured, made_up_device, row, tmp_path):
     data = TouchData(made_up_device, instantiate(configured().representation), 32)

@@ -61,7 +61,8 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 	touch $@
 
 peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs on the same touches (SEEDS=3)
-	$(BIN)/skin peers -m row=lightgbm,minirocket,multirocket_hydra 'seed=range($(SEEDS))'
+	$(BIN)/skin train --config-dir experiments/peers/conf -m 'seed=range($(SEEDS))' \
+		experiment=lightgbm,minirocket,multirocket_hydra
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	@echo "runs: http://127.0.0.1:5000/#/experiments"

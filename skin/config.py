@@ -112,7 +112,6 @@ class Config:
     table: dict[str, Any] | None = None
     validate: dict[str, Any] | None = None
     benchmark: dict[str, Any] | None = None
-    peers: dict[str, Any] | None = None
     results: dict[str, Any] | None = None
 
 

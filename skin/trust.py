@@ -32,14 +32,17 @@ _LIBRARIES = {
 }
 _BASES = {"skin": tuple((f"skin.{group}.base", f"Abstract{group.capitalize()}") for group in GROUPS)}
 _BASES |= _LIBRARIES
+# Models of other libraries: their learners run one program, which no setting can change.
+_BASES["experiments.peers"] = (("skin.learner.base", "AbstractLearner"),)
 
 
 def check_targets(config: Any, where: str) -> None:
     """Check that a stored configuration builds only classes of this package and of its libraries.
 
-    Allowed are subclasses of a group's base class that ``skin`` defines, optimizers of ``torch.optim``, and
-    aggregations, convolutions and networks (``BasicGNN``) of ``torch_geometric.nn``. Names are resolved, so
-    that ``skin.config.sys.exit`` is not taken for a part of ``skin``.
+    Allowed are subclasses of a group's base class that ``skin`` defines, learners of ``experiments.peers``,
+    optimizers of ``torch.optim``, and aggregations, convolutions and networks (``BasicGNN``) of
+    ``torch_geometric.nn``. Names are resolved, so that ``skin.config.sys.exit`` is not taken for a part of
+    ``skin``.
 
     Args:
         config: plain containers.

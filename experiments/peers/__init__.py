@@ -1,3 +1,17 @@
-"""Other libraries on the same touches; data go to their environment and back as files."""
+"""Models of other libraries, in an environment of their own, as learners."""
 
-PEERS = ("lightgbm", "minirocket", "multirocket_hydra", "ridge")
+import os
+from pathlib import Path
+
+PYTHON = "SKIN_PEERS_PYTHON"
+"""Environment variable with the Python of this environment; without it, the one that `make peers` builds."""
+
+CONF = Path(__file__).parent / "conf"
+"""Their options and rows, for ``--config-dir``."""
+
+ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+
+
+def python() -> Path:
+    """Return the Python of this environment, which may not exist."""
+    return Path(os.environ.get(PYTHON, Path(__file__).parents[2] / ".venv-peers" / "bin" / "python"))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.peers import PEERS
+from experiments import peers
 from experiments.studies.row_ensembles import WAYS, combine
 from experiments.studies.runs import newest_finished
 from skin.config import validate_config
@@ -15,7 +15,8 @@ from skin.sweep import sweep_jobs
 from skin.tracking import Store
 
 # They stand in the table as soon as a run of theirs has finished.
-OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in (*WAYS, *PEERS)))
+OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in WAYS))
+_PEERS = (f"hydra.searchpath=['file://{peers.CONF}']",)
 MEMBERS = ("linked_graph", "temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
 
 
@@ -39,7 +40,8 @@ class Entries:
         # Every simulator and seed once, in order: the same touches whatever learns from them.
         touches = (tuple(word for word in job if not word.startswith("experiment=")) for job in trained)
         self._touches = list(dict.fromkeys(touches))
-        self.others = [_composed(*job, other) for job in self._touches for other in OTHERS]
+        others = [[other] for other in OTHERS] + [[*_PEERS, f"experiment={row}"] for row in peers.ROWS]
+        self.others = [_composed(*job, *other) for job in self._touches for other in others]
 
     def vote(self, store: Store) -> None:
         """Let the report's networks decide together, wherever two of them have finished."""

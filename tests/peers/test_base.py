@@ -1,0 +1,111 @@
+"""Peers fit and apply a model in another process."""
+
+import gc
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from experiments.peers import PYTHON
+from experiments.peers.rocket import Rocket
+from skin.datamodule import TouchData
+from skin.errors import InputError
+from skin.labels import TOUCH_SLIDING
+from skin.recording import Touches
+
+
+@pytest.fixture
+def data(configured, made_up_device):
+    return TouchData(made_up_device, instantiate(configured().representation), 32)
+
+
+@pytest.fixture
+def fitted(own_python, data):
+    learner = Rocket(transform="flat")
+    learner.fit(data)
+    return learner
+
+
+def test_a_stored_model_predicts_the_same(fitted, data, tmp_path):
+    touches = data.touches("test")
+    expected = fitted.probabilities(touches)
+    path = fitted.save(tmp_path)
+    with np.load(path, allow_pickle=False) as arrays:
+        assert {array.dtype.kind for array in arrays.values()} == {"f"}
+    other = Rocket(transform="flat")
+    other.load(data, path)
+    assert other.parameters == fitted.parameters
+    torch.testing.assert_close(other.probabilities(touches), expected)
+
+
+def test_it_learns(fitted, data):
+    touches = data.touches("test")
+    right = (fitted.probabilities(touches) > 0.5) == (touches.labels > 0.5)
+    assert right.float().mean() > 0.7
+    assert fitted.seconds_per_epoch > 0
+
+
+def test_touches_of_another_shape_are_refused(fitted, data):
+    touches = data.touches("test")
+    fewer = Touches(
+        touches.readings[..., 1:], touches.valid[..., 1:], touches.positions[1:], None, touches.rate
+    )
+    with pytest.raises(InputError, match="as many sensors and frames"):
+        fitted.probabilities(fewer)
+
+
+def test_a_model_of_other_labels_is_refused(fitted, data, tmp_path):
+    path = fitted.save(tmp_path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **arrays | {name: arrays[name][..., :3] for name in ("weights", "bias")})
+    with pytest.raises(ValueError, match="3 labels, not big, dynamic, press, dangerous"):
+        Rocket(transform="flat").load(data, path)
+
+
+def test_an_error_of_the_worker_is_passed_on(own_python, data, tmp_path):
+    path = tmp_path / "model.npz"
+    np.savez(path, weights=np.zeros((3, 4)))
+    with pytest.raises(RuntimeError, match=r"KeyError.*first"):
+        Rocket(transform="flat").load(data, path)
+
+
+def test_objects_are_not_read(own_python, data, tmp_path):
+    path = tmp_path / "model.npz"
+    np.savez(path, first=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match="holds objects"):
+        Rocket(transform="flat").load(data, path)
+
+
+def test_without_its_environment_it_says_what_builds_it(monkeypatch, data, tmp_path):
+    monkeypatch.setenv(PYTHON, str(tmp_path / "none"))
+    with pytest.raises(InputError, match="none: make peers builds it"):
+        Rocket().check(data)
+
+
+def test_labels_that_it_cannot_learn_are_refused(own_python, data, monkeypatch):
+    monkeypatch.setattr(data.device, "task", TOUCH_SLIDING)
+    with pytest.raises(InputError, match="leave out"):
+        Rocket().check(data)
+
+
+def test_the_process_ends_with_the_learner(own_python, data):
+    learner = Rocket(transform="flat")
+    learner.fit(data)
+    process = learner._process
+    del learner
+    gc.collect()
+    assert process.poll() is not None
+
+
+def test_a_worker_that_dies_is_reported(fitted, data):
+    fitted._process.kill()
+    fitted._process.wait()
+    with pytest.raises(InputError, match="ended with exit code -9"):
+        fitted.probabilities(data.touches("test"))
+
+
+def test_unfitted_it_predicts_nothing(data):
+    with pytest.raises(RuntimeError, match="fit or load"):
+        Rocket().probabilities(data.touches("test"))

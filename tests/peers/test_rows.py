@@ -1,0 +1,101 @@
+"""The rows of peers: finished runs that the table, studies and evaluations find."""
+
+import sys
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from experiments import peers
+from experiments.studies.table_rows import Entries
+from skin.build import build_learner
+from skin.config import Tracking, fingerprint, plain, validate_config
+from skin.datamodule import TouchData
+from skin.paths import CONF
+from skin.tracking import Store
+from skin.trust import check_targets
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+SMALL = [
+    "data.gestures=160",
+    "device.test_gestures=96",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
+    "evaluation.gestures=48",
+]
+
+
+def composed(row):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        search = f"hydra.searchpath=['file://{peers.CONF}']"
+        return validate_config(compose("train", [search, f"experiment={row}"]))
+
+
+@pytest.mark.parametrize("row", peers.ROWS)
+def test_every_row_is_built_and_may_be_loaded(row):
+    config = composed(row)
+    build_learner(config)
+    assert config.row == row
+    check_targets(plain(config), "a run")
+
+
+@pytest.fixture(scope="module")
+def ran(run, tmp_path_factory):
+    """Train the peer that needs no other environment, and evaluate it in a study."""
+    folder = tmp_path_factory.mktemp("peers")
+
+    def command(verb, *words):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("COLUMNS", "200")
+            patch.setenv(peers.PYTHON, sys.executable)
+            return run(folder, verb, *words)
+
+    train = ["--config-dir", str(peers.CONF), "experiment=ridge", "simulator=naive", *SMALL]
+    study = ["study=dead", "study.rows=[ridge]", "study.devices=1", "simulator=naive", f"out={folder}/out"]
+    return folder, command("train", *train), command("study", *study)
+
+
+@pytest.mark.slow
+def test_a_peer_is_a_run_that_the_table_finds(ran):
+    folder, first, _ = ran
+    assert first.returncode == 0, first.stderr
+    store = Store.open(Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None))
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        entries = Entries(["sweep=table", "seed=0", "simulator=naive", *SMALL])
+    (config,) = [config for config in entries.others if config.row == "ridge"]
+    (run,) = store.find("FINISHED", fingerprint=fingerprint(config))
+    for column in ("same", "holdout", "device_shift", "unseen_layout"):
+        assert f"{column}/overall/accuracy" in run.data.metrics
+    # Per label 25 sensors x 30 frames, an intercept, and two numbers of its logistic curve.
+    assert run.data.metrics["parameters"] == 4 * (25 * 30 + 1 + 2)
+    assert run.data.metrics["seconds_per_epoch"] > 0
+
+
+@pytest.mark.slow
+def test_a_study_evaluates_a_finished_peer_under_its_conditions(ran):
+    folder, _, study = ran
+    assert study.returncode == 0, study.stderr
+    lines = (folder / "out" / "study_dead.csv").read_text().splitlines()
+    assert len(lines) == 1 + 4
+    assert all(line.startswith("ridge naive") for line in lines[1:])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not peers.python().is_file(), reason="no .venv-peers: make peers builds it")
+@pytest.mark.parametrize("row", sorted({*peers.ROWS} - {"ridge"}))
+def test_peers_learn_in_their_own_environment(configured, made_up_device, row, tmp_path):
+    data = TouchData(made_up_device, instantiate(configured().representation), 32)
+    learner, touches = build_learner(composed(row)), data.touches("test")
+    learner.check(data)
+    learner.fit(data)
+    found = learner.probabilities(touches)
+    assert ((found >= 0) & (found <= 1)).all()
+    assert ((found > 0.5) == (touches.labels > 0.5)).float().mean() > 0.7
+    assert learner.parameters > 100
+    other = build_learner(composed(row))
+    other.load(data, learner.save(tmp_path))
+    # A feature counts values above a threshold, which rounding may cross.
+    assert (other.probabilities(touches) - found).abs().max() < 0.05

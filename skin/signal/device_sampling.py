@@ -73,13 +73,14 @@ def _reduced(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return readings and masks (B, F, S) at the first of two rates as (B, window, S) at the second, Hz."""
     batch, frames, sensors = readings.shape
-    columns = [one.transpose(0, 1).flatten(1).cpu().numpy() for one in (readings, valid, saturated)]
+    values, works, limits = (
+        one.transpose(0, 1).flatten(1).cpu().numpy() for one in (readings, valid, saturated)
+    )
     time = (np.arange(frames) + 0.5) / rates[0]
-    found = resample(time, *columns, end=window / rates[1], interval=1 / rates[1], window=window)
+    found = resample(time, values, works, limits, window / rates[1], 1 / rates[1], window)
     tensors = (torch.from_numpy(one).unflatten(1, (batch, sensors)).transpose(0, 1) for one in found[:3])
-    values, known, limited = (one.contiguous().to(readings.device) for one in tensors)
-    # Readings of dead sensors are 0 and invalid at either rate.
-    return values.to(readings.dtype), known, limited
+    highest, known, limited = (one.contiguous().to(readings.device) for one in tensors)
+    return highest.to(readings.dtype), known, limited
 
 
 def draw_constants(

@@ -1,12 +1,14 @@
 """One command makes every published file, and goes on where it was killed."""
 
+import re
 import sqlite3
 from contextlib import closing
 
 import pytest
+from omegaconf import OmegaConf
 
 from experiments.studies.recorded_runs import read_records
-from skin.paths import CONF
+from skin.paths import CONF, ROOT
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -118,3 +120,12 @@ def test_every_study_of_the_parts_exists():
     }
     assert named <= {path.stem for path in (CONF / "study").glob("*.yaml")}
     assert len(named) > 10
+
+
+def test_make_help_states_the_hours_of_each_part():
+    parts = OmegaConf.load(CONF / "results.yaml").results.parts
+    hours = {name: sum(step.hours for step in steps) for name, steps in parts.items()}
+    (text,) = (line for line in (ROOT / "Makefile").read_text().splitlines() if line.startswith("results:"))
+    stated = {name: float(value) for name, value in re.findall(r"(\w+) ([\d.]+) h", text)}
+    assert stated.pop("in") == pytest.approx(sum(hours.values()), rel=0.1)
+    assert stated == pytest.approx(hours, rel=0.1)

@@ -21,12 +21,13 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Gt
 from omegaconf import DictConfig
 
-from experiments.commands.peers import PYTHON
+from experiments import peers
 from skin.command import command
 from skin.config import Tracking, overrides, plain
 from skin.errors import InputError
 from skin.settings import check_settings, configured
 
+_PEERS = "experiments/peers/conf"
 _FRESH = {"uri": "sqlite:///results/fresh.db", "artifacts": "results/fresh"}  # of tracking
 
 
@@ -142,8 +143,11 @@ def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[st
     given = [one for one in overrides() if one.split("=")[0].split(".")[0] not in ("results", "out")]
     for step in chosen.steps():
         verb, *words = split(step.run)
-        if smoke and verb == "peers" and not PYTHON.is_file():
-            print(f"left out without {PYTHON}, which make peers builds: skin {step.run}", file=sys.stderr)
+        if smoke and _PEERS in words and not peers.python().is_file():
+            print(
+                f"left out without {peers.python()}, which make peers builds: skin {step.run}",
+                file=sys.stderr,
+            )
             continue
         if smoke and verb not in chosen.smoke:
             raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")

@@ -14,8 +14,6 @@ from skin.run import simulator
 from skin.sweep import sweep_jobs
 from skin.tracking import Store
 
-# They stand in the table as soon as a run of theirs has finished.
-OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in WAYS))
 _PEERS = (f"hydra.searchpath=['file://{peers.CONF}']",)
 MEMBERS = ("linked_graph", "temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
 
@@ -28,7 +26,7 @@ class Entries:
 
     Attributes:
         rows: one per row, simulator and seed of the sweep.
-        others: the same of the rows that other commands make.
+        others: the same of all other rows, which stand in the table once a run of theirs has finished.
     """
 
     def __init__(self, overrides: Sequence[str]) -> None:
@@ -40,7 +38,9 @@ class Entries:
         # Every simulator and seed once, in order: the same touches whatever learns from them.
         touches = (tuple(word for word in job if not word.startswith("experiment=")) for job in trained)
         self._touches = list(dict.fromkeys(touches))
-        others = [[other] for other in OTHERS] + [[*_PEERS, f"experiment={row}"] for row in peers.ROWS]
+        others = [[f"experiment={row}"] for row in _rows() if row not in {config.row for config in self.rows}]
+        others += [[f"row={row}"] for row in WAYS]
+        others += [[*_PEERS, f"experiment={row}"] for row in peers.ROWS]
         self.others = [_composed(*job, *other) for job in self._touches for other in others]
 
     def vote(self, store: Store) -> None:
@@ -55,6 +55,11 @@ class Entries:
     def named(self, configs: list[DictConfig]) -> list[tuple[str, str, DictConfig]]:
         """Return configurations with their row and simulator."""
         return [(config.row, simulator(config), config) for config in configs]
+
+
+def _rows() -> list[str]:
+    """Return the names of all rows."""
+    return sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 
 def _composed(*words: str) -> DictConfig:

@@ -14,10 +14,11 @@ from skin.plot.figures import COLOURS
 _MEASURES = {
     "big": "area",
     "dynamic": "travel",
-    "press": "frames in contact",
+    "press": "duration",
     "dangerous": "pressure",
     ALARM: "pressure",
 }
+_OVERALL = ("accuracy", "balanced_accuracy", "ece")
 _NEAR = (0.9, 1.1)  # times its threshold
 _FAINT = 1.0  # N
 
@@ -54,6 +55,13 @@ def _tables(found: MarginReport) -> dict[str, list[list[str]]]:
         ]
         for name, each in found.spans.items()
     }
+    tables["All touches"] = [
+        ["label", "accuracy, %", "balanced accuracy, %", "calibration error, %"],
+        *(
+            [name, *(f"{100 * found.metrics[f'{name}/{metric}']:.2f}" for metric in _OVERALL)]
+            for name in (*TOUCH.names, "overall")
+        ),
+    ]
     tables["Errors by the highest reading above idle"] = [
         ["N", "touches", *(f"{name} wrong, %" for name in TOUCH.names)],
         *(

@@ -158,7 +158,7 @@ class Margins:
         from skin.evaluation.margins import margins
 
         found = margins(subject.learner, subject.device, self.gestures, subject.point())
-        return Measurement({}, build_margins_page(found, subject.title))
+        return Measurement(found.metrics, build_margins_page(found, subject.title))
 
 
 class Streams(StreamSettings):

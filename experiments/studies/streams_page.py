@@ -1,6 +1,7 @@
 """Page and summary of an evaluation on streams."""
 
 from collections.abc import Sequence
+from statistics import fmean
 
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -22,13 +23,22 @@ def streams_summary(found: WindowReport) -> str:
     """Return a summary in one line."""
     parts = []
     if found.bins:
-        first, last = found.bins[0], found.bins[-1]
-        means = [100 * sum(one.accuracy.values()) / len(one.accuracy) for one in (first, last)]
-        parts.append(f"accuracy {means[0]:.1f} % at share {first.name}, {means[1]:.1f} % {last.name}")
+        ends = found.bins[0], found.bins[-1]
+        told = (
+            f"{100 * fmean(one.accuracy.values()):.1f} % at share {one.name} (always the commoner answer: "
+            f"{100 * fmean(one.majority.values()):.1f} %)"
+            for one in ends
+        )
+        parts.append(f"accuracy {', '.join(told)}")
     for gate, counts in found.gates.items():
         parts.append(f"touch by {gate} {100 * _right(counts):.1f} %")
     hourly = ", ".join(f"{alarms.per_hour:.1f} ({gate})" for gate, alarms in found.alarms.items())
-    parts.append(f"false alarms per hour {hourly} in {_idle(found.alarms):.2f} h without touch")
+    share = 100 * (1 - _idle(found.alarms) / found.hours)
+    parts.append(
+        f"false alarms per hour without touch {hourly}; {share:.0f} % of {found.hours:g} h show a touch"
+    )
+    raised = ", ".join(f"{one.raised} of {one.safe} ({gate})" for gate, one in found.alarms.items())
+    parts.append(f"safe touches that raised the alarm {raised}")
     windows = (f"{window:g} s: {_length(value)}" for window, value in found.lengths.items())
     return "; ".join([*parts, "window " + ", ".join(windows)])
 

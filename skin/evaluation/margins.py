@@ -10,6 +10,7 @@ from torch import Tensor
 
 from skin.device.base import AbstractDevice
 from skin.evaluation.alarm import Reached
+from skin.evaluation.metrics import metrics
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Predictor
 from skin.labels import TOUCH, Measures, Thresholds
@@ -78,12 +79,14 @@ class MarginReport:
         faint: by strength, ascending.
         point: operating point of ``ALARM``.
         reached: its alarms.
+        metrics: of all touches (:func:`skin.evaluation.metrics.metrics`).
     """
 
     spans: dict[str, list[Span]]
     faint: list[Faint]
     point: OperatingPoint
     reached: Reached
+    metrics: dict[str, float]
 
 
 def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: OperatingPoint) -> MarginReport:
@@ -116,7 +119,8 @@ def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: Op
     danger = TOUCH.names.index(LABEL)
     found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH))
+    known = metrics(chances, labels, TOUCH, point)
+    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH), known)
 
 
 def spans(said: Tensor, shares: Tensor) -> list[Span]:

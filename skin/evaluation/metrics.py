@@ -6,7 +6,6 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 from torchmetrics.functional.classification import (
-    binary_calibration_error,
     binary_confusion_matrix,
     binary_recall,
     binary_specificity,
@@ -55,7 +54,7 @@ def metrics(
         if _both(label):
             recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
             values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
-        values[f"{name}/ece"] = float(binary_calibration_error(chance, label, n_bins=15))
+        values[f"{name}/ece"] = calibration_error(chance, label)
     for metric in ("accuracy", "balanced_accuracy", "ece"):
         each = [values[f"{name}/{metric}"] for name in task.gated]
         values[f"overall/{metric}"] = sum(each) / len(each)
@@ -64,6 +63,26 @@ def metrics(
         values["direction/degrees"] = float(degrees.mean())
         values["direction/accuracy"] = float((degrees <= 45).float().mean())
     return values | alarm
+
+
+def calibration_error(chance: Tensor, label: Tensor, bins: int = 15) -> float:
+    """Return the expected calibration error in bins of equal numbers of touches; NaN without touches.
+
+    It is the mean distance between the mean probability of a bin and the share of true labels in it (Nguyen
+    and O'Connor, 2015).
+
+    Args:
+        chance: (B,), probabilities.
+        label: (B,), 0 or 1.
+        bins: their number.
+    """
+    if not len(chance):
+        return math.nan
+    edges = chance.double().quantile(torch.linspace(0, 1, bins + 1, dtype=torch.float64))[1:-1]
+    # Equal probabilities share a bin.
+    group = torch.bucketize(chance.double(), edges.unique())
+    gaps = torch.zeros(bins, dtype=torch.float64).index_add_(0, group, chance.double() - label)
+    return float(gaps.abs().sum()) / len(chance)
 
 
 def angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
-from skin.evaluation.metrics import angles, confusion, metrics
+from skin.evaluation.metrics import angles, calibration_error, confusion, metrics
 from skin.evaluation.operating_point import OperatingPoint
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
@@ -110,3 +110,21 @@ def test_no_recall_is_made_up_where_no_gesture_is_safe_or_none_is_dangerous(scor
     assert math.isnan(found["dangerous/balanced_accuracy"])
     assert 0 < found["dangerous/accuracy"] < 1
     assert 0 < found["overall/accuracy"] < 1
+
+
+def test_calibration_error_in_bins_of_equal_numbers_is_that_of_plain_python():
+    generator = torch.Generator().manual_seed(4)
+    chance = torch.rand(1500, generator=generator) ** 3
+    label = (torch.rand(1500, generator=generator) < 0.8 * chance).long()
+    pairs = sorted(zip(chance.tolist(), label.tolist(), strict=True))
+    gaps = []
+    for start in range(0, 1500, 100):
+        part = pairs[start : start + 100]
+        gaps.append(abs(sum(said for said, _ in part) - sum(true for _, true in part)))
+    assert calibration_error(chance, label) == pytest.approx(sum(gaps) / 1500, abs=1e-3)
+    assert calibration_error(chance, (chance > 0.5).long()) > 0.1
+
+
+def test_equal_probabilities_share_a_bin():
+    label = torch.tensor([1, 0] * 50)
+    assert calibration_error(torch.full((100,), 0.5), label) == pytest.approx(0, abs=1e-9)

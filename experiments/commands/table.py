@@ -87,7 +87,7 @@ def write_results(words: Sequence[str], budget: str, folder: Path) -> int:
     ]
     name = "fem" if "fem" in skins else simulators[-1]
     device = build_device(skins[name]).simulated("the figures of the report are of a simulated skin")
-    pictures = [*draw_runs(cells, store, folder, device.model_rate), *draw_skin(device, folder, name)]
+    pictures = [*draw_runs(cells, store, folder, skins), *draw_skin(device, folder, name)]
     print_results(lines, title)
     print(f"{', '.join(map(str, paths))} and {len(pictures)} figures beside them")
     return sum(cell.missing for cell in cells)

@@ -1,19 +1,22 @@
 """The figures of the report from finished runs and the simulated skin."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
-from mlflow.entities import Run
+from omegaconf import DictConfig
 from torch import Tensor
 
 from experiments.studies.results_table import Cell
+from experiments.studies.runs import load_outcomes
+from experiments.studies.tables import csv_text
+from skin.build import build_device
 from skin.device.base import AbstractSimulated
-from skin.evaluation.metrics import confusion
+from skin.evaluation.outcomes import decode
+from skin.files import write
+from skin.labels import TOUCH
 from skin.plot import figures
 from skin.plot.surface import deflection, surface
 from skin.representation.fourier import Fourier
@@ -21,44 +24,68 @@ from skin.representation.image import Image
 from skin.representation.interp import Interpolation
 from skin.simulator.naive import Naive
 from skin.touch.sampler import Movie
-from skin.tracking import RECORDED, Store
+from skin.tracking import Store
 
+_SHOWN = ("best_fresh", "features", "temporal_graph", "sequence_graph", "sequence_image")
 _SPEEDS = np.linspace(0.03, 0.20, 7)  # m/s
 
 
-def draw_runs(cells: Sequence[Cell], store: Store, folder: Path, rate: float) -> list[Path]:
-    """Draw figures 7 and 8 of each simulator from the test predictions of every row's first run.
+def draw_runs(
+    cells: Sequence[Cell], store: Store, folder: Path, skins: Mapping[str, DictConfig]
+) -> list[Path]:
+    """Draw figures 7 and 8 of each simulator from the outcomes of all runs of each row.
+
+    Figure 7 shows the rows of ``_SHOWN``; a CSV file beside it has the figures of all.
 
     Args:
         cells: the runs.
         store: that holds them.
         folder: of the figures.
-        rate: of the model, Hz; predictions are stored with speeds in m per frame.
-
-    Imported runs have no predictions; with one of them among the rows, the figures are not drawn.
+        skins: simulator -> a configuration with its test gestures.
     """
     paths = []
-    for simulator in dict.fromkeys(cell.simulator for cell in cells):
-        first = {cell.row: cell.runs[0] for cell in cells if cell.simulator == simulator and cell.runs}
-        imported = [row for row, run in first.items() if RECORDED in run.data.tags]
-        if imported:
-            print(
-                f"figures 7 and 8 of {simulator} are not drawn: {', '.join(imported)} were imported "
-                "without predictions: tracking.recorded=false trains them again"
-            )
-        if imported or not first:
+    for simulator, config in skins.items():
+        found = {cell.row: _codes(cell, store) for cell in cells if cell.simulator == simulator}
+        codes = {row: each for row, each in found.items() if len(each)}
+        if not codes:
             continue
-        tables = {row: _predictions(store, run) for row, run in first.items()}
-        matrices, wrong = {}, {}
-        for row, table in tables.items():
-            matrices[row] = confusion(_column(table, "p_dangerous"), _column(table, "dangerous"))[0].numpy()
-            wrong[row] = ((_column(table, "p_big") > 0.5) != (_column(table, "big") > 0.5))[:, 0].numpy()
-        speeds = _column(next(iter(tables.values())), "speed")[:, 0].numpy() * rate
+        device = build_device(config).simulated("the figures of the report are of a simulated skin")
+        speeds = device.recording("test", complete=False).parameters["speed"].numpy() * device.model_rate
+        matrices = {row: _confusion(each) for row, each in codes.items()}
         drawn = figures.confusions(matrices, ("safe", "dangerous"))
         paths.append(figures.save_figure(drawn, folder / f"figure08_confusion_{simulator}.png"))
-        drawn = figures.misclassified(speeds, wrong, "big", _SPEEDS)
-        paths.append(figures.save_figure(drawn, folder / f"figure07_speed_{simulator}.png"))
+        wrong = {row: 1 - decode(each, "big/accuracy", TOUCH).mean(axis=0) for row, each in codes.items()}
+        courses = {row: figures.misclassified_shares(speeds, each, _SPEEDS) for row, each in wrong.items()}
+        shown = {row: courses[row] for row in _SHOWN if row in courses} or courses
+        drawn = figures.misclassified(shown, "big", _SPEEDS)
+        path = folder / f"figure07_speed_{simulator}"
+        paths.append(figures.save_figure(drawn, path.with_suffix(".png")))
+        paths.append(write(csv_text(_courses(courses)), path.with_suffix(".csv")))
     return paths
+
+
+def _codes(cell: Cell, store: Store) -> np.ndarray:
+    """Return the outcomes of the runs of a row that have some, (N, B)."""
+    each = [load_outcomes(store, run) for run in cell.runs]
+    return np.array([one for one in each if one is not None])
+
+
+def _confusion(codes: np.ndarray) -> np.ndarray:
+    """Return the confusion matrix of ``dangerous``, (2, 2), over runs and gestures."""
+    right = decode(codes, "dangerous/accuracy", TOUCH) > 0.5
+    true = ~np.isnan(decode(codes, "dangerous/alarm_recall", TOUCH))
+    said = np.where(right, true, ~true)
+    return np.array([[np.sum((true == row) & (said == column)) for column in (0, 1)] for row in (0, 1)])
+
+
+def _courses(courses: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[list[str]]:
+    """Return a line per row and speed."""
+    ends = [(0.0, 0.0), *pairwise(_SPEEDS)]
+    return [["row", "slowest_m_per_s", "fastest_m_per_s", "wrong", "error"]] + [
+        [row, f"{low:.4g}", f"{high:.4g}", f"{share:.4f}", f"{error:.4f}"]
+        for row, course in courses.items()
+        for (low, high), share, error in zip(ends, *course, strict=True)
+    ]
 
 
 def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> list[Path]:
@@ -150,14 +177,3 @@ def _pictures(readings: Tensor, positions: Tensor, size: tuple[float, float]) ->
     }
     valid = torch.ones_like(frame, dtype=torch.bool)
     return {name: make(frame, valid).x[0, 0, 0] for name, make in makers.items()}
-
-
-def _predictions(store: Store, run: Run) -> pa.Table:
-    with TemporaryDirectory() as folder:
-        path = store.client.download_artifacts(run.info.run_id, "predictions.parquet", folder)
-        return pq.read_table(path, memory_map=False)
-
-
-def _column(table: pa.Table, name: str) -> Tensor:
-    """Return a column as (B, 1)."""
-    return torch.from_numpy(table[name].to_numpy().copy())[:, None]

@@ -5,11 +5,14 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 
+import numpy as np
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
+from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
@@ -18,6 +21,7 @@ from experiments.studies.study import SMOKE, Study, Variant, as_overrides, passe
 from skin.commands import train
 from skin.config import PARENT, fingerprint, validate_config
 from skin.errors import InputError
+from skin.evaluation.outcomes import OUTCOMES
 from skin.run import SWEPT, simulator
 from skin.source import note_reuse
 from skin.stored_run import find_run
@@ -125,6 +129,23 @@ def _another_command() -> Iterator[None]:
             os.environ.pop(name, None)
         if shown is not None:
             os.environ["HYDRA_FULL_ERROR"] = shown
+
+
+def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
+    """Return the outcomes of the test gestures of a run, (B,), uint8; None if it has none."""
+    if OUTCOMES not in artifact_names(store, run):
+        return None
+    with TemporaryDirectory() as folder:
+        path = download_artifacts(
+            run_id=run.info.run_id, artifact_path=OUTCOMES, dst_path=folder, tracking_uri=store.uri
+        )
+        outcomes: np.ndarray = np.load(path)
+        return outcomes
+
+
+def artifact_names(store: Store, run: Run) -> set[str]:
+    """Return the names of the files and folders that were logged with a run."""
+    return {one.path for one in store.client.list_artifacts(run.info.run_id)}
 
 
 def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:

@@ -17,7 +17,7 @@ from mlflow.entities import Run
 from omegaconf import DictConfig
 
 from experiments.studies.measures import Accuracy, Finished, Measure, Subject
-from experiments.studies.runs import Planned
+from experiments.studies.runs import Planned, artifact_names, load_outcomes
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
 from experiments.studies.tables import publish_page
 from skin.build import build_device
@@ -74,7 +74,7 @@ def run_trials(
         return
     own = planned.run.data.metrics if planned.variant.configs else {}
     if study.measure is None and not study.conditions:
-        outcomes = _outcomes(store, planned.run)
+        outcomes = load_outcomes(store, planned.run)
         yield Trial(
             planned.variant,
             planned.seed,
@@ -98,7 +98,7 @@ def run_trials(
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
             at = planned.variant, planned.seed, condition, number, planned.run.data.tags["fingerprint"]
-            yield Trial(*at, metrics, said, files, _outcomes(store, found))
+            yield Trial(*at, metrics, said, files, load_outcomes(store, found))
 
 
 def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -165,26 +165,10 @@ class _Run:
 
 def _fetched(store: Store, run: Run, folder: Path) -> list[Path]:
     """Copy the files of a measure to a folder and return their paths there."""
-    if not _names(store, run) - {OUTCOMES}:
+    if not artifact_names(store, run) - {OUTCOMES}:
         return []
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder) as holder:
         fetched = download_artifacts(run_id=run.info.run_id, dst_path=holder, tracking_uri=store.uri)
         made = (path for path in sorted(Path(fetched).iterdir()) if path.name != OUTCOMES)
         return [path.replace(folder / path.name) for path in made]
-
-
-def _outcomes(store: Store, run: Run) -> np.ndarray | None:
-    """Return the outcomes of the test gestures of a run; None if it has none."""
-    if OUTCOMES not in _names(store, run):
-        return None
-    with TemporaryDirectory() as holder:
-        path = download_artifacts(
-            run_id=run.info.run_id, artifact_path=OUTCOMES, dst_path=holder, tracking_uri=store.uri
-        )
-        outcomes: np.ndarray = np.load(path)
-        return outcomes
-
-
-def _names(store: Store, run: Run) -> set[str]:
-    return {one.path for one in store.client.list_artifacts(run.info.run_id)}

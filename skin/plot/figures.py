@@ -105,30 +105,45 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
     return figure
 
 
+def misclassified_shares(
+    speeds: np.ndarray, wrong: np.ndarray, bins: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share of gestures with a wrong label, and its standard error, by the speed of the slide.
+
+    Args:
+        speeds: (B,), m/s; 0 for a static touch.
+        wrong: (B,), share of runs in which the label is wrong.
+        bins: (K + 1,), ascending edges, m/s.
+
+    Returns:
+        both (K + 1,); the first is for static touches.
+    """
+    # Static touches go to group 0, a slide in bin k to group k.
+    group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, bins), 1, len(bins) - 1))
+    counts = np.maximum(np.bincount(group, minlength=len(bins)), 1)
+    shares = np.bincount(group, weights=wrong, minlength=len(bins)) / counts
+    squares = np.bincount(group, weights=(wrong - shares[group]) ** 2, minlength=len(bins))
+    return shares, np.sqrt(squares) / counts
+
+
 def misclassified(
-    speeds: np.ndarray, wrong: Mapping[str, np.ndarray], label: str, bins: np.ndarray
+    courses: Mapping[str, tuple[np.ndarray, np.ndarray]], label: str, bins: np.ndarray
 ) -> Figure:
     """Draw the share of gestures whose label is wrong against the speed of the slide (report, figure 7).
 
     Args:
-        speeds: (B,), m/s; 0 for a static touch.
-        wrong: row -> (B,), bool.
+        courses: row -> shares and standard errors (:func:`misclassified_shares`).
         label: which label.
         bins: ascending edges, m/s; static touches stand at 0 on their own.
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
     middles = np.concatenate([[0.0], (bins[1:] + bins[:-1]) / 2])
-    # Static touches go to group 0, a slide in bin k to group k.
-    group = np.where(speeds == 0, 0, np.clip(np.digitize(speeds, bins), 1, len(bins) - 1))
     # Every colour comes with one mark after the other, so that any number of rows can be told apart.
     styles = product(_MARKS, COLOURS)
-    for (row, errors), (mark, colour) in zip(wrong.items(), styles, strict=False):
-        counts = np.bincount(group, minlength=len(middles))
-        shares = np.bincount(group, weights=errors, minlength=len(middles)) / np.maximum(counts, 1)
-        spread = np.sqrt(shares * (1 - shares) / np.maximum(counts, 1))
+    for (row, (shares, errors)), (mark, colour) in zip(courses.items(), styles, strict=False):
         axis.errorbar(
-            middles * 1e3, shares, spread, marker=mark, markersize=4, capsize=2, color=colour, label=row
+            middles * 1e3, shares, errors, marker=mark, markersize=4, capsize=2, color=colour, label=row
         )
     axis.set(xlabel="speed, mm/s (0: static)", ylabel=f"share with “{label}” wrong")
     axis.set_ylim(bottom=0)

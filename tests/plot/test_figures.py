@@ -5,7 +5,15 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.plot.figures import confusions, force_and_reading, images, misclassified, save_figure, traces
+from skin.plot.figures import (
+    confusions,
+    force_and_reading,
+    images,
+    misclassified,
+    misclassified_shares,
+    save_figure,
+    traces,
+)
 
 
 def test_a_confusion_matrix_shows_shares_of_each_true_class():
@@ -21,8 +29,10 @@ def test_a_class_that_never_occurs_divides_by_nothing():
 
 def test_static_touches_stand_on_their_own_and_slides_in_their_bin():
     speeds = np.array([0, 0, 0.03, 0.09, 0.11, 0.20])
-    wrong = np.array([True, False, False, True, True, True])
-    figure = misclassified(speeds, {"row": wrong}, "big", np.array([0.03, 0.10, 0.20]))
+    wrong, bins = np.array([True, False, False, True, True, True]), np.array([0.03, 0.10, 0.20])
+    shares, errors = misclassified_shares(speeds, wrong, bins)
+    assert errors == pytest.approx([0.5 / 2**0.5, 0.5 / 2**0.5, 0])
+    figure = misclassified({"row": (shares, errors)}, "big", bins)
     x, y = figure.axes[0].containers[0].lines[0].get_data()
     assert x == pytest.approx([0, 65, 150])
     assert y == pytest.approx([0.5, 0.5, 1.0])

@@ -15,7 +15,7 @@ from skin.sweep import sweep_jobs
 from skin.tracking import Store
 
 # They stand in the table as soon as a run of theirs has finished.
-OTHERS = ("experiment=best_fresh", *(f"row={row}" for row in WAYS))
+OTHERS = ("experiment=best_fresh", "experiment=features_tuned", *(f"row={row}" for row in WAYS))
 _PEERS = (f"hydra.searchpath=['file://{peers.CONF}']",)
 MEMBERS = ("linked_graph", "temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
 

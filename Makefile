@@ -62,9 +62,9 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 		--requirement experiments/peers/requirements.txt
 	touch $@
 
-peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs on the same touches (SEEDS=3)
+peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs, with their defaults and tuned (SEEDS=3)
 	$(BIN)/skin train --config-dir experiments/peers/conf -m 'seed=range($(SEEDS))' \
-		experiment=lightgbm,minirocket,multirocket_hydra
+		experiment=lightgbm,minirocket,multirocket_hydra,lightgbm_tuned,minirocket_tuned,multirocket_tuned
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	@echo "runs: http://127.0.0.1:5000/#/experiments"

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import solve
 from sklearn.linear_model import LogisticRegression
 
-ALPHAS = np.logspace(0, 6, 7)
+STRENGTHS = np.logspace(0, 6, 7)
 """Strengths that are tried; each takes a factorisation of D x D."""
 
 
@@ -34,7 +34,7 @@ def normal_equations(
     best, least = np.zeros_like(cross), np.full(len(total), np.inf)
     diagonal = np.einsum("ii->i", gram)
     plain = diagonal.copy()
-    for alpha in ALPHAS:
+    for alpha in STRENGTHS:
         diagonal[:] = plain + alpha
         weights = solve(gram, cross, assume_a="pos")
         errors = np.square(validation @ weights.astype(np.float32) + total - mean @ weights - held).mean(0)

@@ -7,7 +7,7 @@ from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import Ridge
 
-from experiments.peers.worker.ridge import ALPHAS, normal_equations, platt
+from experiments.peers.worker.ridge import STRENGTHS, normal_equations, platt
 
 
 class Scores(ClassifierMixin, BaseEstimator):
@@ -56,7 +56,7 @@ def test_normal_equations_give_the_ridge_with_the_least_validation_error():
     weights, bias = normal_equations(parts, x[held], y[held])
     chosen = set()
     for label in range(2):
-        fits = [Ridge(alpha).fit(x[train].astype(float), y[train, label]) for alpha in ALPHAS]
+        fits = [Ridge(alpha).fit(x[train].astype(float), y[train, label]) for alpha in STRENGTHS]
         errors = [np.square(fit.predict(x[held]) - y[held, label]).mean() for fit in fits]
         best = fits[int(np.argmin(errors))]
         chosen.add(best.alpha)

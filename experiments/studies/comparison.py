@@ -63,6 +63,21 @@ def paired(
     return Paired(mean, math.hypot(error, devices, _gesture_error(gestures, ratio)), len(shared))
 
 
+def estimate(
+    by_seed: Mapping[str, float], by_device: Mapping[str, float], gestures: np.ndarray | None
+) -> tuple[float, float]:
+    """Return the mean of a variant and its standard error over seeds, devices and gestures.
+
+    Args:
+        by_seed: seed -> figure; at least one.
+        by_device: the same by device.
+        gestures: the same by gesture, (G,); None: not known.
+    """
+    known = [] if gestures is None else list(gestures[~np.isnan(gestures)])
+    errors = _error([*by_seed.values()]), _error([*by_device.values()]), _error(known)
+    return fmean(by_seed.values()), math.hypot(*errors)
+
+
 def _pairs(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -> list[float]:
     pairs = [(one[key], other[key]) for key in one if key in other]
     return [first / second if ratio else first - second for first, second in pairs]

@@ -4,15 +4,19 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 
+import numpy as np
 from mlflow.entities import Run
 from omegaconf import DictConfig
 from rich.console import Console
 
 from experiments.studies import tables
-from experiments.studies.runs import newest_finished
+from experiments.studies.comparison import estimate
+from experiments.studies.runs import load_outcomes, newest_finished
 from experiments.studies.tables import percent
+from skin.evaluation.outcomes import decode
+from skin.labels import TOUCH
 from skin.tracking import Store
 
 ACCURACIES = ("overall", "big", "dynamic", "press", "dangerous")
@@ -24,7 +28,7 @@ COLUMNS = (
     "simulator",
     "label",
     "ours",
-    "ours_sd",
+    "ours_error",
     "report",
     "device_shift",
     "unseen_layout",
@@ -44,17 +48,27 @@ class Cell:
         simulator: on whose data.
         runs: those that finished.
         missing: how many did not: failed, killed, or never started.
+        outcomes: of the test gestures of each run (:func:`skin.evaluation.outcomes.encode`), where known.
     """
 
     row: str
     simulator: str
     runs: tuple[Run, ...]
     missing: int
+    outcomes: tuple[np.ndarray, ...] = ()
 
     def values(self, metric: str) -> list[float]:
         """Return a metric of every run that has it."""
         found = (run.data.metrics.get(metric) for run in self.runs)
         return [value for value in found if value is not None]
+
+    def error(self, metric: str) -> str:
+        """Return the standard error of a metric of ``same`` over seeds and gestures; empty if unknown."""
+        by_seed = {str(number): value for number, value in enumerate(self.values(f"same/{metric}"))}
+        known = decode(np.stack(self.outcomes), metric, TOUCH) if self.outcomes else None
+        if not by_seed or (known is None and len(by_seed) < 2):
+            return ""
+        return f"{estimate(by_seed, {}, None if known is None else known.mean(axis=0))[1]:.4f}"
 
     def shift(self, column: str, label: str) -> str:
         """Return the mean over seeds on other devices or layouts; ``cannot`` where the row takes none."""
@@ -68,10 +82,13 @@ def collect(store: Store, jobs: Iterable[tuple[str, str, DictConfig]]) -> list[C
     groups: dict[tuple[str, str], list[Run | None]] = {}
     for row, simulator, config in jobs:
         groups.setdefault((row, simulator), []).append(newest_finished(store, config))
-    return [
-        Cell(*key, tuple(run for run in runs if run is not None), runs.count(None))
-        for key, runs in groups.items()
-    ]
+    cells = []
+    for key, runs in groups.items():
+        finished = tuple(run for run in runs if run is not None)
+        outcomes = [load_outcomes(store, run) for run in finished]
+        known = tuple(one for one in outcomes if one is not None)
+        cells.append(Cell(*key, finished, runs.count(None), known))
+    return cells
 
 
 def report_values(path: Path) -> dict[tuple[str, str, str], float]:
@@ -90,8 +107,8 @@ def result_rows(
 
     ``ours`` is the mean over seeds of the accuracy on the test gestures, or of what the alarm reaches there
     with the threshold stored with each run; ``failed`` where no run finished, empty where it is
-    undefined. The column ``failed`` counts the seeds that are missing, ``budget`` is
-    theirs.
+    undefined. ``ours_error`` is its standard error. The column ``failed`` counts the seeds that are missing,
+    ``budget`` is theirs.
     """
     lines = []
     for cell in cells:
@@ -99,7 +116,7 @@ def result_rows(
             same = cell.values(_metric("same", label))
             values = {
                 "ours": _number(same) if cell.runs else "failed",
-                "ours_sd": f"{stdev(same):.4f}" if len(same) > 1 else "",
+                "ours_error": cell.error(ALARM.get(label, f"{label}/accuracy")),
                 "report": _reported(report.get((cell.row, cell.simulator, label))),
                 "device_shift": cell.shift("device_shift", label),
                 "unseen_layout": cell.shift("unseen_layout", label),
@@ -166,9 +183,10 @@ def _reported(value: float | None) -> str:
 
 
 def beside(line: dict[str, str]) -> str:
-    """Return our number with its deviation and, in brackets, the report's."""
+    """Return our number ± two standard errors and, in brackets, the report's."""
     reported = percent(line["report"])
-    return (percent(line["ours"], line["ours_sd"]) or "-") + (f" ({reported})" if reported else "")
+    twice = str(2 * float(line["ours_error"])) if line["ours_error"] else ""
+    return (percent(line["ours"], twice) or "-") + (f" ({reported})" if reported else "")
 
 
 def print_results(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:

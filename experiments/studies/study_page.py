@@ -3,16 +3,16 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import fmean, stdev
 
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from experiments.studies.comparison import Paired
+from experiments.studies.comparison import RATIOS, Paired, estimate
 from experiments.studies.outcomes import (
     UNITS,
     Difference,
     StatementResult,
+    by_gesture,
     conclusions,
     differences,
     group_trials,
@@ -36,7 +36,7 @@ _HEADINGS = {
 
 
 def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
-    """Return a line per variant: mean and deviation over its runs; shares in per cent.
+    """Return a line per variant: mean ± two standard errors over seeds, devices and gestures, in per cent.
 
     Where there are conditions, each is a column of the first metric.
     """
@@ -86,7 +86,7 @@ def statements_table(outcomes: Sequence[StatementResult]) -> list[list[str]]:
 def comparison_text(outcome: StatementResult) -> str:
     """Return every comparison of a statement: the mean over paired seeds ± its standard error."""
     said, several = outcome.statement, len(outcome.compared) > 1
-    unit = "times" if said.claim == "ratio" else UNITS.get(said.metric, "points")
+    unit = "times" if said.claim in RATIOS else UNITS.get(said.metric, "points")
     figures: Mapping[str, str] = {name: _figure(found, unit) for name, found in outcome.compared.items()}
     return "; ".join(text + f" ({name})" if several else text for name, text in figures.items())
 
@@ -129,10 +129,10 @@ def study_figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
         every = [scale * one.metrics[metric] for one in each if metric in one.metrics]
         if not every:
             continue
-        means = list(values(each, metric, "device" if each[0].device else "seed").values())
-        error = 2 * stdev(means) / math.sqrt(len(means)) if len(means) > 1 else 0.0
+        figures, across = values(each, metric), values(each, metric, "device")
+        mean, error = estimate(figures, across, by_gesture(each, metric))
         axis.plot(every, [place] * len(every), "o", color=COLOURS[0], alpha=0.35, ms=4)
-        axis.errorbar(fmean(every), place, xerr=error, fmt="|", color="black", ms=10, capsize=3)
+        axis.errorbar(mean, place, xerr=2 * error, fmt="|", color="black", ms=10, capsize=3)
     axis.set_yticks(range(len(found)), [", ".join(filter(None, key)) for key in found], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel(
@@ -165,13 +165,16 @@ def _heading(metric: str) -> str:
 
 
 def _cell(trials: Sequence[Trial], metric: str) -> str:
-    """Return mean and deviation over trainings, or over devices where a training was tried on several."""
-    figures = list(values(trials, metric, "device" if trials[0].device else "seed").values())
+    """Return the mean and two standard errors."""
+    figures = values(trials, metric)
     if not figures:
         return ""
+    across, gestures = values(trials, metric, "device"), by_gesture(trials, metric)
+    mean, error = estimate(figures, across, gestures)
     if metric in ("seconds_per_epoch", "parameters", "self_share"):
-        return f"{fmean(figures):.{0 if metric == 'parameters' else 2}f}"
-    return f"{fmean(figures):.1f}" + (f" ± {stdev(figures):.1f}" if len(figures) > 1 else "")
+        return f"{mean:.{0 if metric == 'parameters' else 2}f}"
+    several = len(figures) > 1 or len(across) > 1 or gestures is not None
+    return f"{mean:.1f}" + (f" ± {2 * error:.1f}" if several else "")
 
 
 def _figure(found: Paired | None, unit: str) -> str:

@@ -58,12 +58,12 @@ def markdown(table: Table, title: str) -> str:
     return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
 
 
-def percent(value: str, deviation: str = "") -> str:
-    """Return a share in per cent, with its deviation if there is one; what is no number stays as it is."""
+def percent(value: str, spread: str = "") -> str:
+    """Return a share in per cent, with its spread if there is one; what is no number stays as it is."""
     if value in ("", "failed", "cannot"):
         return value
-    spread = f" ± {100 * float(deviation):.1f}" if deviation else ""
-    return f"{100 * float(value):.1f}{spread}"
+    shown = f" ± {100 * float(spread):.1f}" if spread else ""
+    return f"{100 * float(value):.1f}{shown}"
 
 
 def print_table(

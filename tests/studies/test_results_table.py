@@ -4,6 +4,7 @@ import csv
 import io
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -48,15 +49,25 @@ def lines():
     return {(line["row"], line["label"]): line for line in result_rows(cells, REPORT)}
 
 
-def test_ours_is_mean_and_deviation_over_seeds(lines):
+def test_ours_is_mean_and_standard_error_over_seeds(lines):
     line = lines["temporal_graph", "overall"]
-    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt(2)
-    assert (line["ours"], line["ours_sd"], line["device_shift"]) == ("0.8500", "0.0707", "0.6000")
+    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt(2), by sqrt(2)
+    assert (line["ours"], line["ours_error"], line["device_shift"]) == ("0.8500", "0.0500", "0.6000")
+
+
+def test_the_error_is_also_one_over_gestures():
+    """By hand: half of 100 gestures have one of four labels wrong in both runs."""
+    codes = np.repeat(np.array([0, 1], dtype=np.uint8), 50)
+    cell = Cell("rules", "fem", (run(0.875), run(0.875)), 0, (codes, codes))
+    (line, *_) = result_rows([cell], {})
+    # a standard deviation of 0.125 sqrt(100 / 99) over gestures, by sqrt(100)
+    assert (line["ours"], line["ours_error"]) == ("0.8750", "0.0126")
+    assert display_rows(result_rows([cell], {}))[1][2] == "87.5 ± 2.5"
 
 
 def test_one_seed_has_no_deviation():
     (line, *_) = result_rows([Cell("rules", "fem", (run(0.8),), 0)], {})
-    assert (line["ours"], line["ours_sd"], line["report"]) == ("0.8000", "", "")
+    assert (line["ours"], line["ours_error"], line["report"]) == ("0.8000", "", "")
 
 
 def test_the_reports_number_stands_where_it_has_one(lines):
@@ -115,7 +126,7 @@ def test_what_is_undefined_is_no_number():
 
 def test_a_person_reads_ours_with_the_reports_in_brackets(lines):
     head, first, _ = display_rows(list(lines.values()))
-    assert dict(zip(head, first, strict=True))["overall"] == "85.0 ± 7.1 (73.2)"
+    assert dict(zip(head, first, strict=True))["overall"] == "85.0 ± 10.0 (73.2)"
 
 
 def test_csv_has_the_columns_and_reads_back(lines):
@@ -152,15 +163,15 @@ def test_a_table_tells_its_budget():
 
 def test_no_number_is_cut_on_a_narrow_terminal():
     line = dict.fromkeys(COLUMNS, "0.1234") | {"row": "temporal_graph", "simulator": "naive", "failed": "0"}
-    lines = [line | {"label": label, "ours_sd": "0.0123", "report": "0.85"} for label in LABELS]
+    lines = [line | {"label": label, "ours_error": "0.0123", "report": "0.85"} for label in LABELS]
     seen = io.StringIO()
     print_results(lines, "title", Console(file=seen, width=40))
     text = seen.getvalue()
     assert "…" not in text
-    assert "12.3 ± 1.2 (85.0)" in text
+    assert "12.3 ± 2.5 (85.0)" in text
     assert all(head in text for head in ("overall", "recall", "false", "dev.", "lay."))
     # A temporal_graph of one seed, with the report's number, fits 80 columns.
-    line |= {"ours_sd": ""}
+    line |= {"ours_error": ""}
     seen = io.StringIO()
     print_results([line | {"label": label} for label in LABELS], "title", Console(file=seen, width=40))
     assert max(map(len, seen.getvalue().splitlines())) <= 80

@@ -48,12 +48,12 @@ SAID = Statement("x", "one [sic] beats the other", {"weight": "weight=exp"}, MET
 STUDY = Study("edges", "edges", [0, 1], metrics=METRICS, statements=[SAID])
 
 
-def test_a_line_per_variant_with_mean_and_deviation():
+def test_a_line_per_variant_with_mean_and_two_standard_errors():
     head, first, second, third = variants_table(FOUND, METRICS)
-    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt 2
+    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt 2, by sqrt 2, twice
     assert dict(zip(head, first, strict=True)) | {"big": "", "dynamic": "", "press": "", "dangerous": ""} == {
         "variant": "weight=exp",
-        "overall": "85.0 ± 7.1",
+        "overall": "85.0 ± 10.0",
         "big": "",
         "dynamic": "",
         "press": "",
@@ -76,7 +76,7 @@ def test_conditions_are_columns_of_the_first_metric():
     ]
     assert variants_table(found, METRICS) == [
         ["variant", "none", "5 dead"],
-        ["a", "85.0 ± 7.1", "85.0 ± 7.1"],
+        ["a", "85.0 ± 10.0", "85.0 ± 10.0"],
     ]
 
 
@@ -109,7 +109,8 @@ def test_files_and_terminal_say_the_same(tmp_path):
     assert len([line for line in page.splitlines() if line.startswith("| weight=")]) == 3
     text = console.file.getvalue()
     assert all(
-        part in text for part in ("85.0 ± 7.1", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
+        part in text
+        for part in ("85.0 ± 10.0", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
     )
     assert "…" not in text  # a narrow terminal cuts no number short
     read = list(csv.DictReader((tmp_path / "study_edges.csv").read_text().splitlines()))

@@ -64,6 +64,6 @@ def expected_seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]
 def format_duration(duration: float) -> str:
     """Return a duration in s as text."""
     minutes = math.ceil(duration / 60)
-    if duration >= 2 * 3600:
+    if duration > 2 * 3600:
         return f"{duration / 3600:.1f} h"
     return f"{duration:.0f} s" if duration < 90 else f"{minutes} min"

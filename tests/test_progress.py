@@ -25,8 +25,10 @@ def test_a_skipped_job_says_nothing_about_speed():
     assert progress.left() == 30
 
 
-@pytest.mark.parametrize(("duration", "text"), [(0.4, "0 s"), (89, "89 s"), (91, "2 min"), (7200, "120 min")])
-def test_a_duration_is_told_in_seconds_or_minutes(duration, text):
+@pytest.mark.parametrize(
+    ("duration", "text"), [(0.4, "0 s"), (89, "89 s"), (91, "2 min"), (7200, "120 min"), (9000, "2.5 h")]
+)
+def test_a_duration_is_told_in_seconds_minutes_or_hours(duration, text):
     assert format_duration(duration) == text
 
 

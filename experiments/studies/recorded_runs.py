@@ -90,7 +90,7 @@ def import_runs(settings: Tracking, path: Path) -> int:
             before = known.get(identity)
             if one["experiment"] == experiment and (before is None or before.start_time < one["start"]):
                 parent = known.get((one["tags"].get("evaluated", ""), "", "", ""))
-                known[identity] = _log(store, one, path.name, parent and parent.run_id)
+                known[identity] = _log(store, one, path.name, parent.run_id if parent else None)
                 count += 1
     return count
 
@@ -173,9 +173,9 @@ def _files(store: Store, run: Run) -> Iterator[tuple[str, bytes]]:
         for name in names if "study" in run.data.tags else sorted({*names} & {*_KEPT}):
             path = Path(store.client.download_artifacts(run.info.run_id, name, folder))
             if name == _CONFIGURATION:
-                stored = OmegaConf.load(path)
-                stored.pop("tracking", None)  # type: ignore[union-attr]  # places on this machine
-                path.write_text(OmegaConf.to_yaml(stored))
+                stored = {str(key): value for key, value in OmegaConf.load(path).items()}
+                stored.pop("tracking", None)  # places on this machine
+                path.write_text(OmegaConf.to_yaml(OmegaConf.create(stored)))
             yield name, path.read_bytes()
 
 

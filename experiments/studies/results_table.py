@@ -161,7 +161,7 @@ def seeds_csv(cells: Sequence[Cell]) -> str:
     shown = [
         _metric(column, label) for column in ("same", "device_shift", "unseen_layout") for label in LABELS
     ]
-    lines = [
+    lines: list[list[object]] = [
         [cell.row, cell.simulator, run.data.tags["seed"], run.data.tags["fingerprint"]]
         + [run.data.metrics.get(metric, "") for metric in shown]
         for cell in cells

@@ -121,14 +121,14 @@ def verdict(claim: str, found: Paired | None, by: float = 0.0) -> str:
     wholly outside, else, and always with fewer than three paired seeds, ``undecided``.
 
     Args:
-        claim: ``greater`` (0 to infinity), ``less`` (minus infinity to 0), ``alike`` (-by to by),
+        claim: ``greater`` (by to infinity), ``less`` (minus infinity to by), ``alike`` (-by to by),
             ``no better`` and ``at most`` (minus infinity to by), ``about`` or ``ratio`` (by / 2 to 2 by).
         found: the comparison, None without paired seeds.
         by: in the unit of the comparison.
     """
     least, most = {
-        "greater": (0.0, math.inf),
-        "less": (-math.inf, 0.0),
+        "greater": (by, math.inf),
+        "less": (-math.inf, by),
         "alike": (-by, by),
         "no better": (-math.inf, by),
         "at most": (-math.inf, by),

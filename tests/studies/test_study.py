@@ -5,6 +5,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from experiments import peers
 from experiments.studies.comparison import Paired, verdict
 from experiments.studies.study import Study, variants
 from skin.config import fingerprint, validate_config
@@ -13,7 +14,7 @@ from skin.paths import CONF
 
 NAMES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
-KINDS = ("accuracy", "balanced_accuracy", "alarm_recall", "false_alarm_rate", "degrees")
+KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
 OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "self_share", "same/any/disagreement"}
 
 
@@ -46,18 +47,21 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name):
     if study.differences is None and study.trainings:
         assert study.statements or study.conditions
     known = {f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
-             for label in (*LABELS, "direction") for kind in KINDS}  # fmt: skip
+             for label in (*LABELS, "direction") for kind in (*KINDS, "error")}  # fmt: skip
     known |= OTHER | {"same/direction/degrees"}
     assert set(study.metrics) <= known
     for said in study.statements:
         assert set(said.metric.split(" - ")) <= known
         assert verdict(said.claim, Paired(0.0, 1e9, 3), said.by) == "undecided"
-        assert (said.by > 0) == (said.claim not in ("greater", "less"))
+        assert said.by > 0 or said.claim in ("greater", "less")
         assert bool(said.others) != (said.level is not None)
         lines = [
             one.chosen | {"condition": condition} for one in every for condition in study.conditions or ("",)
         ]
         lines += [{"row": way} for way in study.ensembles]
+        if not study.trainings:  # finished runs of any row
+            rows = [path.stem for path in (CONF / "experiment").glob("*.yaml")] + peers.ROWS
+            lines = [{"row": row, "condition": condition} for row in rows for condition in study.conditions]
         picked = [[line for line in lines if one.items() <= line.items()] for one in (said.one, *said.others)]
         assert [len(each) for each in picked] == [1] * len(picked), said.id
         assert len({str(each) for each in picked}) == len(picked)

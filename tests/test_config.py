@@ -1,5 +1,6 @@
 """The configuration mirrors the package, refuses what it does not know, and tells which runs are the same."""
 
+import csv
 import subprocess
 import sys
 
@@ -18,6 +19,9 @@ GROUPS = ("body", "layout", "simulator", "contact", "device", "representation", 
 ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 TRAIN = ROOT / "experiments" / "train.py"
+with (ROOT / "docs" / "results" / "tuning.csv").open(newline="") as file:
+    TRIALS = list(csv.DictReader(file))
+CHOSEN = [trial for trial in TRIALS if trial["chosen"] == "yes"]
 
 
 def keys(value):
@@ -64,6 +68,23 @@ def test_every_row_composes_and_is_built(configured, row, simulator):
     build_learner(config)
     assert (config.row, config.data.name) == (row, simulator)
     assert config.trainer.max_epochs == config.epochs[simulator]
+
+
+@pytest.mark.parametrize("trial", CHOSEN, ids=[trial["row"] for trial in CHOSEN])
+def test_a_tuned_row_has_the_settings_of_the_chosen_trial(configured, trial):
+    settings = [*trial["settings"].split(), f"epochs.fem={trial['epochs']}"]
+    tried = plain(configured(f"experiment={trial['row']}", "simulator=fem", *settings))
+    tuned = plain(configured(f"experiment={trial['row']}_tuned", "simulator=fem"))
+    differ = {key for key in tried if tried[key] != tuned[key]}
+    assert differ <= {"row", "epochs"}, "epochs of other data"
+    assert tuned["trainer"]["max_epochs"] == int(trial["epochs"])
+
+
+def test_every_tuned_row_is_the_best_of_its_trials():
+    for row in (name.removesuffix("_tuned") for name in ROWS if name.endswith("_tuned")):
+        trials = [trial for trial in TRIALS if trial["row"] == row]
+        best = max(trials, key=lambda trial: float(trial["validation_overall"]))
+        assert [trial for trial in trials if trial["chosen"] == "yes"] == [best], row
 
 
 @pytest.mark.parametrize("simulator", ["naive", "fem"])

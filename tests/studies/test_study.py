@@ -89,7 +89,7 @@ def test_studies_share_the_runs_that_they_have_in_common(composed):
 def test_variants_are_named_by_what_tells_them_apart(composed):
     _, every = composed("study=image_representation", "study.seeds=[0,1]")
     assert [one.name for one in every][1:3] == [
-        "temporal_image representation=fourier",
+        "sequence_image representation=fourier",
         "interp method=nearest",
     ]
     assert {tuple(one.configs) for one in every} == {("0", "1")}

@@ -76,7 +76,7 @@ reproduce-table: $(READY)  ## train the models of the results table and print it
 		$(if $(SIMULATORS),'table.simulators=[$(SIMULATORS)]')
 
 # The smoke budget leaves peers out where their environment is missing.
-results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers,$(PART)),$(PEERS)/.ready))  ## publish all results in 22 h: PART=peers 1.5 h, table 15.5 h, shifts 0.6 h, studies 5 h (FRESH=1, BUDGET=smoke)
+results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers,$(PART)),$(PEERS)/.ready))  ## publish all results in 28 h: PART=table 9.5 h, peers 2.4 h, shifts 2.6 h, studies 13.7 h (FRESH=1, BUDGET=smoke)
 	$(BIN)/skin results results.part=$(PART) results.budget=$(BUDGET) $(if $(FRESH),results.fresh=true)
 
 release-check: $(READY)  ## train three models again and compare them with docs/results/runs.parquet

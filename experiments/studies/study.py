@@ -98,7 +98,8 @@ class Study:
         if not name:
             known = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
             raise InputError(f"which study? choose one of {known}, as in study=norm")
-        settings = {"name": name} | plain(config)["study"]
+        settings = plain(config)["study"]
+        settings["name"] = settings["name"] or name
         check_settings(cls, settings, "study")
         if settings["measure"]:
             part = settings["measure"]

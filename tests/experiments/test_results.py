@@ -81,7 +81,7 @@ def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["results.part=tables"], "results.part=tables is none of all, peers, table, shifts, studies"),
+        (["results.part=tables"], "results.part=tables is none of all, table, peers, shifts, studies"),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.action=show"], "results.action"),
         (["results.check.seed=-1"], "results.check.seed"),

@@ -70,7 +70,7 @@ def _measure_skin(study: Study, folder: Path) -> None:
     """Apply the measure of a study without runs to the skin."""
     from hydra import compose
 
-    from experiments.studies.measures import Subject
+    from experiments.studies.subject import Subject
     from experiments.studies.tables import publish_page
     from skin.build import build_device
 

@@ -9,7 +9,7 @@ import torch
 from annotated_types import Ge, Gt, Lt, MinLen
 from scipy.special import log_ndtr
 
-from experiments.studies.measures import Measurement, Subject
+from experiments.studies.subject import Measurement, Subject
 
 if TYPE_CHECKING:
     from torch import Tensor

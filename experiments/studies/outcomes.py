@@ -10,7 +10,7 @@ import numpy as np
 from experiments.studies.comparison import RATIOS, Paired, combine_verdicts, paired, verdict
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
-from skin.evaluation.outcomes import decode
+from skin.evaluation.outcomes import decodable, decode
 from skin.labels import TOUCH
 
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
@@ -69,7 +69,7 @@ def values(trials: Sequence[Trial], metric: str, by: Literal["seed", "device"] =
     scale = 1 if metric in UNITS else 100
     groups: dict[str, list[float]] = {}
     for one in trials:
-        known = one.metrics | {
+        known = dict(one.metrics) | {
             f"{name.removesuffix('accuracy')}error": 1 - value
             for name, value in one.metrics.items()
             if name.endswith("/accuracy")
@@ -88,15 +88,15 @@ def by_gesture(trials: Sequence[Trial], metric: str) -> np.ndarray | None:
         metric: one of a run on its test gestures; others have no figures by gesture.
     """
     codes = [one.outcomes for one in trials if one.outcomes is not None]
+    plain, wrong = metric.removeprefix("same/"), metric.endswith("/error")
+    plain = plain.removesuffix("error") + "accuracy" if wrong else plain
+    if plain == metric or not decodable(plain, TOUCH):
+        return None
     if not codes or len(codes) < len(trials) or len({len(code) for code in codes}) > 1:
         return None
-    plain, wrong = metric.removeprefix("same/"), metric.endswith("/error")
-    if not metric.startswith("same/") or " - " in metric:
-        return None
-    if wrong:
-        plain = plain.removesuffix("error") + "accuracy"
     found = decode(np.stack(codes), plain, TOUCH)
-    return None if found is None else 100 * (1 - found if wrong else found).mean(axis=0)
+    mean: np.ndarray = 100 * (1 - found if wrong else found).mean(axis=0)
+    return mean
 
 
 def compare(

@@ -16,9 +16,10 @@ from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
-from experiments.studies.measures import Accuracy, Finished, Measure, Subject
+from experiments.studies.measures import Accuracy
 from experiments.studies.runs import Planned, artifact_names, load_outcomes
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
+from experiments.studies.subject import Finished, Measure, Subject
 from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.config import fingerprint, validate_config

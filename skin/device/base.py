@@ -13,8 +13,9 @@ from skin.recording import Recording, Touches
 from skin.sensors import Sensors
 
 if TYPE_CHECKING:  # only their names are needed here
+    from skin.signal.constants import Constants
     from skin.signal.frame import Frame
-    from skin.signal.imperfection import Constants, Imperfection
+    from skin.signal.imperfection import Imperfection
     from skin.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
     from skin.touch.stream import TouchStream

@@ -9,10 +9,10 @@ import torch
 from annotated_types import Ge
 from torch import Tensor
 
-from skin import __version__
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
+from skin.device._metadata import describe
 from skin.device._split import split_rows, split_slices
 from skin.device._threads import in_threads
 from skin.device._tracking import Tracker, estimated, oracle
@@ -29,16 +29,14 @@ from skin.signal.device_sampling import draw_constants, idle_excess, measure
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.signal.resampling import check_rate
 from skin.simulator.base import AbstractSimulator
-from skin.summary import summarise
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import Movie, TouchSampler, balanced
-from skin.touch.stream import TouchStream, draw_timeline, only_touches
+from skin.touch.stream import TouchStream, draw_timeline
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
 _BATCH = 1024
 _FEW = 10  # gestures
-_VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -162,7 +160,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the same touches with the applied force and the gestures' parameters."""
         recording = self._split(split, epoch, complete)
-        return replace(recording, metadata=self._metadata(recording, split, epoch))
+        return replace(recording, metadata=describe(self, recording, split, epoch))
 
     def source(self) -> Source:
         """Open a stream of test gestures, in real time."""
@@ -255,10 +253,3 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
         return replace(true, touches=self.tracker.estimate(touches), parameters=true.parameters | clipped)
-
-    def _metadata(self, recording: Recording, split: Split | None, epoch: int) -> dict[str, Any]:
-        about: dict[str, Any] = {"source": "simulated", "simulator": type(self.model).__name__}
-        about |= {"split": split or "budget", "epoch": epoch, "device_seed": self.seed}
-        shapes, summary = list(self.sampler.shapes.names), summarise(only_touches(recording), self.body)
-        about |= {"data_seed": self.data_seed, "shapes": shapes, "summary": summary}
-        return about | {"versions": _VERSIONS}

@@ -119,8 +119,8 @@ def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: Op
     danger = TOUCH.names.index(LABEL)
     found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    known = metrics(chances, labels, TOUCH, point)
-    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH), known)
+    overall = metrics(chances, labels, TOUCH, point)
+    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH), overall)
 
 
 def spans(said: Tensor, shares: Tensor) -> list[Span]:

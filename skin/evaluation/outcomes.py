@@ -42,8 +42,15 @@ def encode(
     return code.astype(np.uint8)
 
 
-def decode(outcomes: np.ndarray, metric: str, task: Task) -> np.ndarray | None:
-    """Return the contribution of each gesture to a metric, whose mean it is; None for other metrics.
+def decodable(metric: str, task: Task) -> bool:
+    """Return whether :func:`decode` knows a metric."""
+    label, _, kind = metric.partition("/")
+    known = label in (*task.names, "overall") and kind == "accuracy"
+    return known or metric in (f"{LABEL}/alarm_recall", f"{LABEL}/false_alarm_rate")
+
+
+def decode(outcomes: np.ndarray, metric: str, task: Task) -> np.ndarray:
+    """Return the contribution of each gesture to a metric, whose mean it is.
 
     Args:
         outcomes: (..., B), uint8.
@@ -53,14 +60,18 @@ def decode(outcomes: np.ndarray, metric: str, task: Task) -> np.ndarray | None:
 
     Returns:
         (..., B), float64; NaN for gestures that do not count: safe ones for a recall, for example.
+
+    Raises:
+        ValueError: another metric.
     """
+    if not decodable(metric, task):
+        raise ValueError(f"outcomes do not tell {metric}")
     alarm, dangerous = (outcomes & _ALARM) > 0, (outcomes & _DANGEROUS) > 0
-    counts = {f"{LABEL}/alarm_recall": dangerous, f"{LABEL}/false_alarm_rate": ~dangerous}
-    if metric in counts:
-        return np.where(counts[metric], alarm, np.nan)
-    label, _, kind = metric.partition("/")
-    if kind != "accuracy" or label not in (*task.names, "overall"):
-        return None
+    if metric == f"{LABEL}/alarm_recall":
+        return np.where(dangerous, alarm, np.nan)
+    if metric == f"{LABEL}/false_alarm_rate":
+        return np.where(dangerous, np.nan, alarm)
+    label = metric.partition("/")[0]
     names = task.names if label == "overall" else (label,)
-    right = [(outcomes >> task.names.index(name) & 1) == 0 for name in names]
-    return np.mean(right, axis=0)
+    right: np.ndarray = np.mean([(outcomes >> task.names.index(name) & 1) == 0 for name in names], axis=0)
+    return right

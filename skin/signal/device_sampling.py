@@ -5,7 +5,8 @@ import torch
 from scipy.special import ndtri
 from torch import Tensor
 
-from skin.signal.imperfection import Constants, Imperfection
+from skin.signal.constants import Constants
+from skin.signal.imperfection import Imperfection
 from skin.signal.resampling import resample
 
 _QUANTILES = 20000

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from skin.errors import InputError
 from skin.sensor_dynamics import apply_hysteresis, first_order_lag, quantize
 from skin.settings import RISING, check_settings
 from skin.signal.calibration import Calibration, read_calibration
+from skin.signal.constants import Constants
 
 _IDLE_FRAMES = 30
 
@@ -21,40 +22,6 @@ _SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant")
 
 Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
 """A number, or a range (least, most) of which each device draws its own."""
-
-
-class Constants(NamedTuple):
-    """What is fixed in a device; (S,), or (B, 1, S) where every gesture has a device of its own.
-
-    Attributes:
-        gain: factor on the true force.
-        offset: N.
-        baseline: what the device subtracts as its idle reading, N; 0 without tare.
-        dead: bool, sensors whose readings mean nothing: dead, stuck or saturated.
-        noise: standard deviation in every frame, N.
-        clip: largest force that a sensor measures, N.
-        level: constant reading of the sensors in ``dead``, N.
-        drift: N/s.
-        hysteresis: mean gap between unloading and loading, share of the touch's peak.
-        time_constant: of a first-order lag, s; 0: none.
-        quantum: step of the converter, N; 0: none.
-    """
-
-    gain: Tensor
-    offset: Tensor
-    baseline: Tensor
-    dead: Tensor
-    noise: Tensor
-    clip: Tensor
-    level: Tensor
-    drift: Tensor
-    hysteresis: Tensor
-    time_constant: Tensor
-    quantum: Tensor
-
-    def to(self, device: torch.device | str) -> "Constants":
-        """Return these constants on ``device``."""
-        return Constants(*(value.to(device) for value in self))
 
 
 @dataclass(kw_only=True)

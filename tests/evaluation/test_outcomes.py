@@ -24,8 +24,9 @@ def test_means_over_gestures_are_the_metrics():
         "dangerous/false_alarm_rate",
     ):  # fmt: skip
         assert np.nanmean(decode(codes, metric, TOUCH)) == pytest.approx(known[metric], abs=1e-6), metric
-    assert decode(codes, "overall/ece", TOUCH) is None
-    assert decode(codes, "made_up/accuracy", TOUCH) is None
+    for metric in ("overall/ece", "made_up/accuracy", "dangerous/degrees"):
+        with pytest.raises(ValueError, match=metric):
+            decode(codes, metric, TOUCH)
 
 
 @pytest.mark.parametrize("task", [TOUCH_OR_NOT, TOUCH_SLIDING, Task(("a", "b", "c"), "exclusive")])

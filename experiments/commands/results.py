@@ -65,6 +65,7 @@ class Results:
     part: str
     budget: Literal["full", "smoke"]
     file: str
+    jobs: Annotated[int, Ge(1)]
     fresh: bool
     parts: Mapping[str, Sequence[Mapping[str, Any]]]
     smoke: Mapping[str, Sequence[str]]
@@ -153,6 +154,8 @@ def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[st
             raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")
         words += chosen.smoke[verb] if smoke else ()
         words += [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
+        if chosen.jobs > 1 and verb == "train":
+            words += ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={chosen.jobs}"]
         words += [f"out={_folder(chosen, config)}"] if verb in ("table", "study") else []
         yield step.hours, [verb, *words, *given]
 

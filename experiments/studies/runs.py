@@ -55,7 +55,7 @@ def train_study(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]
 
 
 def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
-    """Return finished runs: the named one, or the newest ones of rows on the simulator of ``config``.
+    """Return finished runs: the named one, or the newest of rows and seeds on the simulator of ``config``.
 
     Runs of a row whose names differ in more than the seed are different variants.
 
@@ -70,7 +70,8 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     data = simulator(config)
     for run in store.find("FINISHED", simulator=data):
         row = run.data.tags["row"]
-        if "learned" in run.data.tags and (study.rows == "all" or row in study.rows):
+        wanted = study.rows == "all" or row in study.rows
+        if wanted and "learned" in run.data.tags and int(run.data.tags["seed"]) in study.seeds:
             one = Planned(Variant(_name(run), {"row": row}, {}), run.data.tags["seed"], run)
             found.setdefault((one.variant.name, one.seed), one)
     rows = {one.variant.chosen["row"] for one in found.values()}

@@ -20,9 +20,10 @@ RENAMED: dict[str, str] = {
 _LATER: dict[str, dict[str, Any]] = {
     "touch": {"stretch": 4.0, "leak": 0.6, "strict": False, "over_sensors": True},
     "layout": {"depth": None},
+    "evaluation": {"gestures": None},
 }
-# Settings of Lightning's Trainer that choose the machine, not the result.
-_MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
+MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
+"""Settings of Lightning's Trainer that choose the machine, not the result."""
 
 
 def config_hash(content: dict[str, Any]) -> str:
@@ -64,7 +65,7 @@ def _relevant(value: Any, group: str = "") -> Any:
     if group != "trainer":
         return kept
     # The CPU stands for all accelerators, as in earlier runs.
-    return {key: one for key, one in kept.items() if key not in _MACHINE} | {"accelerator": "cpu"}
+    return {key: one for key, one in kept.items() if key not in MACHINE} | {"accelerator": "cpu"}
 
 
 def _strings(value: Any) -> Iterator[str]:

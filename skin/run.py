@@ -30,6 +30,7 @@ from skin.evaluation.metrics_table import print_report as show
 from skin.evaluation.operating_point import check_evaluation, choose_operating_point
 from skin.evaluation.outcomes import OUTCOMES
 from skin.evaluation.report import Report, evaluate
+from skin.fingerprint import MACHINE
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.option import option_name
@@ -45,7 +46,8 @@ SWEPT = "SKIN_SWEPT"
 
 _STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
-_NAMED = ("experiment", "row", "seed", "simulator")  # a run's name has them in any case
+# A run's name has the first ones in any case; the others choose the machine.
+_NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
 
 
 class _OpenLogger(MLFlowLogger):

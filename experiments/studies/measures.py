@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt
 
 from experiments.studies.embedding.probe_settings import ProbeSettings
 from experiments.studies.subject import Measurement, Subject
+from skin.errors import InputError
 from skin.evaluation.stream_settings import StreamSettings
 
 
@@ -24,11 +25,11 @@ class Accuracy:
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
-        chances, task, point = (
-            subject.learner.probabilities(touches),
-            subject.device.task,
-            subject.of.trained.point,
-        )
+        task, point = subject.device.task, subject.of.trained.point
+        try:
+            chances = subject.learner.probabilities(touches)
+        except InputError as reason:  # another number of sensors, for example
+            return Measurement({}, cannot=str(reason))
         found = metrics(chances, touches.labels, task, point)
         outcomes = encode(chances, touches.labels, task, point)
         return Measurement({f"same/{name}": value for name, value in found.items()}, outcomes=outcomes)

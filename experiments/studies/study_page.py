@@ -105,8 +105,11 @@ def publish_study(
     """
     console = console or Console()
     changed = differences(study, trials)
+    further = study.metrics[1:] if any(one.condition for one in trials) else []
     tables = {
         "Variants": variants_table(trials, study.metrics),
+        # Where conditions take the columns, each metric has a table.
+        **({_heading(one): variants_table(trials, [one]) for one in further}),
         f"Differences in {_heading(study.metrics[0])}": differences_table(changed, study.metrics[0]),
         "Statements": statements_table(conclusions(study.statements, trials)),
     }
@@ -114,7 +117,8 @@ def publish_study(
     drawn = study_figure(trials, study.metrics[0], study.about) if any(one.run for one in trials) else None
     print(title)
     for name, each in told.items():
-        print_table(each, name, console, wrapped=("statement", "measured"))
+        if name not in map(_heading, further):
+            print_table(each, name, console, wrapped=("statement", "measured"))
     print(*write_page(Page("", told, _csv(study, trials), drawn), title, path), sep="\n")
 
 
@@ -168,7 +172,7 @@ def _cell(trials: Sequence[Trial], metric: str) -> str:
     """Return the mean and two standard errors."""
     figures = values(trials, metric)
     if not figures:
-        return ""
+        return "cannot" if any(one.cannot for one in trials) else ""
     across, gestures = values(trials, metric, "device"), by_gesture(trials, metric)
     mean, error = estimate(figures, across, gestures)
     if metric in ("seconds_per_epoch", "parameters", "self_share"):

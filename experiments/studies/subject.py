@@ -85,11 +85,13 @@ class Measurement:
         metrics: name -> value; shares are of 1.
         page: what is published; None where the metrics tell everything.
         outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
+        cannot: why the learner does not accept the touches; empty where it does.
     """
 
     metrics: dict[str, float]
     page: "Page | None" = None
     outcomes: "np.ndarray | None" = None
+    cannot: str = ""
 
 
 class Measure(Protocol):

@@ -45,6 +45,7 @@ class Trial:
         line: for a person; empty where there is only a table.
         files: of the measure.
         outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
+        cannot: why the run does not accept the touches of the condition; empty where it does.
     """
 
     variant: Variant
@@ -56,6 +57,7 @@ class Trial:
     line: str = ""
     files: Sequence[Path] = ()
     outcomes: np.ndarray | None = None
+    cannot: str = ""
 
 
 def run_trials(
@@ -99,7 +101,8 @@ def run_trials(
             files = _fetched(store, found, folder)
             metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
             at = planned.variant, planned.seed, condition, number, planned.run.data.tags["fingerprint"]
-            yield Trial(*at, metrics, said, files, load_outcomes(store, found))
+            cannot = found.data.tags.get("cannot", "")
+            yield Trial(*at, metrics, said, files, load_outcomes(store, found), cannot)
 
 
 def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -153,7 +156,9 @@ class _Run:
         with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
             found = what(subject)
             self.store.log_metrics(logged, found.metrics)
-            self.store.client.set_tag(logged.info.run_id, "outcome", found.page.about if found.page else "")
+            about = {"outcome": found.page.about if found.page else "", "cannot": found.cannot}
+            for name, text in about.items():
+                self.store.client.set_tag(logged.info.run_id, name, text)
             if found.page is not None:
                 run = re.sub(r"\W+", "_", self.run.info.run_name)
                 stem = f"{type(what).__name__.lower()}_{run}" + (f"_{tags['study'][:8]}" if changed else "")

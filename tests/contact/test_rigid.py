@@ -1,5 +1,7 @@
 """Gestures of rigid objects: their shape, their force, their labels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -210,7 +212,7 @@ def test_rounding_decides_nothing(wanted):
 def test_the_end_of_a_range_is_tried_itself(most):
     """The ball is big from 82.5 kPa on: wherever the search begins, it must not stop a little below that."""
     where, contact = problem(shapes=["blurred_disc"]), rigid(relief=0.002)
-    settings = GestureSettings(**dict(vars(where.settings), safe_peak=(10e3, 1.03 * most)))
+    settings = replace(where.settings, safe_peak=(10e3, 1.03 * most))
     for peak in np.linspace(10e3, 80e3, 9):
         stroke = still(0.065, peak=peak, wanted=(1, 0, 0, 0))
         assert not contact.press(stroke, where._replace(settings=settings)).refused.any(), peak

@@ -244,3 +244,20 @@ def test_every_imperfection_may_be_set_where_its_default_stands(configured):
     assert {name: device[name] for name in defaults} == defaults
     names = {entry.name for entry in fields(Simulated)}
     assert {name for name in device if not name.startswith("_")} == names - {"body", "layout"}
+
+
+def test_touches_between_the_sensors_count_if_asked_to():
+    """Of small dangerous touches, some press no sensor; over sensors, all do."""
+    few = {"layout": Grid(2, 2), "test_gestures": 320, **PERFECT}
+    shapes = {"shapes": ["disc"], "small_area": (0.005, 0.02)}
+    everywhere = device(touch=shapes | {"over_sensors": False}, **few).recording("test")
+    over = device(touch=shapes, **few).recording("test")
+    for recording, some in ((everywhere, True), (over, False)):
+        dangerous = recording.touches.labels[:, 3] > 0.5
+        felt = recording.touches.readings.amax(dim=(1, 2))
+        assert dangerous.sum() == 160
+        assert bool((felt[dangerous] == 0).any()) == some
+        pressure = recording.parameters["pressure"]
+        assert (pressure[dangerous] > 90.5e3).all()
+        assert (pressure[~dangerous] <= 90.5e3).all()
+    assert everywhere.parameters["draws"].mean() < over.parameters["draws"].mean()

@@ -24,7 +24,6 @@ SMALL = [
     "evaluation.devices=1",
     "evaluation.layouts=1",
     "evaluation.safe_gestures=64",
-    "evaluation.gestures=48",
 ]
 
 

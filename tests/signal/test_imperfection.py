@@ -194,3 +194,32 @@ def test_further_sensors_of_a_calibrated_device_may_die():
         Imperfection(dead=3, calibration=CALIBRATION).constants(3, generator())
     with pytest.raises(InputError, match=r"the calibration has 3 sensors, the layout 25"):
         imperfection.constants(25, generator())
+
+
+def test_a_device_takes_one_share_of_all_its_ranges():
+    ranges = {"noise": [0.05, 0.2], "time_constant": (0.0, 0.2), "hysteresis": [0.0, 0.1], "offset": 0.0}
+    drawn = Imperfection(**ranges).constants(5, generator(), gestures=2000)
+    share = (drawn.noise - 0.05) / 0.15
+    assert share.shape == (2000, 1, 1)
+    assert 0 <= share.min() < 0.01 < 0.99 < share.max() <= 1
+    assert share.mean() == pytest.approx(0.5, abs=0.03)
+    torch.testing.assert_close(drawn.time_constant, 0.2 * share)
+    torch.testing.assert_close(drawn.hysteresis, 0.1 * share)
+    one = Imperfection(**ranges).constants(5, generator(1))
+    assert 0.05 <= one.noise.item() <= 0.2
+
+
+def test_spreads_grow_with_the_share_of_a_device():
+    drawn = Imperfection(noise=[0.0, 1.0], gain_spread=[0.0, 0.4], drift=[0.0, 0.1]).constants(
+        25, generator(), gestures=2000
+    )
+    share = drawn.noise[:, 0, 0]
+    for value, most in ((drawn.gain.log(), 0.4), (drawn.drift, 0.1)):
+        spread = value[:, 0].std(dim=1)
+        assert (spread / (most * share)).median().item() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("given", [[0.2, 0.1], [-0.1, 0.1], [0.1], "much"])
+def test_what_is_no_range_is_refused(given):
+    with pytest.raises(InputError, match=r"device\.noise"):
+        Imperfection(noise=given)

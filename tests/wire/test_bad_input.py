@@ -103,7 +103,7 @@ def test_an_unplugged_skin_is_recorded_on_with_a_gap_marker(new_plug, tmp_path):
     thread.start()
     while not ready:
         sleep(0.001)
-    settings = {"window": 10, "tare": 1.0, "timeout": PATIENT, "backoff": (0.01, 0.05)}
+    settings = {"touch": {"window": 1.0}, "tare": 1.0, "timeout": PATIENT, "backoff": (0.01, 0.05)}
     device = Serial(body=SHEET, layout=Grid(2, 2), port=str(link), **settings)
     record_session(device, path, 8.0, True, said.append)
     over.append(True)

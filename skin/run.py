@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 import sys
 import tempfile
 from contextlib import redirect_stderr, redirect_stdout
@@ -40,6 +41,7 @@ from skin.settings import import_target
 from skin.source import note_reuse
 from skin.stored_run import TAG
 from skin.tracking import Store
+from skin.unfinished import find_unfinished, unfinished_folder
 
 SWEPT = "SKIN_SWEPT"
 """Environment variable with the settings that a sweep varies, for its jobs."""
@@ -64,7 +66,8 @@ class _OpenLogger(MLFlowLogger):
 def train(config: DictConfig) -> bool:
     """Train and evaluate a configuration; return False if a finished run has the results.
 
-    A run that finished with the same fingerprint is not repeated, unless ``tracking.resume=false``.
+    A run that finished with the same fingerprint is not repeated, and one that was killed is continued,
+    unless ``tracking.resume=false``.
     """
     quiet()
     _limit_threads(config.tracking.threads)
@@ -86,8 +89,10 @@ def train(config: DictConfig) -> bool:
     learner.check(data)
     report_balance(device, shown=PARENT not in os.environ)
     name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
-    with store.run(name, identity, os.environ.get(PARENT)) as run:
+    again = find_unfinished(store, config.tracking, identity["fingerprint"])
+    with store.run(name, identity, os.environ.get(PARENT), again) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
+        learner.unfinished = unfinished_folder(config.tracking, run)
         describe(store, run.info.run_id, config, data.touches("train"))
         learner.fit(data, logger)
         point = choose_operating_point(learner, device, config.evaluation)
@@ -95,6 +100,7 @@ def train(config: DictConfig) -> bool:
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
         _keep(store, run, learner)
         log_report(store, run, report, device.task, values)
+    shutil.rmtree(learner.unfinished, ignore_errors=True)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True

@@ -118,10 +118,23 @@ class Store:
                 self.client.set_terminated(run.info.run_id, "KILLED")
 
     @contextmanager
-    def run(self, name: str, tags: dict[str, str], parent: str | None = None) -> Iterator[Run]:
-        """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal."""
+    def run(
+        self, name: str, tags: dict[str, str], parent: str | None = None, again: Run | None = None
+    ) -> Iterator[Run]:
+        """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal.
+
+        Args:
+            name: of the run.
+            tags: of the run.
+            parent: id of the run of its sweep.
+            again: a killed run to open instead of a new one.
+        """
         tags = tags | source_tags() | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
-        run = self.create(name, tags)
+        run = again or self.create(name, tags)
+        if again:
+            self.client.update_run(run.info.run_id, status="RUNNING")
+            for key, value in (tags | {PROCESS: _me()}).items():
+                self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
         try:
             with ends_on_signal():

@@ -21,10 +21,13 @@ class AbstractLearner(ABC):
     Attributes:
         parameters: number of trained parameters, known after ``fit`` or ``load``.
         seconds_per_epoch: median duration of one training epoch, s, known after ``fit``.
+        unfinished: existing folder in which ``fit`` may keep its progress, and from which a later ``fit``
+            with the same settings and data continues; None: nothing is kept.
     """
 
     parameters: int
     seconds_per_epoch: float
+    unfinished: Path | None = None
 
     def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
         """Raise InputError if the learner cannot be fitted, before anything is logged."""

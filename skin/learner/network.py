@@ -2,7 +2,8 @@
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
+LAST = "last.ckpt"
+"""Name of the checkpoint that continues an unfinished training."""
 CHUNK = 64  # touches at a time when predicting: fastest, and bounds memory to a few hundred MB
 
 
@@ -81,33 +84,47 @@ class Network(AbstractLearner):
     def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
         """Train on the training split; the validation loss chooses the epoch.
 
-        With several processes, only the first has the trained weights.
+        With several processes, only the first has the trained weights; they continue no earlier training.
 
         Raises:
             InputError: the choices do not fit each other or the data.
         """
         from pytorch_lightning.callbacks import ModelCheckpoint
 
-        from skin.learner._clock import Clock
+        from skin.learner._callbacks import Clock, RandomState
 
-        with torch.random.fork_rng(), TemporaryDirectory() as folder:
+        with torch.random.fork_rng(), self._folder() as folder:
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
-            clock = Clock(Path(folder) / "seconds.json")
-            trainer = self._trainer_of(logger, [best, clock], folder)
+            clock, callbacks, last = Clock(folder / "seconds.json"), [], folder / LAST
+            if self.unfinished:
+                # after `best`, whose state it saves
+                every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
+                callbacks = [RandomState(), every]
+            trainer = self._trainer_of(logger, [best, clock, *callbacks], folder)
+            again = last if last.is_file() and trainer.world_size == 1 else None
             with warnings.catch_warnings():
                 # Lightning 2.6 asks torch 2.13 for a deprecated class
                 warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)
-                trainer.fit(classifier, datamodule=data)
+                trainer.fit(classifier, datamodule=data, ckpt_path=again, weights_only=True)
             if not trainer.is_global_zero:
                 return
             weights = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
             classifier.load_state_dict(weights["state_dict"])
             self.seconds_per_epoch = clock.median()
 
+    @contextmanager
+    def _folder(self) -> Iterator[Path]:
+        """Yield the folder for checkpoints: the one that outlives this process, or a temporary one."""
+        if self.unfinished:
+            yield self.unfinished
+            return
+        with TemporaryDirectory() as folder:
+            yield Path(folder)
+
     def _trainer_of(
-        self, logger: "Logger | None", callbacks: "list[Callback]", folder: str | None = None
+        self, logger: "Logger | None", callbacks: "list[Callback]", folder: Path | None = None
     ) -> "Trainer":
         """Return Lightning's trainer; callbacks and loggers of its settings join ours.
 

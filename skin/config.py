@@ -113,6 +113,7 @@ class Config:
     validate: dict[str, Any] | None = None
     benchmark: dict[str, Any] | None = None
     results: dict[str, Any] | None = None
+    design: dict[str, Any] | None = None
 
 
 def validate_config(config: DictConfig) -> DictConfig:

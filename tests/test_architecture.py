@@ -25,7 +25,7 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build
+evaluation build unfinished
 stored_run
 trained
 hardware

@@ -1,0 +1,22 @@
+"""Compute what a skin can know, and where to put its sensors.
+
+    skin design simulator=solid                        # the bound of place, radius and force of a fingertip
+    skin design design=place simulator=solid design.count=16
+
+Writes tables, pictures and JSON into out=.
+"""
+
+from omegaconf import DictConfig
+
+from skin.command import command
+from skin.config import plain
+from skin.files import results
+from skin.settings import configured, import_target
+
+
+@command("design")
+def main(config: DictConfig) -> None:
+    """Build the chosen analysis from its settings, run it and write its files."""
+    settings = plain(config)["design"]
+    target = import_target(settings.pop("_target_"), "design")
+    configured(target, settings, "design").run(config, results(config.out))

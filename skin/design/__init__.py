@@ -1,0 +1,1 @@
+"""What a skin can know, and where to put its sensors."""

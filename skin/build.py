@@ -1,26 +1,62 @@
 """Build the objects that a configuration names, group by group."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from skin.body.base import AbstractBody
 from skin.config import plain
 from skin.device.base import AbstractDevice
+from skin.layout.base import AbstractLayout
 from skin.learner.base import AbstractLearner
 from skin.plausibility import check_plausibility, warn_of_surface
+from skin.sensors import Sensors
 from skin.settings import check_groups, configured
+from skin.simulator.base import AbstractSimulator
 
 if TYPE_CHECKING:
     from skin.datamodule import TouchData
 
 
+@dataclass(frozen=True)
+class Skin:
+    """A body with sensors and a simulator, without touches.
+
+    Attributes:
+        body: the body.
+        layout: the layout of the sensors.
+        sensors: those of the layout in the body.
+        simulator: ``simulator(body, sensors)``.
+    """
+
+    body: AbstractBody
+    layout: AbstractLayout
+    sensors: Sensors
+    simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
+
+
+def build_skin(config: DictConfig) -> Skin:
+    """Return the body, the sensors and the simulator."""
+    groups = plain(config)
+    body, layout = _body_and_layout(groups, "simulator")
+    sensors, simulator = layout.sensors(body), instantiate(groups["simulator"])
+    return Skin(body, layout, sensors, simulator)
+
+
+def _body_and_layout(groups: dict[str, Any], source: str) -> tuple[AbstractBody, AbstractLayout]:
+    """Check body, layout and the group of what responds to touches; return the first two."""
+    check_groups({name: groups[name] for name in ("body", "layout", source)})
+    check_plausibility(groups)
+    return instantiate(groups["body"]), instantiate(groups["layout"])
+
+
 def build_device(config: DictConfig) -> AbstractDevice:
     """Return the device, with its body, layout and, if it has one, its simulator."""
     groups = plain(config)
-    check_groups({name: groups[name] for name in ("body", "layout", "device")})
-    check_plausibility(groups)
-    body, layout = instantiate(groups["body"]), instantiate(groups["layout"])
+    body, layout = _body_and_layout(groups, "device")
     # Not arguments of instantiate, which would treat the dataclass of the body as a configuration.
     device: AbstractDevice = instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
     if device.simulation is not None and device.simulation.model.mechanical:

@@ -29,7 +29,7 @@ evaluation build unfinished
 stored_run
 trained
 hardware
-plot
+plot design
 console progress variants
 run
 sweep

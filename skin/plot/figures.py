@@ -15,7 +15,8 @@ Layout = tuple[tuple[float, float], float]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's palette: told apart by colour-blind readers too."""
 
-_MARKS = ("o", "s", "^", "D")
+MARKS = ("o", "s", "^", "D")
+"""Markers of lines, so that they differ without colour."""
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
@@ -140,7 +141,7 @@ def misclassified(
     axis = figure.subplots()
     middles = np.concatenate([[0.0], (bins[1:] + bins[:-1]) / 2])
     # Every colour comes with one mark after the other, so that any number of rows can be told apart.
-    styles = product(_MARKS, COLOURS)
+    styles = product(MARKS, COLOURS)
     for (row, (shares, errors)), (mark, colour) in zip(courses.items(), styles, strict=False):
         axis.errorbar(
             middles * 1e3, shares, errors, marker=mark, markersize=4, capsize=2, color=colour, label=row

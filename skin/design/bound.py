@@ -1,0 +1,179 @@
+"""What a skin can know of a fingertip: the Cramer-Rao bound, blind touches and the receptive radius."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from annotated_types import Ge, Gt, MinLen
+from omegaconf import DictConfig
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from scipy.stats.qmc import Halton
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.build import build_skin
+from skin.design.fingertip import Fingertip
+from skin.design.information import Noise, Sensitivity, covariance_bound, sensitivity
+from skin.errors import InputError
+from skin.files import write
+from skin.settings import RISING, checked
+from skin.simulator.base import AbstractSimulator
+
+Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is known of touches with one force; bounds are standard deviations.
+
+    Attributes:
+        force_N: of the touches.
+        blind_share: touches that raise no sensor above three standard deviations of the noise of a frame.
+        place_m: bound of the place, the root of the mean variance along x and y, median over touches.
+        place_90_m: its 90 % quantile.
+        radius_m: median bound of the radius.
+        force_relative: median bound of the force, as a share of it.
+        receptive_radius_m: radius of the disc with the area over which a touch raises a sensor above three
+            standard deviations, median over sensors.
+    """
+
+    force_N: float  # noqa: N815 - the unit
+    blind_share: float
+    place_m: float
+    place_90_m: float
+    radius_m: float
+    force_relative: float
+    receptive_radius_m: float
+
+
+@checked("design")
+@dataclass(frozen=True, kw_only=True)
+class Bound:
+    """Bounds how precisely a skin locates fingertips and measures their force.
+
+    Touches are spread evenly over places, at least ``margin`` from the edges, and over radii (Halton points).
+    The priors are the standard deviations of a uniform distribution over the surface and over the radii, and
+    half of the force.
+
+    Args:
+        forces: N.
+        radii: least and largest radius of a fingertip, m.
+        rim: softness of its edge, m (:class:`skin.design.fingertip.Fingertip`).
+        frames: number of frames of a touch that are averaged.
+        noise: standard deviation of a sensor's noise in a frame, N.
+        gain: standard deviation of the unknown gain of a sensor, relative.
+        clip: largest force that a sensor measures, N.
+        margin: m.
+        touches: number of touches.
+        seed: of the touches.
+    """
+
+    forces: Annotated[Sequence[PositiveFloat], MinLen(1)] = (1.0, 5.0, 20.0)
+    radii: Lengths = (0.004, 0.012)
+    rim: PositiveFloat = 0.0015
+    frames: PositiveInt = 10
+    noise: Annotated[float, Gt(0)] = 0.05
+    gain: NonNegativeFloat = 0.0
+    clip: PositiveFloat = 10.0
+    margin: NonNegativeFloat = 0.015
+    touches: Annotated[int, Ge(16)] = 1024
+    seed: Annotated[int, Ge(0)] = 0
+
+    def run(self, config: DictConfig, folder: Path) -> None:
+        """Write design.json and design.png for the configured skin, and print a table.
+
+        Raises:
+            InputError: a skin that cannot be built, or a margin that leaves no place.
+        """
+        from skin.plot.design import draw_bounds, print_bounds
+
+        skin = build_skin(config)
+        simulator = skin.simulator(skin.body, skin.sensors)
+        found = self.find(simulator, skin.body)
+        about = {
+            "sensors": len(skin.sensors),
+            "settings": asdict(self),
+            "bounds": [asdict(one) for one in found],
+        }
+        print_bounds(found)
+        write(json.dumps(about, indent=2) + "\n", folder / "design.json")
+        maps = self.maps(simulator, skin.body)
+        print(
+            draw_bounds(
+                skin.body, skin.sensors, dict(zip(self.forces, maps, strict=True)), folder / "design.png"
+            )
+        )
+
+    def find(self, simulator: AbstractSimulator, body: AbstractBody) -> list[Findings]:
+        """Return the findings for each force.
+
+        Raises:
+            InputError: the margin leaves no place.
+        """
+        touches = self.sample(body)
+        felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
+        area = math.prod(self._extent(body))
+        return [self._findings(felt.of_force(force), force, body, area) for force in self.forces]
+
+    def _findings(self, felt: Sensitivity, force: float, body: AbstractBody, area: float) -> Findings:
+        place, radius, relative = self._bounds(felt, force, body)
+        raised = self._noise.felt(felt.readings)
+        reach = (raised.double().mean(0) * area / math.pi).sqrt()
+        numbers = (
+            (~raised.any(1)).double().mean(),
+            place.median(),
+            place.quantile(0.9),
+            radius.median(),
+            relative.median(),
+            reach.median(),
+        )
+        return Findings(force, *map(float, numbers))
+
+    def _bounds(self, felt: Sensitivity, force: float, body: AbstractBody) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the bounds of place, m, radius, m, and force, relative; each (B,)."""
+        covariance = covariance_bound(felt, self._noise, self.priors(force, body))
+        variances = covariance.diagonal(dim1=1, dim2=2)
+        return variances[:, :2].mean(1).sqrt(), variances[:, 2].sqrt(), variances[:, 3].sqrt() / force
+
+    @property
+    def _noise(self) -> Noise:
+        return Noise(self.noise, self.frames, self.gain, self.clip)
+
+    def priors(self, force: float, body: AbstractBody) -> Tensor:
+        """Return the standard deviations of x, y, radius and force before a touch, (4,), m and N."""
+        spreads = [*body.size, self.radii[1] - self.radii[0]]
+        return torch.tensor([spread / math.sqrt(12) for spread in spreads] + [force / 2]).double()
+
+    def sample(self, body: AbstractBody) -> Tensor:
+        """Return touches with a force of 1 N, (B, 4).
+
+        Raises:
+            InputError: the margin leaves no place.
+        """
+        shares = torch.from_numpy(Halton(3, seed=self.seed).random(self.touches))
+        least = torch.tensor([self.margin, self.margin, self.radii[0]]).double()
+        extent = torch.tensor([*self._extent(body), self.radii[1] - self.radii[0]]).double()
+        return torch.cat([least + shares * extent, torch.ones(self.touches, 1)], dim=1)
+
+    def _extent(self, body: AbstractBody) -> tuple[float, float]:
+        width, height = (side - 2 * self.margin for side in body.size)
+        if min(width, height) <= 0:
+            raise InputError(
+                f"design.margin={self.margin:g} m leaves no place on {body.size[0]:g} x {body.size[1]:g} m: "
+                f"give less than {min(body.size) / 2:g}"
+            )
+        return width, height
+
+    def maps(self, simulator: AbstractSimulator, body: AbstractBody) -> Tensor:
+        """Return the bound of the place for a touch of mean radius on each cell, (forces, H, W), m."""
+        x, y = ((torch.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
+        down, across = torch.meshgrid(y, x, indexing="ij")
+        rest = torch.tensor([sum(self.radii) / 2, 1.0]).expand(across.numel(), 2)
+        touches = torch.cat([torch.stack([across, down], -1).flatten(0, 1), rest], dim=1)
+        felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
+        places = [self._bounds(felt.of_force(force), force, body)[0] for force in self.forces]
+        return torch.stack(places).unflatten(1, body.shape)

@@ -1,0 +1,114 @@
+"""Tables and pictures of what a skin can know."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.design.bound import Findings
+from skin.design.sweep import Step
+from skin.plot.figures import COLOURS, MARKS, save_figure
+from skin.sensors import Sensors
+
+
+def print_bounds(found: Sequence[Findings]) -> None:
+    """Print one line per force; the reach is the receptive radius."""
+    names = ("force, N", "blind, %", "place, mm", "90 %, mm", "radius, mm", "force, %", "reach, mm")
+    table = Table(*names, title="Bounds of a fingertip (median over touches)")
+    for one in found:
+        lengths = one.place_m, one.place_90_m, one.radius_m
+        table.add_row(
+            f"{one.force_N:g}",
+            f"{100 * one.blind_share:.1f}",
+            *(f"{1e3 * length:.2f}" for length in lengths),
+            f"{100 * one.force_relative:.1f}",
+            f"{1e3 * one.receptive_radius_m:.1f}",
+        )
+    Console().print(table)
+
+
+def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tensor], path: Path) -> Path:
+    """Draw the bound of the place on the surface for each force, with the sensors, and return the path.
+
+    Args:
+        body: the skin.
+        sensors: in it.
+        maps: force, N -> bound on each cell, (H, W), m.
+        path: x.png.
+    """
+    panel = np.array(body.size) * 2.8 / max(body.size)  # inches
+    figure = Figure(figsize=(1.6 + len(maps) * (panel[0] + 0.2), panel[1] + 0.9), layout="constrained")
+    axes = figure.subplots(1, len(maps), squeeze=False, sharey=True)[0]
+    shown = {force: 1e3 * np.asarray(bound) for force, bound in maps.items()}
+    scale = LogNorm(min(one.min() for one in shown.values()), max(one.max() for one in shown.values()))
+    extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
+    for axis, (force, bound) in zip(axes, shown.items(), strict=True):
+        picture = axis.imshow(bound, cmap="viridis_r", norm=scale, extent=extent)
+        x, y = 1e3 * sensors.positions[:, :2].T
+        axis.plot(x, y, "o", color="white", markeredgecolor="black", markersize=4)
+        axis.set(title=f"{force:g} N", xlabel="x, mm")
+    axes[0].set_ylabel("y, mm")
+    figure.colorbar(picture, ax=axes, label="bound of the place, mm", format="%g")
+    return save_figure(figure, path)
+
+
+def print_sweep(steps: Sequence[Step]) -> None:
+    """Print one line per step and force."""
+    names = (
+        "thickness, mm",
+        "sensors",
+        "pitch, mm",
+        "force, N",
+        "blind, %",
+        "place, mm",
+        "90 %, mm",
+        "force, %",
+    )
+    table = Table(*names, title="Bounds of a fingertip (median over touches)")
+    for step in steps:
+        for one in step.findings:
+            table.add_row(
+                f"{1e3 * step.thickness:g}",
+                f"{step.grid[0]} x {step.grid[1]}",
+                f"{1e3 * step.pitch:.0f}",
+                f"{one.force_N:g}",
+                f"{100 * one.blind_share:.1f}",
+                f"{1e3 * one.place_m:.2f}",
+                f"{1e3 * one.place_90_m:.2f}",
+                f"{100 * one.force_relative:.1f}",
+            )
+    Console().print(table)
+
+
+def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
+    """Draw the bound of the place against thickness, one line per number of sensors, and return the path.
+
+    Args:
+        steps: with the same forces.
+        path: x.png.
+    """
+    forces = [one.force_N for one in steps[0].findings]
+    figure = Figure(figsize=(1 + 4.2 * len(forces), 3.6), layout="constrained")
+    axes = figure.subplots(1, len(forces), squeeze=False, sharey=True)[0]
+    for number, (axis, force) in enumerate(zip(axes, forces, strict=True)):
+        for line, grid in enumerate(dict.fromkeys(step.grid for step in steps)):
+            mine = [step for step in steps if step.grid == grid]
+            axis.plot(
+                [1e3 * step.thickness for step in mine],
+                [1e3 * step.findings[number].place_m for step in mine],
+                marker=MARKS[line % len(MARKS)],
+                color=COLOURS[line % len(COLOURS)],
+                label=f"{grid[0]} x {grid[1]} sensors",
+            )
+        axis.set(title=f"{force:g} N", xlabel="thickness, mm", yscale="log")
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.grid(which="both", alpha=0.3)
+    axes[0].set_ylabel("bound of the place, mm")
+    axes[-1].legend()
+    return save_figure(figure, path)

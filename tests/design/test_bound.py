@@ -1,0 +1,84 @@
+"""`skin design` as a person runs it."""
+
+import csv
+import json
+
+import pytest
+
+SMALL = (
+    "design", "body.size=[0.24,0.08]", "body.cells=[24,8]", "layout=grid", "layout.rows=3", "layout.columns=3",
+    "design.touches=64",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_bounds_of_nine_sensors(run, tmp_path):
+    done = run(tmp_path, *SMALL, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
+    assert done.returncode == 0, done.stderr
+    assert "Bounds of a fingertip" in done.stdout
+    found = json.loads((tmp_path / "x" / "design.json").read_text())
+    assert found["sensors"] == 9
+    weak, middle, strong = found["bounds"]
+    assert [one["force_N"] for one in (weak, middle, strong)] == [1, 5, 20]
+    prior = (0.24**2 / 24 + 0.08**2 / 24) ** 0.5  # the root of the mean of both variances
+    for name, most in {"place_m": prior, "radius_m": 0.008 / 12**0.5, "force_relative": 0.5}.items():
+        assert 0 < strong[name] < middle[name] < weak[name] < most * (1 + 1e-9)
+    assert 0 <= strong["blind_share"] < middle["blind_share"] < weak["blind_share"] <= 1
+    assert strong["receptive_radius_m"] > weak["receptive_radius_m"]
+    assert (tmp_path / "x" / "design.png").stat().st_size > 10_000
+
+
+def test_a_skin_without_mechanics_has_a_bound_too(run, tmp_path):
+    done = run(tmp_path, *SMALL, "simulator=naive", "out=x", store=False)
+    assert done.returncode == 0, done.stderr
+    weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["bounds"]
+    # A touch beside every sensor's cell raises none, however hard it is.
+    assert 0.5 < strong["blind_share"] <= weak["blind_share"] < 1
+
+
+@pytest.mark.slow
+def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
+    given = (
+        "design=sweep",
+        "design.thicknesses=[0.015,0.03]",
+        "design.grids=[[2,4],[2,6]]",
+        "design.margin=0.02",
+    )
+    done = run(tmp_path, *SMALL, *given, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "x" / "design_sweep.csv").open(newline="") as file:
+        lines = [{name: float(value) for name, value in line.items()} for line in csv.DictReader(file)]
+    assert [(line["thickness_m"], line["columns"]) for line in lines] == [
+        (0.015, 4),
+        (0.015, 6),
+        (0.03, 4),
+        (0.03, 6),
+    ]
+    assert lines[0]["pitch_m"] == pytest.approx(0.05)
+    assert lines[1]["place_m"] < lines[0]["place_m"]
+    assert (tmp_path / "x" / "design_sweep.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            ["design.margin=0.04"],
+            "design.margin=0.04 m leaves no place on 0.24 x 0.08 m: give less than 0.04",
+        ),
+        (["design.noise=0"], "design.noise=0 must be greater than 0"),
+        (["design.radii=[0.01,0.002]"], "must be a range [least, most]"),
+        (["device.noise=[0.05,0.2]"], "design.noise="),
+        (["design=sweep", "simulator=naive"], "needs a simulator with mechanics: set simulator=solid"),
+        (["design=sweep", "design.height=0.02", "simulator=solid"], "design.height=0.02 m is not inside"),
+        (["body=arm", "simulator=fem", "~body.size"], "simulator=solid"),
+        (["design=placement"], "Could not find 'design/placement'"),
+    ],
+)
+def test_refuses(run, tmp_path, given, words):
+    first = [one for one in SMALL if "body=arm" not in given or not one.startswith("body.")]
+    done = run(tmp_path, *first, *[one for one in given if not one.startswith("~")], "out=x", store=False)
+    assert done.returncode == 2, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "x").exists()

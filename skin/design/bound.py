@@ -23,6 +23,12 @@ from skin.files import write
 from skin.settings import RISING, checked
 from skin.simulator.base import AbstractSimulator
 
+_UNITS = {
+    **dict.fromkeys(("radii", "rim", "margin"), "_m"),
+    **dict.fromkeys(("forces", "noise", "clip"), "_N"),
+    "gain": "_relative",
+}
+
 Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 
 
@@ -94,18 +100,14 @@ class Bound:
         skin = build_skin(config)
         simulator = skin.simulator(skin.body, skin.sensors)
         found = self.find(simulator, skin.body)
-        about = {
-            "sensors": len(skin.sensors),
-            "settings": asdict(self),
-            "bounds": [asdict(one) for one in found],
-        }
+        maps = dict(zip(self.forces, self.maps(simulator, skin.body), strict=True))
         print_bounds(found)
-        write(json.dumps(about, indent=2) + "\n", folder / "design.json")
-        maps = self.maps(simulator, skin.body)
+        settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
+        about = {"sensors": len(skin.sensors), "settings": settings, "bounds": [asdict(one) for one in found]}
         print(
-            draw_bounds(
-                skin.body, skin.sensors, dict(zip(self.forces, maps, strict=True)), folder / "design.png"
-            )
+            write(json.dumps(about, indent=2) + "\n", folder / "design.json"),
+            draw_bounds(skin.body, skin.sensors, maps, folder / "design.png"),
+            sep="\n",
         )
 
     def find(self, simulator: AbstractSimulator, body: AbstractBody) -> list[Findings]:

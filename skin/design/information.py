@@ -89,11 +89,9 @@ def _parts(
             along = torch.zeros_like(part)
             along[:, axis] = 1
             # Touches do not influence each other, so one direction serves all of them.
-            readings, slope = torch.func.jvp(
-                lambda one: simulator(fingertip(one)).readings, (part,), (along,)
-            )
-            slopes.append(slope)
-        yield readings, torch.stack(slopes, dim=-1)
+            found = torch.func.jvp(lambda one: simulator(fingertip(one)).readings, (part,), (along,))
+            slopes.append(found[1])
+        yield found[0], torch.stack(slopes, dim=-1)
 
 
 def covariance_bound(sensitivity: Sensitivity, noise: Noise, priors: Tensor) -> Tensor:

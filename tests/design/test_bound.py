@@ -6,8 +6,8 @@ import json
 import pytest
 
 SMALL = (
-    "design", "body.size=[0.24,0.08]", "body.cells=[24,8]", "layout=grid", "layout.rows=3", "layout.columns=3",
-    "design.touches=64",
+    "design", "body.size=[0.24,0.08]", "body.cells=[24,8]", "layout=grid", "layout.rows=3",
+    "layout.columns=3", "design.touches=64",
 )  # fmt: skip
 
 
@@ -18,6 +18,7 @@ def test_the_bounds_of_nine_sensors(run, tmp_path):
     assert "Bounds of a fingertip" in done.stdout
     found = json.loads((tmp_path / "x" / "design.json").read_text())
     assert found["sensors"] == 9
+    assert found["settings"]["noise_N"] == 0.05
     weak, middle, strong = found["bounds"]
     assert [one["force_N"] for one in (weak, middle, strong)] == [1, 5, 20]
     prior = (0.24**2 / 24 + 0.08**2 / 24) ** 0.5  # the root of the mean of both variances

@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 
 from skin.config import Tracking
 from skin.errors import InputError
+from skin.evaluation.outcomes import OUTCOMES
 from skin.files import whole
 from skin.tracking import PROCESS, RECORDED, Store
 
@@ -42,7 +43,7 @@ _SCHEMA = pa.schema(
 _MAPS = ("tags", "params", "metrics", "files")
 _IDENTITY = ("fingerprint", "members", "evaluated", "study")
 _CONFIGURATION = "config.yaml"
-_KEPT = (_CONFIGURATION, "outcomes.npy")  # files of a training that are recorded
+_KEPT = (_CONFIGURATION, OUTCOMES)  # files of a training that are recorded
 
 
 def read_records(path: Path) -> list[Record]:

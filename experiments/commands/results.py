@@ -153,11 +153,21 @@ def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[st
         if smoke and verb not in chosen.smoke:
             raise InputError(f"results.smoke has no settings for skin {verb}: add +results.smoke.{verb}=[]")
         words += chosen.smoke[verb] if smoke else ()
-        words += [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
+        if verb != "design":
+            words += [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
         if chosen.jobs > 1 and verb == "train":
             words += ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={chosen.jobs}"]
-        words += [f"out={_folder(chosen, config)}"] if verb in ("table", "study") else []
+        folder = _folder(chosen, config)
+        if verb == "design":  # has no runs, and takes no settings of trainings
+            yield step.hours, [verb, *_within(folder, words)]
+            continue
+        words += [f"out={folder}"] if verb in ("table", "study") else []
         yield step.hours, [verb, *words, *given]
+
+
+def _within(folder: Path, words: Sequence[str]) -> list[str]:
+    """Return overrides with the place of the results in a folder."""
+    return [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
 
 
 def _folder(chosen: Results, config: DictConfig) -> Path:

@@ -94,7 +94,7 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
         path: x.png.
     """
     forces = [one.force_N for one in steps[0].findings]
-    figure = Figure(figsize=(1 + 4.2 * len(forces), 3.6), layout="constrained")
+    figure = Figure(figsize=(2.3 + 4.2 * len(forces), 3.6), layout="constrained")
     axes = figure.subplots(1, len(forces), squeeze=False, sharey=True)[0]
     for number, (axis, force) in enumerate(zip(axes, forces, strict=True)):
         for line, grid in enumerate(dict.fromkeys(step.grid for step in steps)):
@@ -110,5 +110,5 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
         axis.yaxis.set_major_formatter("{x:g}")
         axis.grid(which="both", alpha=0.3)
     axes[0].set_ylabel("bound of the place, mm")
-    axes[-1].legend()
+    axes[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return save_figure(figure, path)

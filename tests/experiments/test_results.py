@@ -21,6 +21,7 @@ PARTS = [
     "results.parts.studies=[{run: 'study study=pair study.rows=[rules] study.seeds=[0,1]', hours: 1}]",
     "results.parts.shifts=[]",
     "results.parts.peers=[]",
+    "results.parts.design=[]",
     "results.file=runs.parquet",
     "out=docs",
 ]
@@ -78,10 +79,21 @@ def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
     assert not (tmp_path / "runs.parquet").exists()
 
 
+@pytest.mark.slow
+def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
+    parts = "results.parts.design=[{run: 'design design.touches=64 simulator=naive out=a/b', hours: 1}]"
+    done = run(tmp_path, "results", *PARTS, parts, "results.part=design", "results.budget=smoke", *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "docs" / "a" / "b" / "design.json").is_file()
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["results.part=tables"], "results.part=tables is none of all, table, peers, shifts, studies"),
+        (
+            ["results.part=tables"],
+            "results.part=tables is none of all, table, peers, shifts, studies, design",
+        ),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.action=show"], "results.action"),
         (["results.check.seed=-1"], "results.check.seed"),

@@ -30,6 +30,7 @@ stored_run
 trained
 hardware
 plot
+design
 console progress variants
 run
 sweep

@@ -46,5 +46,5 @@ def placement(
     x, y = 1e3 * chosen.T
     marks += axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label=f"placed, {len(chosen)}")
     axis.set(xlabel="x, mm", ylabel="y, mm", xlim=extent[:2], ylim=extent[2:], aspect="equal", title=title)
-    figure.legend(handles=marks, loc="outside right upper", frameon=False)
+    axis.legend(handles=marks, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
     return figure

@@ -41,9 +41,8 @@ def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sequence[int
     """Choose sites one by one, each with the largest gain of information.
 
     The gain of a site is half the logarithm of its variance given the chosen ones. A pivoted Cholesky
-    factorisation updates all these variances in O(C k) per step, so a lazy evaluation of gains would save
-    nothing. The choice has at least 1 - 1/e of the largest information (Nemhauser, Wolsey and Fisher, 1978)
-    if ``near`` excludes nothing. Of equally good sites, the first is chosen.
+    factorisation updates the variances of all sites in O(C k) per step, so a lazy evaluation of gains would
+    save nothing. Of equally good sites, the first is chosen.
 
     Args:
         signal: A, (C, C).
@@ -62,15 +61,13 @@ def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sequence[int
     allowed = np.ones(len(signal), dtype=bool)
     chosen: list[int] = []
     while len(chosen) < count:
-        if len(chosen) < len(fixed):
-            site = int(fixed[len(chosen)])
-        elif allowed.any():
-            site = _best(variance, allowed)
-        else:
+        staying = len(chosen) < len(fixed)
+        if not staying and not allowed.any():
             raise InputError(
                 f"only {len(chosen)} of {count} sensors fit, because each other site is too near to one of "
                 "them: lower design.count or design.distance, or set a finer design.raster"
             )
+        site = int(fixed[len(chosen)]) if staying else _best(variance, allowed)
         above = factor[: len(chosen)]
         row = signal[site] - above[:, site] @ above
         row[site] += 1
@@ -99,7 +96,7 @@ def exchange(signal: np.ndarray, sites: Sequence[int], near: np.ndarray, fixed: 
         for number in range(fixed, len(found)):
             others = found[:number] + found[number + 1 :]
             variance = _variance(signal, others)
-            best = _best(variance, ~near[others].any(axis=0))
+            best = _best(variance, np.logical_not(near[others].any(axis=0)))
             if variance[best] > variance[found[number]] * (1 + _TIE):
                 found[number], moved = best, True
     return found

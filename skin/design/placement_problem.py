@@ -63,13 +63,8 @@ class PlacementProblem:
             InputError: numbers that do not fit the layout or the sites.
         """
         body, old = device.body, device.sensors
-        kept = _kept(keep, len(old))
         count = len(old) if count is None else count
-        if count <= len(kept) and len(kept):
-            raise InputError(
-                f"design.keep keeps {len(kept)} sensors, and design.count={count} leaves none to place: set "
-                f"design.count={len(kept) + 1} or more, or keep fewer"
-            )
+        kept = _kept(keep, len(old), count)
         depths, numbers = np.unique(old.positions[:, 2], return_counts=True)
         depth = float(depths[numbers.argmax()])
         sites = candidate_sites(body, old.footprint, depth, raster, forbidden)
@@ -79,11 +74,10 @@ class PlacementProblem:
                 "design.count, set a finer design.raster, or shrink the zones of design.keep_out"
             )
         every = [sites, old, *_grid(body, count, old.footprint, depth)]
-        sensors = Sensors(
-            np.concatenate([one.positions for one in every]),
-            old.footprint,
-            np.concatenate([one.normals for one in every]),
+        positions, normals = (
+            np.concatenate([getattr(one, name) for one in every]) for name in ("positions", "normals")
         )
+        sensors = Sensors(positions, old.footprint, normals)
         layout = len(sites) + np.arange(len(old))
         return cls(body, sensors, len(sites), layout[kept], layout, count, distance)
 
@@ -118,13 +112,18 @@ class PlacementProblem:
         return chosen, known | {"share_of_bound": value / bound, "layouts": layouts}
 
 
-def _kept(keep: str | Sequence[int], sensors: int) -> np.ndarray:
-    """Return the indices of the sensors that stay, in the order of the layout."""
+def _kept(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:
+    """Return the indices of the sensors of a layout that stay, in its order; less than ``count``."""
     numbers = range(1, sensors + 1) if isinstance(keep, str) else sorted(set(keep))
     if beyond := [number for number in numbers if number > sensors]:
         raise InputError(
             f"design.keep names sensor {beyond[0]}, but the layout has {sensors}: give numbers from 1 to "
             f"{sensors}, or all"
+        )
+    if numbers and count <= len(numbers):
+        raise InputError(
+            f"design.keep keeps {len(numbers)} sensors, and design.count={count} leaves none to place: set "
+            f"design.count={len(numbers) + 1} or more, or keep fewer"
         )
     return np.array(numbers, dtype=int) - 1
 

@@ -14,8 +14,8 @@ from skin.layout.file import File
 from skin.paths import CONF
 
 SIZE = (0.12, 0.08)
-SHEET = Sheet(SIZE, [24, 16], [{"material": "EcoFlex 00-30", "thickness": 0.005}] * 2)
-BODY = ("body.size=[0.12,0.08]", "body.cells=[24,16]")
+SHEET = Sheet(SIZE, [12, 8], [{"material": "EcoFlex 00-30", "thickness": 0.005}] * 2)
+BODY = ("body.size=[0.12,0.08]", "body.cells=[12,8]")
 GRID = ("layout=grid", "layout.rows=2", "layout.columns=3")
 NAIVE = ("simulator=naive", *BODY, *GRID)
 TOUCHES = 100
@@ -119,7 +119,7 @@ def test_more_noise_is_less_information(placed):
 @pytest.mark.parametrize(
     ("overrides", "settings", "reason"),
     [
-        ((), {"count": 500}, "needs 500 sites, and there are 308: lower design.count"),
+        ((), {"count": 500}, "needs 500 sites, and there are 96: lower design.count"),
         ((), {"count": 40, "distance": 0.03}, "of 40 sensors fit"),
         ((), {"keep": [7]}, "design.keep names sensor 7, but the layout has 6"),
         ((), {"keep": "all"}, "design.keep keeps 6 sensors, and design.count=6 leaves none to place"),

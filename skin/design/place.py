@@ -73,8 +73,9 @@ class Place:
         """
         started = time.perf_counter()
         # Gestures must not depend on the layout that is to be replaced.
-        config = OmegaConf.merge(config, {"touch": {"over_sensors": False}})
-        device = build_device(config).simulated("sensors are placed by simulated touches")
+        merged = OmegaConf.merge(config, {"touch": {"over_sensors": False}})
+        assert isinstance(merged, DictConfig)
+        device = build_device(merged).simulated("sensors are placed by simulated touches")
         forbidden = keep_out(self.keep_out, device.size)
         problem = PlacementProblem.of(device, forbidden, self.count, self.keep, self.distance, self.raster)
         noise = self._noise(device)
@@ -82,7 +83,7 @@ class Place:
         covariance, frames = reading_covariance(device, problem.sensors, self.touches, self.seed, clip)
         with Console(stderr=True).status("placing sensors"):
             chosen, found = problem.solve(covariance / noise**2, self.seed)
-        settings = {"sites": problem.sites, "touches": self.touches, "frames": frames}
+        settings: dict[str, Any] = {"sites": problem.sites, "touches": self.touches, "frames": frames}
         settings |= {"noise_n": noise, "clip_n": clip, "distance_m": self.distance}
         content = settings | found | {"seconds": round(time.perf_counter() - started, 1)}
         Console().print(_table(content))

@@ -12,10 +12,13 @@ from scipy.linalg import solve
 
 from skin.errors import InputError
 
+Sites = Sequence[int] | np.ndarray
+"""Indices of sites."""
+
 _TIE = 1e-9  # relative difference below which two sites are equally good
 
 
-def mutual_information(signal: np.ndarray, sites: Sequence[int]) -> float:
+def mutual_information(signal: np.ndarray, sites: Sites) -> float:
     """Return 1/2 log det(I + A_SS) of some sites, nats.
 
     Args:
@@ -37,7 +40,7 @@ def too_near(places: np.ndarray, distance: float) -> np.ndarray:
     return (apart < distance - 1e-6) | np.eye(len(places), dtype=bool)
 
 
-def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sequence[int] = ()) -> list[int]:
+def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sites = ()) -> list[int]:
     """Choose sites one by one, each with the largest gain of information.
 
     The gain of a site is half the logarithm of its variance given the chosen ones. A pivoted Cholesky
@@ -78,7 +81,7 @@ def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sequence[int
     return chosen
 
 
-def exchange(signal: np.ndarray, sites: Sequence[int], near: np.ndarray, fixed: int = 0) -> list[int]:
+def exchange(signal: np.ndarray, sites: Sites, near: np.ndarray, fixed: int = 0) -> list[int]:
     """Move one sensor at a time to the best free site until no move gains information.
 
     Args:
@@ -102,7 +105,7 @@ def exchange(signal: np.ndarray, sites: Sequence[int], near: np.ndarray, fixed: 
     return found
 
 
-def given(signal: np.ndarray, sites: Sequence[int]) -> np.ndarray:
+def given(signal: np.ndarray, sites: Sites) -> np.ndarray:
     """Return A of all other sites, in their order, given the noisy readings of some.
 
     Args:
@@ -123,13 +126,13 @@ def _best(variance: np.ndarray, allowed: np.ndarray) -> int:
     return int(np.flatnonzero(allowed & (variance >= most * (1 - _TIE)))[0])
 
 
-def _variance(signal: np.ndarray, given: Sequence[int]) -> np.ndarray:
+def _variance(signal: np.ndarray, given: Sites) -> np.ndarray:
     """Return the variance (C,) of each noisy reading given those of some other sites."""
     rows = signal[np.asarray(given, dtype=int)]
     return 1 + np.diag(signal) - (rows * _solved(rows, given)).sum(axis=0)
 
 
-def _solved(rows: np.ndarray, sites: Sequence[int]) -> np.ndarray:
+def _solved(rows: np.ndarray, sites: Sites) -> np.ndarray:
     """Return (I + A_SS)^-1 times the rows of A at S, (k, C)."""
     if not len(sites):
         return rows

@@ -8,7 +8,7 @@ import numpy as np
 
 from skin.body.base import AbstractBody
 from skin.design.candidates import candidate_sites
-from skin.design.placement import exchange, greedy, mutual_information, too_near
+from skin.design.placement import Sites, exchange, greedy, mutual_information, too_near
 from skin.design.relaxation import upper_bound
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
@@ -17,7 +17,7 @@ from skin.rng import Stream, generator
 from skin.sensors import Sensors
 
 _RANDOM = 100  # layouts
-_TILE = 2.0  # largest aspect ratio of the tiles of a grid
+_TILE = 4.0  # largest aspect ratio of the tiles of a grid
 
 
 @dataclass(frozen=True)
@@ -131,22 +131,20 @@ def _kept(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:
 def _grid(body: AbstractBody, count: int, footprint: tuple[float, float], depth: float) -> list[Sensors]:
     """Return a grid of as many sensors, the one whose tiles are nearest to squares, if one exists."""
 
-    def aspect(rows: int) -> float:
+    def aspect(rows: int) -> tuple[float, int]:
         sides = body.size[0] * rows / count, body.size[1] / rows
-        return round(max(sides) / min(sides), 6)
+        return round(max(sides) / min(sides), 6), abs(rows - count // rows)
 
     rows = min((rows for rows in range(1, count + 1) if count % rows == 0), key=aspect)
-    if aspect(rows) > _TILE:
+    if aspect(rows)[0] > _TILE:
         return []
     return [Grid(rows, count // rows, footprint, depth=depth).sensors(body)]
 
 
-def _drawn(
-    near: np.ndarray, count: int, fixed: Sequence[int] | np.ndarray, draw: np.random.Generator
-) -> list[int]:
+def _drawn(near: np.ndarray, count: int, fixed: Sites, draw: np.random.Generator) -> list[int]:
     """Return sites that are drawn at random, or fewer if no more fit."""
     sites = [int(site) for site in fixed]
-    taken = near[sites].any(axis=0)
+    taken = np.asarray(near[sites].any(axis=0))
     for site in map(int, draw.permutation(len(near))):
         if len(sites) < count and not taken[site]:
             sites.append(site)

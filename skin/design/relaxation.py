@@ -1,19 +1,18 @@
 """An upper bound of the information of sensors at any sites."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigh, eigvalsh
 
-from skin.design.placement import given, mutual_information
+from skin.design.placement import Sites, given, mutual_information
 
 _ITERATIONS = 200
 _INSIDE = 0.95  # share of the way to the nearest constraint that a step may take
 _SHORTEST = 1e-9  # share of a step
 
 
-def upper_bound(signal: np.ndarray, count: int, fixed: Sequence[int] = (), gap: float = 5e-3) -> float:
+def upper_bound(signal: np.ndarray, count: int, fixed: Sites = (), gap: float = 5e-3) -> float:
     """Return an upper bound of the information of any ``count`` sites, nats.
 
     A concave relaxation gives each site a weight from 0 to 1, of the sum ``count`` (:class:`_Relaxation`).

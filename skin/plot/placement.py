@@ -1,6 +1,7 @@
 """Pictures of sensor placements."""
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -33,7 +34,7 @@ def placement(
     figure = Figure(figsize=(scale * size[0] + 2.8, max(scale * size[1], 1.8) + 0.9), layout="constrained")
     axis = figure.add_subplot()
     extent = (0, 1e3 * size[0], 1e3 * size[1], 0)
-    marks = []
+    marks: list[Artist] = []
     if forbidden is not None:
         shade = np.ma.masked_equal(forbidden, False)
         axis.imshow(shade, extent=extent, cmap=ListedColormap([_SHADE]), interpolation="nearest")
@@ -41,8 +42,9 @@ def placement(
     x, y = 1e3 * sites.T
     marks += axis.plot(x, y, ".", color=_SHADE, markersize=2, label=f"{len(sites)} sites")
     x, y = 1e3 * before.T
-    style = {"markersize": 9, "markerfacecolor": "none", "color": COLOURS[1]}
-    marks += axis.plot(x, y, "s", label=f"configured layout, {len(before)}", **style)
+    (old,) = axis.plot(x, y, "s", color=COLOURS[1], label=f"configured layout, {len(before)}")
+    old.set(markersize=9, markerfacecolor="none")
+    marks.append(old)
     x, y = 1e3 * chosen.T
     marks += axis.plot(x, y, "o", color=COLOURS[0], markersize=6, label=f"placed, {len(chosen)}")
     axis.set(xlabel="x, mm", ylabel="y, mm", xlim=extent[:2], ylim=extent[2:], aspect="equal", title=title)

@@ -12,7 +12,7 @@ TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist load
 # Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
-NUMERICAL := $(addprefix tests/,body contact evaluation fusion hardware/calibration hardware/record layout learner model \
+NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/calibration hardware/record layout learner model \
 	representation signal simulator studies/embedding test_classifier.py test_labels.py test_material.py touch \
 	validation wire/test_segmentation.py wire/test_tare.py)
 

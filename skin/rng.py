@@ -20,6 +20,7 @@ class Stream(IntEnum):
     MODULUS = 8
     TRACKING = 9
     ALARM = 10
+    PLACEMENT = 11
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

@@ -29,7 +29,8 @@ evaluation build unfinished
 stored_run
 trained
 hardware
-plot design
+plot
+design
 console progress variants
 run
 sweep

@@ -10,6 +10,7 @@ from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
 OTHERS = ["bench", "results", "study", "table", "validate"]
+NEW = ["design"]  # never was a script
 MOVED = ["animate", "calibrate", "compare", "emulate", "listen"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
@@ -77,7 +78,7 @@ def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
 
 
 def test_every_verb_that_was_a_script_still_is_one():
-    for name in VERBS:
+    for name in sorted({*VERBS} - {*NEW}):
         text = (ROOT / "experiments" / f"{name}.py").read_text()
         assert f'main(["{name}", *sys.argv[1:]])' in text
         assert (f"is now: skin {name}" in text) == (name in MOVED)

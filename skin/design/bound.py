@@ -95,7 +95,7 @@ class Bound:
         Raises:
             InputError: a skin that cannot be built, or a margin that leaves no place.
         """
-        from skin.plot.design import draw_bounds, print_bounds
+        from skin.design.drawing import draw_bounds, print_bounds
 
         skin = build_skin(config)
         simulator = skin.simulator(skin.body, skin.sensors)

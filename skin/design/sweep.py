@@ -74,7 +74,7 @@ class Sweep(Bound):
             InputError: a skin that cannot be built, a simulator without mechanics, or sensors outside the
                 layer.
         """
-        from skin.plot.design import draw_sweep, print_sweep
+        from skin.design.drawing import draw_sweep, print_sweep
 
         skin = build_skin(config)
         cases = [

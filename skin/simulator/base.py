@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -139,6 +140,13 @@ class AbstractSimulator(nn.Module, ABC):
             "a rigid object needs a simulator with a compliant surface, got "
             f"simulator={self._name}: set simulator=solid, or contact=prescribed"
         )
+
+    def pressure_rows(self, sensors: Sensors) -> np.ndarray | None:
+        """Return the readings of other sensors under 1 Pa on each cell, (S, cells), N/Pa.
+
+        None if that is not faster than a simulator of these sensors, or if readings are not linear.
+        """
+        return None
 
     def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
         """Return the largest principal strain of the top layer under pressures (U, H, W), (U,), 1.

@@ -1,6 +1,6 @@
 """Three-dimensional elasticity of a layered body, as one linear operator."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -134,16 +134,20 @@ class Solid(AbstractSimulator):
         """Return the displacement of each node under 1 Pa on each cell along an axis, (3 N, cells), m/Pa."""
         return self._elastic.influence(axis, self._folder / f"influence-{self._key}-{axis}.npy")
 
-    def of(self, sensors: Sensors) -> np.ndarray:
-        """Return the readings of other sensors under 1 Pa on each cell along x, y and inwards.
+    def of(self, sensors: Sensors, axes: Sequence[int] = (0, 1, 2)) -> np.ndarray:
+        """Return the readings of other sensors under 1 Pa on each cell along x (0), y (1) and inwards (2).
 
         They are exact for any layout and computed from :meth:`influence` in milliseconds.
 
         Returns:
-            (3, S, cells), N/Pa.
+            (axes, S, cells), N/Pa.
         """
         rows = reading_rows(self._mesh, sensors)
-        return np.stack([_read(rows, self.influence(axis)) for axis in range(3)])
+        return np.stack([_read(rows, self.influence(axis)) for axis in axes])
+
+    def pressure_rows(self, sensors: Sensors) -> np.ndarray:
+        """Return the readings of other sensors under 1 Pa on each cell, (S, cells), N/Pa."""
+        return self.of(sensors, [_INWARDS])[0]
 
     @cached_property
     def _elastic(self) -> Elastic:

@@ -136,6 +136,7 @@ def test_a_layout_needs_no_further_solve():
     skin = solid(where)
     direct = skin.transfer[:, :, :2].transpose(1, 2).numpy()
     assert skin.of(where) == pytest.approx(direct, rel=1e-4, abs=1e-6 * float(np.abs(direct).max()))
+    assert np.array_equal(skin.pressure_rows(where), skin.of(where)[2])
 
 
 def test_sensors_move_as_the_skin_does():

@@ -1,0 +1,151 @@
+"""Place sensors where their readings tell most about touches."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt
+from omegaconf import DictConfig, OmegaConf
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from skin.build import build_device
+from skin.design.candidates import Zones, keep_out
+from skin.design.placement_problem import PlacementProblem
+from skin.design.readings import reading_covariance
+from skin.device.base import AbstractSimulated
+from skin.errors import InputError
+from skin.files import write
+from skin.plot.figures import save_figure
+from skin.plot.placement import placement
+from skin.sensors import Sensors
+from skin.settings import checked
+
+
+@checked("design")
+@dataclass(frozen=True)
+class Place:
+    """Chooses sites for sensors by the mutual information of noisy and true readings of sampled touches.
+
+    ``run`` writes ``placement.csv``, a layout for ``layout=file layout.path=...``; ``placement.json``, with
+    the information of the placement, its upper bound and the information of other layouts; and
+    ``placement.png``. Sensors that stay come first in the layout, in their order. The others follow in rows
+    from the upper left. New sensors lie at the depth of most sensors of the layout and face the surface.
+
+    Args:
+        count: number of sensors, with those that stay; None: as many as the layout.
+        touches: number of sampled touches.
+        seed: of the touches, and of the random layouts for comparison.
+        noise: standard deviation of a reading, N; None: the median of the device's sensors.
+        distance: least distance of a new sensor from all others, m.
+        raster: pitch of the sites, or pitches along x and y, m; None: the cells of the body.
+        keep_out: polygons (x, y), m, or the path of a picture (:func:`skin.design.candidates.keep_out`).
+        keep: sensors of the layout that stay, numbered from 1, or ``all``.
+
+    Raises:
+        InputError: invalid settings.
+    """
+
+    count: PositiveInt | None = None
+    touches: Annotated[int, Ge(100)] = 3000
+    seed: NonNegativeInt = 0
+    noise: Annotated[float, Gt(0)] | None = None
+    distance: Annotated[float, Ge(0)] = 0.012
+    raster: PositiveFloat | tuple[PositiveFloat, PositiveFloat] | None = None
+    keep_out: str | Zones | None = None
+    keep: Literal["all"] | Sequence[PositiveInt] = ()
+
+    def run(self, config: DictConfig, folder: Path) -> None:
+        """Place the sensors of the configured skin, print a table and write the files.
+
+        Args:
+            config: the whole configuration.
+            folder: of the files.
+
+        Raises:
+            InputError: no site, too few sites, a device without simulation or without noise.
+        """
+        started = time.perf_counter()
+        # Gestures must not depend on the layout that is to be replaced.
+        merged = OmegaConf.merge(config, {"touch": {"over_sensors": False}})
+        assert isinstance(merged, DictConfig)
+        device = build_device(merged).simulated("sensors are placed by simulated touches")
+        forbidden = keep_out(self.keep_out, device.size)
+        problem = PlacementProblem.of(device, forbidden, self.count, self.keep, self.distance, self.raster)
+        noise = self._noise(device)
+        clip = _median(device.constants.clip)
+        covariance, frames = reading_covariance(device, problem.sensors, self.touches, self.seed, clip)
+        with Console(stderr=True).status("placing sensors"):
+            chosen, found = problem.solve(covariance / noise**2, self.seed)
+        settings: dict[str, Any] = {"sites": problem.sites, "touches": self.touches, "frames": frames}
+        settings |= {"noise_N": noise, "clip_N": clip, "distance_m": self.distance}
+        content = settings | found | {"seconds": round(time.perf_counter() - started, 1)}
+        Console().print(_table(content))
+        paths = self._write(problem, chosen, content, forbidden, folder)
+        print("\n".join(map(str, paths)))
+
+    def _noise(self, device: AbstractSimulated) -> float:
+        noise = _median(device.constants.noise) if self.noise is None else self.noise
+        if noise == 0:
+            raise InputError(
+                "placement needs sensors with noise, got device.noise=0: set design.noise=0.05, or another "
+                "standard deviation in N"
+            )
+        return noise
+
+    def _write(
+        self,
+        problem: PlacementProblem,
+        chosen: np.ndarray,
+        content: Mapping[str, Any],
+        forbidden: np.ndarray | None,
+        folder: Path,
+    ) -> list[Path]:
+        places = problem.sensors.positions[:, :2]
+        title = f"{content['information_nats']:.1f} of at most {content['bound_nats']:.1f} nats"
+        figure = placement(
+            places[chosen],
+            places[problem.layout],
+            places[: problem.sites],
+            problem.body.size,
+            forbidden,
+            title,
+        )
+        return [
+            write(_csv(problem.sensors, chosen), folder / "placement.csv"),
+            write(json.dumps(content, indent=2) + "\n", folder / "placement.json"),
+            save_figure(figure, folder / "placement.png"),
+        ]
+
+
+def _median(constants: Tensor) -> float:
+    """Return the median of constants of sensors without the digits that float32 adds."""
+    return float(f"{float(constants.median()):.6g}")
+
+
+def _csv(sensors: Sensors, rows: np.ndarray) -> str:
+    """Return some sensors as the text of a layout file, to the micrometre."""
+    names, columns = ["x_m", "y_m", "depth_m"], [sensors.positions[rows]]
+    if sensors.tilted[rows].any():
+        names, columns = [*names, "normal_x", "normal_y", "normal_z"], [*columns, sensors.normals[rows]]
+    lines = (",".join(f"{value:.6f}" for value in row) for row in np.hstack(columns))
+    return "\n".join([",".join(names), *lines]) + "\n"
+
+
+def _table(content: Mapping[str, Any]) -> Table:
+    """Return the table of the placement and of other layouts."""
+    title = f"{content['sites']} sites, {content['touches']} touches, {content['seconds']:g} s"
+    made = Table("layout", "sensors", "information, nats", "of the bound", title=title)
+    share = f"{100 * content['share_of_bound']:.1f} %"
+    made.add_row("placed", str(content["sensors"]), f"{content['information_nats']:.1f}", share)
+    for name, layout in content["layouts"].items():
+        shown = name.replace("_", " ")
+        made.add_row(shown, str(layout["sensors"]), f"{layout['information_nats']:.1f}", "")
+    made.add_row("upper bound", str(content["sensors"]), f"{content['bound_nats']:.1f}", "100.0 %")
+    return made

@@ -1,0 +1,146 @@
+"""`skin design design=place` as a person runs it, and the files that it writes."""
+
+import json
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from PIL import Image
+
+from skin.body.sheet import Sheet
+from skin.design.place import Place
+from skin.errors import InputError
+from skin.layout.file import File
+from skin.paths import CONF
+
+SIZE = (0.12, 0.08)
+SHEET = Sheet(SIZE, [12, 8], [{"material": "EcoFlex 00-30", "thickness": 0.005}] * 2)
+BODY = ("body.size=[0.12,0.08]", "body.cells=[12,8]")
+GRID = ("layout=grid", "layout.rows=2", "layout.columns=3")
+NAIVE = ("simulator=naive", *BODY, *GRID)
+TOUCHES = 100
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory):
+    """Return a function that places sensors and returns the folder; settings are those of Place."""
+
+    def place(*overrides, **settings):
+        folder = tmp_path_factory.mktemp("placed")
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("train", overrides=[*NAIVE, *overrides])
+        Place(**{"touches": TOUCHES} | settings).run(config, folder)
+        return folder
+
+    return place
+
+
+def content(folder):
+    return json.loads((folder / "placement.json").read_text())
+
+
+def positions(folder):
+    return File(folder / "placement.csv").sensors(SHEET).positions
+
+
+@pytest.mark.parametrize("simulator", [("simulator=solid", "simulator.divisions=1"), ("simulator=fem",)])
+def test_the_layout_is_read_by_the_next_command(run, tmp_path, simulator):
+    """There, it has the information that was found for it."""
+    words = (*simulator, *BODY, "design=place", f"design.touches={TOUCHES}")
+    done = run(tmp_path, "design", *words, *GRID, "design.count=4", "out=first", store=False)
+    assert done.returncode == 0, done.stderr
+    assert "of the bound" in done.stdout
+    assert "placement.csv" in done.stdout
+    found = content(tmp_path / "first")
+    with Image.open(tmp_path / "first" / "placement.png") as picture:
+        assert picture.size[0] > picture.size[1]
+    placed = ("layout=file", "layout.path=first/placement.csv")
+    done = run(tmp_path, "design", *words, *placed, "out=second", store=False)
+    assert done.returncode == 0, done.stderr
+    configured = content(tmp_path / "second")["layouts"]["configured"]
+    assert configured == {
+        "sensors": 4,
+        "information_nats": pytest.approx(found["information_nats"], rel=1e-3),
+    }
+    assert content(tmp_path / "second")["information_nats"] >= configured["information_nats"] - 1e-3
+
+
+def test_is_above_other_layouts_and_below_the_bound(placed):
+    folder = placed()
+    found = content(folder)
+    layouts = found["layouts"]
+    assert set(layouts) == {"configured", "grid", "best_of_random"}
+    assert all(one["sensors"] == found["sensors"] == 6 for one in layouts.values())
+    assert found["information_nats"] > max(one["information_nats"] for one in layouts.values())
+    assert 0.9 < found["share_of_bound"] <= 1
+    assert found["share_of_bound"] == pytest.approx(found["information_nats"] / found["bound_nats"])
+    assert layouts["grid"] == layouts["configured"]
+    assert (found["noise_N"], found["clip_N"], found["touches"]) == (0.05, 10.0, TOUCHES)
+
+
+def test_sensors_are_apart_in_reading_order_and_the_same_again(placed):
+    folder = placed(distance=0.03)
+    found = positions(folder)
+    apart = np.linalg.norm(found[:, None, :2] - found[None, :, :2], axis=-1)
+    assert apart[np.triu_indices(6, 1)].min() >= 0.03 - 1e-6
+    assert np.lexsort((found[:, 0], found[:, 1])).tolist() == list(range(6))
+    again = placed(distance=0.03)
+    assert (again / "placement.csv").read_bytes() == (folder / "placement.csv").read_bytes()
+
+
+def test_sensors_that_stay_come_first(placed):
+    old = np.array([[0.1, 0.02], [0.02, 0.06]])
+    found = positions(placed(keep=[4, 3], count=5))
+    assert found[:2, :2] == pytest.approx(old, abs=1e-6)
+    assert np.linalg.norm(found[2:, None, :2] - old, axis=-1).min() >= 0.012 - 1e-6
+    every = positions(placed(keep="all", count=8))
+    assert len(every) == 8
+    assert every[0, :2] == pytest.approx([0.02, 0.02], abs=1e-6)
+
+
+def test_no_new_sensor_is_in_a_zone(placed):
+    found = positions(placed(keep_out=[[(0, 0), (0.06, 0), (0.06, 0.08), (0, 0.08)]]))
+    assert found[:, 0].min() >= 0.065 - 1e-6
+
+
+def test_normals_of_sensors_that_stay_are_written(placed):
+    folder = placed("simulator=solid", "simulator.divisions=1", "layout.tilt=0.3", keep=[1], count=3)
+    normals = File(folder / "placement.csv").sensors(SHEET).normals
+    assert normals[0] == pytest.approx([np.sin(0.3), 0, np.cos(0.3)], abs=1e-5)
+    assert normals[1:] == pytest.approx(np.tile([0.0, 0.0, 1.0], (2, 1)))
+
+
+def test_more_noise_is_less_information(placed):
+    quiet, loud = content(placed(noise=0.02)), content(placed("device.noise=0.2"))
+    assert quiet["information_nats"] > 1.3 * loud["information_nats"]
+    assert loud["noise_N"] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("overrides", "settings", "reason"),
+    [
+        ((), {"count": 500}, "needs 500 sites, and there are 96: lower design.count"),
+        ((), {"count": 40, "distance": 0.03}, "of 40 sensors fit"),
+        ((), {"keep": [7]}, "design.keep names sensor 7, but the layout has 6"),
+        ((), {"keep": "all"}, "design.keep keeps 6 sensors, and design.count=6 leaves none to place"),
+        ((), {"keep": [1, 2, 3], "count": 2}, "set design.count=4 or more"),
+        (("device.noise=0",), {}, "got device.noise=0: set design.noise=0.05"),
+        ((), {"noise": 0.0}, "design.noise=0.0 must be greater than 0"),
+        (("device=serial", "device.port=x"), {}, "sensors are placed by simulated touches"),
+        ((), {"raster": 0.2}, "no site is left"),
+    ],
+)
+def test_bad_input_is_a_sentence(placed, overrides, settings, reason):
+    with pytest.raises(InputError) as error:
+        placed(*overrides, **settings)
+    assert reason in str(error.value)
+
+
+def test_a_mistake_on_the_command_line_ends_with_code_2(run, tmp_path):
+    Image.new("L", (10, 10), 255).save(tmp_path / "square.png")
+    words = (*NAIVE, "design=place", "design.keep_out=square.png")
+    done = run(tmp_path, "design", *words, store=False)
+    assert done.returncode == 2
+    assert "10 x 10 pixels" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "results").exists()

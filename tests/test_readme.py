@@ -19,7 +19,7 @@ def files():
             for name in WRITTEN.findall(block):
                 if not name.startswith(("~", "/", "$")):
                     path = Path(name)
-                    beside = [path.with_name(f"{name}.json"), path.with_suffix(".parquet")]
+                    beside = [path.with_name(f"{path.name}.json"), path.with_suffix(".parquet")]
                     yield from (
                         (page.name, one) for one in [path, *(beside if path.suffix == ".csv" else [])]
                     )

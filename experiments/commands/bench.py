@@ -70,6 +70,8 @@ def run_all(
     found["operator"] = {
         name: run_alone("building", "measure_building", name, repeats) for name in SIMULATORS
     }
+    say("bound and placement: about two minutes")
+    found["design"] = run_alone("designing", "measure_design", repeats)
     say("peers of the finite-element skins: about two minutes")
     _compare(found["generation"], repeats, say)
     say("start")

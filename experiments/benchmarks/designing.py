@@ -20,7 +20,7 @@ _STEPS = (1e-6, 1e-6, 1e-6, 1e-3)  # m, m, m, N
 def measure_design(repeats: int) -> dict[str, float]:
     """Return seconds (medians) on the default sheet with ``simulator=solid``, and the share of the bound.
 
-    ``bound_relative_to_differences`` is the time of the bound relative to central differences of the readings.
+    ``bound_relative_to_differences`` is the time of the bound relative to that of central differences.
     """
     device = build_device(training_config("simulator=solid", "touch.over_sensors=false")).simulated("design")
     bound = Bound()

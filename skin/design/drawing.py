@@ -42,18 +42,24 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
         maps: force, N -> bound on each cell, (H, W), m.
         path: x.png.
     """
-    panel = np.array(body.size) * 2.8 / max(body.size)  # inches
-    figure = Figure(figsize=(1.6 + len(maps) * (panel[0] + 0.2), panel[1] + 0.9), layout="constrained")
-    axes = figure.subplots(1, len(maps), squeeze=False, sharey=True)[0]
+    wide = body.size[0] > 2 * body.size[1]
+    panel = np.array(body.size) * (5.5 if wide else 2.8) / max(body.size)  # inches
+    counts = np.array([1, len(maps)] if wide else [len(maps), 1])  # across, down
+    size = counts * (panel + [0.2, 0.4]) + [1.4, 0.5]
+    figure = Figure(figsize=tuple(size), layout="constrained")
+    axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
     shown = {force: 1e3 * np.asarray(bound) for force, bound in maps.items()}
     scale = LogNorm(min(one.min() for one in shown.values()), max(one.max() for one in shown.values()))
     extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
-    for axis, (force, bound) in zip(axes, shown.items(), strict=True):
+    for axis, (force, bound) in zip(axes.flat, shown.items(), strict=True):
         picture = axis.imshow(bound, cmap="viridis_r", norm=scale, extent=extent)
         x, y = 1e3 * sensors.positions[:, :2].T
         axis.plot(x, y, "o", color="white", markeredgecolor="black", markersize=4)
-        axis.set(title=f"{force:g} N", xlabel="x, mm")
-    axes[0].set_ylabel("y, mm")
+        axis.set_title(f"{force:g} N")
+    for axis in axes[-1]:
+        axis.set_xlabel("x, mm")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y, mm")
     figure.colorbar(picture, ax=axes, label="bound of the place, mm", format="%g")
     return save_figure(figure, path)
 

@@ -45,7 +45,7 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
     wide = body.size[0] > 2 * body.size[1]
     panel = np.array(body.size) * (5.5 if wide else 2.8) / max(body.size)  # inches
     counts = np.array([1, len(maps)] if wide else [len(maps), 1])  # across, down
-    size = counts * (panel + [0.2, 0.4]) + [1.4, 0.5]
+    size = counts * (panel + np.array([0.2, 0.4])) + np.array([1.4, 0.5])
     figure = Figure(figsize=tuple(size), layout="constrained")
     axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
     shown = {force: 1e3 * np.asarray(bound) for force, bound in maps.items()}
@@ -60,7 +60,8 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
         axis.set_xlabel("x, mm")
     for axis in axes[:, 0]:
         axis.set_ylabel("y, mm")
-    figure.colorbar(picture, ax=axes, label="bound of the place, mm", format="%g")
+    bar = figure.colorbar(picture, ax=axes, label="bound of the place, mm", format="%g")
+    bar.ax.yaxis.set_minor_formatter("{x:g}")
     return save_figure(figure, path)
 
 

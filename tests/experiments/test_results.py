@@ -21,6 +21,7 @@ PARTS = [
     "results.parts.studies=[{run: 'study study=pair study.rows=[rules] study.seeds=[0,1]', hours: 1}]",
     "results.parts.shifts=[]",
     "results.parts.peers=[]",
+    "results.parts.sensors=[]",
     "results.parts.design=[]",
     "results.file=runs.parquet",
     "out=docs",
@@ -92,7 +93,7 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     [
         (
             ["results.part=tables"],
-            "results.part=tables is none of all, table, peers, shifts, studies, design",
+            "results.part=tables is none of all, table, peers, shifts, sensors, studies, design",
         ),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.action=show"], "results.action"),

@@ -85,7 +85,9 @@ class TouchData(pl.LightningDataModule):
         Raises:
             InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
         """
-        if positions.ndim != 2:
+        if self._known is not None and self._known[1].layout_free:
+            return self._known[1]
+        if positions.ndim != 2 and not getattr(self._make, "func", self._make).layout_free:
             raise InputError(
                 "representations are built for one layout, got positions per frame: give one position "
                 "(x, y, z) per sensor, and how far it moves as Touches.motion"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
+from skin.device._geometry import sensor_geometry
 from skin.device._metadata import describe
 from skin.device._split import split_rows, split_slices
 from skin.device._threads import in_threads
@@ -134,6 +136,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         randomness = generator(Stream.TRACKING, self.data_seed)
         return estimated(model, sampler, self.imperfection, len(self.sensors), randomness)
 
+    @cached_property
+    def geometry(self) -> Tensor:
+        """Where the sensors are and what they respond to, (S, G), :data:`skin.recording.GEOMETRY`."""
+        same = self.position_error == 0
+        model = self.model if same else modelled(self.simulator, self.body, self.sensors, self.model_rate)
+        return sensor_geometry(self.body, self.sensors, model)
+
     @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
@@ -237,7 +246,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, self.model_rate, self.tracker.motion(movie))
+        motion = self.tracker.motion(movie)
+        touches = Touches(readings, valid, positions, labels, self.model_rate, motion, geometry=self.geometry)
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.

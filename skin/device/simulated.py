@@ -164,7 +164,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def fresh_touches(self, count: int) -> Touches:
         """Return touches that belong to no split, for choosing a threshold after the training."""
-        return self._draw(False, Stream.ALARM, count, self.data_seed).touches
+        return self.draw(Stream.ALARM, count, self.data_seed)
+
+    def draw(self, stream: Stream, count: int, *key: int) -> Touches:
+        """Return touches of a stream of randomness at a key."""
+        return self._draw(False, stream, count, *key).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the same touches with the applied force and the gestures' parameters."""

@@ -15,7 +15,7 @@ from skin.representation.base import AbstractRepresentation, Frames
 from skin.settings import checked
 
 _IDLE = 8  # frames
-_LEAST = 1e-3  # N, smallest response to a fingertip of 1 N that readings are divided by
+_LEAST = 1e-3  # N and m, smallest response and extent to divide by
 _COVERED = 1e-6
 _X, _Y, _WIDTH, _HEIGHT, _DIRECT = (
     GEOMETRY.index(name) for name in ("x", "y", "width", "height", "response_0mm")
@@ -115,7 +115,8 @@ class Sites(AbstractRepresentation):
 
     def _weights(self, geometry: Tensor) -> Tensor:
         """Return the weight of each sensor at each site for each spread, (B, V, S)."""
-        places = geometry[..., [_X, _Y]] / geometry[..., [_WIDTH, _HEIGHT]]
+        # sensors that fill up a small skin have no extent
+        places = geometry[..., [_X, _Y]] / geometry[..., [_WIDTH, _HEIGHT]].clamp(min=_LEAST)
         squares = (self.centres[:, None] - places[:, None]).square().sum(-1)
         return torch.cat([(-squares / (2 * spread**2)).exp() for spread in self.spreads], dim=1)
 

@@ -51,7 +51,8 @@ def test_the_order_of_sensors_does_not_matter(touches):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_dead_sensor_changes_nothing(touches):
+@pytest.mark.parametrize("filled", [0.0, 100.0])
+def test_a_dead_sensor_changes_nothing(touches, filled):
     extra = torch.full((5, 12, 1), torch.nan)
     other = replace(
         touches,
@@ -59,7 +60,7 @@ def test_a_dead_sensor_changes_nothing(touches):
         valid=torch.cat([touches.valid, extra == 0], dim=2),
         saturated=torch.cat([touches.saturated, extra != extra], dim=2),
         positions=torch.cat([touches.positions, torch.zeros(1, 3)]),
-        geometry=torch.cat([touches.geometry, 100 * torch.ones(1, len(GEOMETRY))]),
+        geometry=torch.cat([touches.geometry, filled * torch.ones(1, len(GEOMETRY))]),
     )
     for found, expected in zip(shown(other)[::2], shown(touches)[::2], strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)

@@ -28,7 +28,7 @@ from skin.settings import check_settings, configured
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.touch.gesture import GestureSettings
 
-_GROUP = 128  # gestures on one skin at a time; fewer take longer, more are less diverse
+_GROUP = 128  # largest number of gestures on one skin at a time; fewer take longer
 _DEAD = 4  # at most one of so many sensors is dead
 _TRAINING, _TEST = 0, 1
 _NUMBERS = {"train": 0, "validation": 1, "holdout": 2, "test": 3}
@@ -123,7 +123,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
     def _draw(self, skins: Sequence[Simulated], count: int, key: tuple[int, ...]) -> Touches:
         """Return gestures in groups, each on a drawn skin; every skin is drawn once before any again."""
-        sizes = [min(_GROUP, count - first) for first in range(0, count, _GROUP)]
+        most = min(_GROUP, -(-count // len(skins)))
+        sizes = [min(most, count - first) for first in range(0, count, most)]
         rounds = -(-len(sizes) // len(skins))
         order = generator(Stream.SKIN, *key)
         chosen = np.concatenate([order.permutation(len(skins)) for _ in range(rounds)])

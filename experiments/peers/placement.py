@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from annotated_types import Ge, Gt, MinLen
@@ -26,9 +26,12 @@ from skin.design.placement import exchange, greedy, mutual_information, too_near
 from skin.design.placement_problem import PlacementProblem, best_of_random
 from skin.design.readings import sampled_readings
 from skin.design.relaxation import upper_bound
+from skin.errors import InputError
 from skin.files import write
 from skin.paths import ROOT
 from skin.settings import checked
+
+_Found = TypeVar("_Found")
 
 _HEAD = (
     "sheet",
@@ -50,8 +53,9 @@ class Comparison:
     ``run`` writes ``placement.csv``. Methods are ``placed`` (:class:`skin.design.place.Place`),
     ``pysensors_qr`` and ``pysensors_gqr``, ``grid`` and ``best_of_random``. Without the environment of the
     peers, the methods of PySensors are left out. ``nearest_m`` is the least distance of two sensors:
-    ``pysensors_qr`` and ``grid`` do not take ``distance`` into account. ``cpu_seconds`` is the time of the
-    choice, without that of the readings and of the bound.
+    ``pysensors_qr`` and ``grid`` do not take ``distance`` into account. ``cpu_seconds`` is the
+    processor time of the choice from the readings, with that of their covariance or of PySensors' basis and
+    without that of the bound.
 
     Args:
         cases: extent (x, y) of the body, m, and number of sensors. Cells keep their size.
@@ -80,7 +84,8 @@ class Comparison:
             folder: of the file.
 
         Raises:
-            InputError: no site, too few sites, or a device without simulation.
+            InputError: no site, too few sites, a device without simulation, or an environment of the peers
+                without PySensors.
         """
         if not python().is_file():
             print(
@@ -94,10 +99,10 @@ class Comparison:
         """Yield one line of the table per method."""
         *size, count = case
         problem, readings = self._sample(config, size, count)
-        signal = np.cov(readings.T, bias=True) / self.noise**2
+        signal, spent = _timed(lambda: np.cov(readings.T, bias=True) / self.noise**2)
         bound = upper_bound(signal[: problem.sites, : problem.sites], count)
         places = problem.sensors.positions[:, :2]
-        for method, sites, seconds in self._choices(problem, readings, signal):
+        for method, sites, seconds in self._choices(problem, readings, signal, spent):
             information = mutual_information(signal, sites)
             apart = np.linalg.norm(places[sites, None] - places[sites], axis=-1)
             nearest = apart[np.triu_indices(count, 1)].min(initial=np.inf)
@@ -120,13 +125,14 @@ class Comparison:
         return problem, np.concatenate(list(parts))
 
     def _choices(
-        self, problem: PlacementProblem, readings: np.ndarray, signal: np.ndarray
+        self, problem: PlacementProblem, readings: np.ndarray, signal: np.ndarray, spent: float
     ) -> Iterator[tuple[str, Sequence[int], float]]:
-        """Yield name, sites and duration, s, of each method."""
+        """Yield name, sites and processor time, s, of each method; ``spent`` is that of the covariance."""
         number, count = problem.sites, problem.count
         places, inner = problem.sensors.positions[:number, :2], signal[:number, :number]
         near = too_near(places, self.distance)
-        yield "placed", *_timed(lambda: exchange(inner, greedy(inner, count, near), near))
+        placed, seconds = _timed(lambda: exchange(inner, greedy(inner, count, near), near))
+        yield "placed", placed, spent + seconds
         if python().is_file():
             arrays = {"readings": readings[:, :number], "places": places}
             for method, found in ask(arrays, count=count, distance=self.distance).items():
@@ -136,16 +142,24 @@ class Comparison:
             yield "grid", grid, 0.0
         drawn, seconds = _timed(lambda: best_of_random(inner, count, near, seed=self.seed))
         if drawn:
-            yield "best_of_random", drawn, seconds
+            yield "best_of_random", drawn, spent + seconds
 
 
-def _timed(choose: Callable[[], list[int]]) -> tuple[list[int], float]:
+def _timed(compute: Callable[[], _Found]) -> tuple[_Found, float]:
     began = time.process_time()
-    return choose(), time.process_time() - began
+    return compute(), time.process_time() - began
 
 
 def ask(arrays: dict[str, np.ndarray], **request: Any) -> dict[str, Any]:
-    """Return the answer of the worker to a request to place sensors."""
+    """Return the answer of the worker to a request to place sensors.
+
+    Args:
+        arrays: ``readings`` and ``places`` (:func:`experiments.peers.worker.sensor_sites.sensor_sites`).
+        request: ``count`` and ``distance``.
+
+    Raises:
+        InputError: PySensors is not installed there.
+    """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "readings.npz"
         np.savez(path, **arrays)  # type: ignore[arg-type]
@@ -154,6 +168,8 @@ def ask(arrays: dict[str, np.ndarray], **request: Any) -> dict[str, Any]:
             [python(), "-m", WORKER], cwd=ROOT, input=line, stdout=subprocess.PIPE, text=True, check=True
         )
     answer = json.loads(done.stdout)
+    if answer.get("error", "").startswith("ModuleNotFoundError"):
+        raise InputError(f"{python()} has no PySensors ({answer['error']}): make peers installs it")
     if "error" in answer:
         raise RuntimeError(answer["error"])
     return answer

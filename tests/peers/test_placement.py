@@ -53,10 +53,11 @@ def test_without_its_environment_pysensors_is_left_out(compared, tmp_path):
     assert min(float(one["nearest_m"]) for one in found if one["method"] != "grid") >= 0.012
 
 
-def test_a_worker_without_pysensors_is_an_error(compared, tmp_path):
+def test_an_older_environment_without_pysensors_is_refused(compared, tmp_path):
     done = compared(sys.executable, "design.cases=[[0.08,0.08,4]]")
-    assert done.returncode != 0
-    assert "No module named 'pysensors'" in done.stderr
+    assert done.returncode == 2
+    assert "has no PySensors" in done.stderr
+    assert "make peers installs it" in done.stderr
     assert not (tmp_path / "found").exists()
 
 

@@ -62,8 +62,8 @@ class Sweep(Bound):
     """
 
     material: str | Mapping[str, Any] = "EcoFlex 00-30"
-    thicknesses: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.015, 0.020, 0.030, 0.040)
-    grids: Annotated[Sequence[tuple[PositiveInt, PositiveInt]], MinLen(1)] = ((3, 3), (4, 4), (5, 5), (7, 7))
+    thicknesses: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
+    grids: Annotated[Sequence[tuple[PositiveInt, PositiveInt]], MinLen(1)] = ((3, 3), (4, 4), (5, 5), (6, 6))
     footprint: Footprint = (0.01, 0.01)
     height: PositiveFloat = 0.0005
 

@@ -1,8 +1,9 @@
 """The Cramer-Rao bound: how precisely readings determine where and how hard a fingertip presses.
 
-With independent noise of the readings and Gaussian priors, the inverse of J' R^-1 J + P is the covariance of
-the parameters given the readings, to first order (Van Trees, Detection, Estimation, and Modulation Theory,
-2.4). J are the derivatives of the readings, R the variances of the noise, P the inverse variances of the priors.
+With independent noise of the readings and Gaussian priors, the inverse of J' R^-1 J + P is the covariance
+of the parameters given the readings, to first order (Van Trees, Detection, Estimation, and Modulation
+Theory, 2.4). J are the derivatives of the readings, R the variances of the noise, P the inverse variances
+of the priors.
 """
 
 from collections.abc import Iterator

@@ -100,7 +100,7 @@ def test_two_processes_make_one_run(run, tmp_path):
     assert done.returncode == 0, done.stderr
     ((name, status, losses),) = logged(tmp_path)
     assert status == "FINISHED"
-    assert "devices=2 strategy=ddp" in name
+    assert "strategy" not in name  # names tell what results depend on
     assert done.stdout.count("overall/accuracy") == 1
     assert len([line for line in done.stderr.splitlines() if line.startswith("dangerous")]) == 1
     assert "GLOBAL_RANK" not in done.stderr

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from skin.datamodule import TouchData
 
-_WORKER = "experiments.peers.worker"
+WORKER = "experiments.peers.worker"
 _PART = 8192  # touches
 
 
@@ -120,7 +120,7 @@ class AbstractPeer(AbstractLearner):
         """Send a request to the process and return its answer."""
         if self._process is None:
             self._process = subprocess.Popen(
-                [_python(), "-m", _WORKER], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                [_python(), "-m", WORKER], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
             )
             weakref.finalize(self, _end, self._process)
         process = self._process

@@ -1,8 +1,9 @@
 """The Cramer-Rao bound: how precisely readings determine where and how hard a fingertip presses.
 
-With independent noise of the readings and Gaussian priors, the inverse of J' R^-1 J + P bounds the covariance
-of an estimate (Van Trees, Detection, Estimation, and Modulation Theory, 2.4). J are the derivatives of the
-readings, R the variances of the noise, P the inverse variances of the priors.
+With independent noise of the readings and Gaussian priors, the inverse of J' R^-1 J + P is the covariance
+of the parameters given the readings, to first order (Van Trees, Detection, Estimation, and Modulation
+Theory, 2.4). J are the derivatives of the readings, R the variances of the noise, P the inverse variances
+of the priors.
 """
 
 from collections.abc import Iterator
@@ -36,7 +37,7 @@ class Noise:
     def variance(self, readings: Tensor) -> Tensor:
         """Return the variance (B, S), N^2, of the mean of the frames of readings (B, S), N.
 
-        A sensor that clips has none: its reading does not depend on the touch.
+        It is infinite where a sensor clips: its reading does not depend on the touch.
         """
         known = self.frame**2 / self.frames + (self.gain * readings).square()
         return known.masked_fill(readings >= self.clip, torch.inf)

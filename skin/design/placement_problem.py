@@ -103,13 +103,25 @@ class PlacementProblem:
             for name, rows in others.items()
             if len(rows)
         }
-        draws = [
-            _drawn(near, self.count, fixed, generator(Stream.PLACEMENT, seed, 0, n)) for n in range(_RANDOM)
-        ]
-        if values := [mutual_information(inner, sites) for sites in draws if len(sites) == self.count]:
-            layouts["best_of_random"] = {"sensors": self.count, "information_nats": max(values)}
+        if drawn := best_of_random(inner, self.count, near, fixed, seed):
+            information = mutual_information(inner, drawn)
+            layouts["best_of_random"] = {"sensors": self.count, "information_nats": information}
         known = {"sensors": self.count, "information_nats": value, "bound_nats": bound}
         return chosen, known | {"share_of_bound": value / bound, "layouts": layouts}
+
+
+def best_of_random(
+    signal: np.ndarray, count: int, near: np.ndarray, fixed: Sites = (), seed: int = 0
+) -> list[int]:
+    """Return the most informative of 100 random choices of sites; none if the sites do not fit in any.
+
+    Args:
+        signal, count, near, fixed: as of :func:`skin.design.placement.greedy`.
+        seed: of the choices.
+    """
+    draws = (_drawn(near, count, fixed, generator(Stream.PLACEMENT, seed, 0, n)) for n in range(_RANDOM))
+    whole = (sites for sites in draws if len(sites) == count)
+    return max(whole, key=lambda sites: mutual_information(signal, sites), default=[])
 
 
 def _kept(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:

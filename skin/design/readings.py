@@ -1,7 +1,7 @@
-"""The covariance of the readings that sampled touches give at any sites of a skin."""
+"""The readings that sampled touches give at any sites of a skin, and their covariance."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -19,11 +19,30 @@ from skin.touch.sampler import balanced
 _BATCH = 256
 
 
-@torch.no_grad()
 def reading_covariance(
     device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
 ) -> tuple[np.ndarray, int]:
-    """Sample touches and return the covariance of the true readings, and from how many frames it is.
+    """Return the covariance of the readings of sampled touches, and from how many frames it is.
+
+    Args:
+        device, sensors, touches, seed, clip: as of :func:`sampled_readings`.
+
+    Returns:
+        covariance (C, C), N^2, and the number of frames.
+    """
+    total, squares, frames = np.zeros(len(sensors)), np.zeros((len(sensors), len(sensors))), 0
+    for readings in sampled_readings(device, sensors, touches, seed, clip):
+        total, squares = total + readings.sum(axis=0), squares + readings.T @ readings
+        frames += len(readings)
+    mean = total / frames
+    return squares / frames - np.outer(mean, mean), frames
+
+
+@torch.no_grad()
+def sampled_readings(
+    device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
+) -> Iterator[np.ndarray]:
+    """Sample touches and yield their true readings in parts, (F, C), N.
 
     Only frames with contact count. Labels are balanced. The touches belong to no split of the device.
 
@@ -33,23 +52,15 @@ def reading_covariance(
         touches: their number.
         seed: of the touches.
         clip: largest reading, N.
-
-    Returns:
-        covariance (C, C), N^2, and the number of frames.
     """
     read = _reader(device, sensors)
     wanted = balanced(touches, generator(Stream.PLACEMENT, seed, 0))
-    total, squares = np.zeros(len(sensors)), np.zeros((len(sensors), len(sensors)))
-    frames, parts = 0, range(0, touches, _BATCH)
+    parts = range(0, touches, _BATCH)
     console, shown = Console(stderr=True), sys.stderr.isatty()
     for number, first in enumerate(track(parts, "sampling touches", console=console, disable=not shown)):
         labels = wanted[first : first + _BATCH]
         movie = device.sampler.sample(len(labels), generator(Stream.PLACEMENT, seed, 1 + number), labels)
-        readings = read(movie).clamp(-clip, clip).double().numpy()
-        total, squares = total + readings.sum(axis=0), squares + readings.T @ readings
-        frames += len(readings)
-    mean = total / frames
-    return squares / frames - np.outer(mean, mean), frames
+        yield read(movie).clamp(-clip, clip).double().numpy()
 
 
 def _reader(device: AbstractSimulated, sensors: Sensors) -> Callable[[Movie], Tensor]:

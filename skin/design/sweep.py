@@ -23,6 +23,8 @@ from skin.layout.grid import Grid
 from skin.material import Material
 from skin.settings import checked
 
+Pair = tuple[PositiveInt, PositiveInt]
+
 
 @dataclass(frozen=True)
 class Step:
@@ -62,8 +64,8 @@ class Sweep(Bound):
     """
 
     material: str | Mapping[str, Any] = "EcoFlex 00-30"
-    thicknesses: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.015, 0.020, 0.030, 0.040)
-    grids: Annotated[Sequence[tuple[PositiveInt, PositiveInt]], MinLen(1)] = ((3, 3), (4, 4), (5, 5), (7, 7))
+    thicknesses: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
+    grids: Annotated[Sequence[Pair], MinLen(1)] = tuple((count, count) for count in range(3, 9))
     footprint: Footprint = (0.01, 0.01)
     height: PositiveFloat = 0.0005
 

@@ -97,13 +97,14 @@ class Network(AbstractLearner):
             torch.manual_seed(self._seed)
             classifier = self.build(data)
             best = ModelCheckpoint(folder, monitor="val_loss", save_weights_only=True)
-            clock, callbacks, last = Clock(folder / "seconds.json"), [], folder / LAST
-            if self.unfinished:
-                # after `best`, whose state it saves
+            clock, last = Clock(folder / "seconds.json"), folder / LAST
+            trainer = self._trainer_of(logger, [best, clock], folder)
+            alone = trainer.world_size == 1
+            if self.unfinished and alone:
+                # Behind `best`, whose state it saves; several processes would have to save together.
                 every = ModelCheckpoint(folder, last.stem, enable_version_counter=False)
-                callbacks = [RandomState(), every]
-            trainer = self._trainer_of(logger, [best, clock, *callbacks], folder)
-            again = last if last.is_file() and trainer.world_size == 1 else None
+                trainer.callbacks += [RandomState(), every]  # type: ignore[attr-defined]
+            again = last if alone and last.is_file() else None
             with warnings.catch_warnings():
                 # Lightning 2.6 asks torch 2.13 for a deprecated class
                 warnings.filterwarnings("ignore", ".*treespec, LeafSpec", FutureWarning)

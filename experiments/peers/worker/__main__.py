@@ -8,6 +8,8 @@ Reads requests from standard input, one JSON object per line, and answers each w
   ``{"do": "save", "path": ...}`` wrote as an .npz file.
 - ``{"do": "predict", "path": ..., "to": ...}`` reads inputs (B, ...) from an .npy file and writes
   probabilities (B, L).
+- ``{"do": "place", "path": ..., "count": ..., "distance": ...}`` chooses sites of sensors from the arrays
+  ``readings`` and ``places`` of an .npz file and answers with the result of ``sensor_sites``.
 
 The answer to ``fit`` and ``load`` has the keys ``seconds``, ``parameters``, ``shape`` (of one input) and
 ``labels`` (their number); the answer to a request that fails has the key ``error``.
@@ -22,6 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from experiments.peers.worker.kernel_model import KernelModel
+from experiments.peers.worker.sensor_sites import sensor_sites
 from experiments.peers.worker.tree_model import TreeModel
 
 Arrays = dict[str, np.ndarray]
@@ -83,6 +86,10 @@ class Worker:
         """Write the probabilities of the labels of touches."""
         np.save(to, self.model.predict(np.load(path, allow_pickle=False)))
         return {}
+
+    def place(self, path: str, count: int, distance: float) -> dict[str, Any]:
+        """Choose sites of sensors; this needs no model."""
+        return sensor_sites(**_load_arrays(path), count=count, distance=distance)
 
     def _described(self, seconds: float) -> dict[str, Any]:
         model = self.model

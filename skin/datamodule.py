@@ -1,6 +1,7 @@
 """The LightningDataModule: touches as batches of frames."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytorch_lightning as pl
 import torch
@@ -87,7 +88,8 @@ class TouchData(pl.LightningDataModule):
         """
         if self._known is not None and self._known[1].layout_free:
             return self._known[1]
-        if positions.ndim != 2 and not getattr(self._make, "func", self._make).layout_free:
+        make: Any = getattr(self._make, "func", self._make)
+        if positions.ndim != 2 and not make.layout_free:
             raise InputError(
                 "representations are built for one layout, got positions per frame: give one position "
                 "(x, y, z) per sensor, and how far it moves as Touches.motion"

@@ -8,11 +8,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, MinLen
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from scipy.spatial import cKDTree
 
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody, Layer
 from skin.body.sheet import Sheet
+from skin.errors import InputError
 from skin.layout.base import AbstractLayout, Footprint, place
 from skin.layout.grid import Grid
 from skin.layout.hexagonal import Hexagonal
@@ -22,15 +24,18 @@ from skin.material import Material
 from skin.sensors import Sensors
 from skin.settings import RISING, checked
 from skin.simulator.base import AbstractSimulator
+from skin.simulator.fem import PlatesAndBeams
+from skin.simulator.naive import Naive
 from skin.simulator.solid import Solid
 
 Range = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
-Kind = Literal["grid", "scattered", "hexagonal", "random", "clustered"]
+Kind = Literal["grid", "scattered", "hexagonal", "random", "clustered", "spread"]
 Make = Callable[[AbstractBody, Sensors], AbstractSimulator]
 
 _POISSON = 0.49
 _TRIES = 2000
 _LEAST_CELLS = 8
+_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -41,11 +46,13 @@ class DrawnSkin:
         body: the body.
         layout: of its sensors.
         simulator: ``simulator(body, sensors)``.
+        position_error: standard deviation of the true positions from those of the layout, m.
     """
 
     body: AbstractBody
     layout: AbstractLayout
     simulator: Make
+    position_error: float
 
 
 @checked("device.skins")
@@ -65,7 +72,11 @@ class SkinDistribution:
         depth: of the sensors, as a share of the thickness of the top layer.
         arms: share of skins on a cylinder.
         radius: of the cylinders, m.
+        position_error: standard deviation of the sensors' true positions from those of the layout, m.
         divisions: rows of elements in each layer.
+        plates: share of sheets with the mechanics of plates on beams (:mod:`skin.simulator.fem`); their
+            sensors are between the layers.
+        naive: share of sheets without mechanics.
     """
 
     length: Range
@@ -81,10 +92,40 @@ class SkinDistribution:
     depth: Range
     arms: Annotated[float, Ge(0), Le(1)]
     radius: Range
+    position_error: Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
     divisions: PositiveInt
+    plates: Annotated[float, Ge(0), Le(1)] = 0.0
+    naive: Annotated[float, Ge(0), Le(1)] = 0.0
 
-    def draw(self, generator: np.random.Generator) -> DrawnSkin:
-        """Return a skin."""
+    def __post_init__(self) -> None:
+        if self.plates + self.naive > 1:
+            raise InputError(
+                "device.skins.plates + device.skins.naive must be at most 1, got "
+                f"{self.plates + self.naive:g}: make one of them smaller"
+            )
+
+    def draw(self, generator: np.random.Generator, mixed: bool = False) -> DrawnSkin:
+        """Return a skin.
+
+        Args:
+            generator: of random numbers.
+            mixed: with any mechanics; otherwise that of an elastic solid.
+        """
+        body = self._body(generator)
+        count = round(_logarithmic(self.sensors, generator))
+        kind, top = str(generator.choice(self.layouts)), body.layers[-1].thickness
+        depth = top * generator.uniform(*self.depth)
+        side = generator.uniform(*self.footprint)
+        simulator: Make = partial(Solid, divisions=self.divisions)
+        chance = generator.random()
+        if mixed and isinstance(body, Sheet) and chance < self.plates + self.naive:
+            plates = chance < self.plates
+            simulator = PlatesAndBeams if plates else Naive
+            depth = top if plates else depth  # plates on beams know forces between layers only
+        layout = _layout(kind, count, body.size, side, depth, generator)
+        return DrawnSkin(body, layout, simulator, generator.uniform(*self.position_error))
+
+    def _body(self, generator: np.random.Generator) -> AbstractBody:
         longer = generator.uniform(*self.length)
         shorter = longer / generator.uniform(*self.aspect)
         sides = (longer, shorter) if generator.random() < 0.5 else (shorter, longer)
@@ -94,16 +135,12 @@ class SkinDistribution:
             Layer(Material("base", stiff, _POISSON), base),
             Layer(Material("top", soft, _POISSON), top),
         )
-        cells = tuple(max(_LEAST_CELLS, round(side / self.cell)) for side in sides)
-        body: AbstractBody = Sheet(sides, cells, layers)
+        across, along = (max(_LEAST_CELLS, round(side / self.cell)) for side in sides)
         radius = max(generator.uniform(*self.radius), 1.2 * (base + top))
         if generator.random() < self.arms and sides[0] < 1.8 * math.pi * radius:
-            body = Arm(cells=cells, layers=layers, radius=radius, length=sides[1], angle=sides[0] / radius)
-        count = round(_logarithmic(self.sensors, generator))
-        kind = str(generator.choice(self.layouts))
-        depth = top * generator.uniform(*self.depth)
-        layout = _layout(kind, count, body.size, generator.uniform(*self.footprint), depth, generator)
-        return DrawnSkin(body, layout, partial(Solid, divisions=self.divisions))
+            cells = (across, along)
+            return Arm(cells=cells, layers=layers, radius=radius, length=sides[1], angle=sides[0] / radius)  # type: ignore[misc]
+        return Sheet(sides, (across, along), layers)
 
 
 @dataclass(frozen=True)
@@ -116,7 +153,8 @@ class _Places(AbstractLayout):
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return them in their order."""
-        return place(body, *self.places.T, self.depth, self.footprint)
+        x, y = self.places.T
+        return place(body, x, y, self.depth, self.footprint)
 
 
 def _logarithmic(limits: tuple[float, float], generator: np.random.Generator) -> float:
@@ -145,6 +183,10 @@ def _layout(
     columns = max(1, math.ceil(count / rows))
     pitch = min(size[0] / columns, size[1] / rows)
     seed = int(generator.integers(2**31))
+    if kind == "spread":
+        places = _spread(count, size, generator)
+        apart = np.abs(places[:, None] - places).max(axis=2)[~np.eye(count, dtype=bool)]
+        return _Places(places, (min(side, float(apart.min())),) * 2, depth)
     if kind in ("random", "clustered"):
         # Random places fill less than half of the surface.
         footprint = (min(side, 0.6 * math.sqrt(math.prod(size) / count)),) * 2
@@ -174,4 +216,19 @@ def _clustered(
             places = np.vstack([places, found])
         if len(places) == count:
             break
+    return places[np.argsort(places[:, 1], kind="stable")]
+
+
+def _spread(count: int, size: tuple[float, float], generator: np.random.Generator) -> np.ndarray:
+    """Return places (S, 2), m, that divide the surface evenly without rows, as informative layouts do.
+
+    Each place is in the middle of the region that is nearer to it than to the others (Lloyd's algorithm).
+    """
+    extent = np.array(size)
+    samples, places = (generator.random((number, 2)) * extent for number in (50 * count, count))
+    for _ in range(_ROUNDS):
+        nearest = cKDTree(places).query(samples)[1]
+        shares = np.bincount(nearest, minlength=count)[:, None]
+        sums = np.stack([np.bincount(nearest, values, count) for values in samples.T], axis=1)
+        places = np.where(shares > 0, sums / shares.clip(min=1), places)
     return places[np.argsort(places[:, 1], kind="stable")]

@@ -53,7 +53,9 @@ def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, re
     around = reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     places = sensors.positions[:, None, :2] + around
     inside = ((places >= 0) & (places <= body.size)).all(axis=2)
-    inside |= ~inside.any(axis=1, keepdims=True)  # of a small body: beyond the edge is better than nowhere
+    inside |= ~np.any(
+        inside, axis=1, keepdims=True
+    )  # of a small body: beyond the edge is better than nowhere
     owner, number = np.nonzero(inside)
     rest = np.broadcast_to([_RADIUS, 1.0], (len(owner), 2))
     touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), rest], axis=1))

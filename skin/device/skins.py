@@ -38,8 +38,9 @@ _NUMBERS = {"train": 0, "validation": 1, "holdout": 2, "test": 3}
 class Skins(ImperfectionSettings, AbstractDevice):
     """Yields gestures on skins that differ in body, layout and mechanics, each measured by another device.
 
-    Training, validation and holdout gestures are on the same skins; those of ``test`` are on others. Skins
-    with fewer sensors than the largest one get sensors that are never valid.
+    Training, validation and holdout gestures are on the same skins; those of ``test`` are on others, all with
+    the mechanics of an elastic solid. Skins with fewer sensors than the largest one get sensors that are
+    never valid.
 
     Args:
         body, layout: not used; the skins have their own.
@@ -92,7 +93,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
         return [self._skin(part, number) for number in numbers]
 
     def _skin(self, part: int, number: int) -> Simulated:
-        drawn = self.distribution.draw(generator(Stream.SKIN, self.skin_seed, part, number))
+        random = generator(Stream.SKIN, self.skin_seed, part, number)
+        drawn = self.distribution.draw(random, mixed=part == _TRAINING)
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
         sensors = len(drawn.layout.sensors(drawn.body))
         imperfections["dead"] = [min(one, sensors // _DEAD) for one in Imperfection.of(self, None).dead_range]
@@ -100,6 +102,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
             body=drawn.body,
             layout=drawn.layout,
             simulator=drawn.simulator,
+            position_error=drawn.position_error,
             touch=self.touch,
             padded=self.padded,
             randomise=True,

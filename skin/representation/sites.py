@@ -13,10 +13,16 @@ from skin.errors import InputError
 from skin.recording import GEOMETRY, Touches
 from skin.representation.base import AbstractRepresentation, Frames
 from skin.settings import checked
+from skin.signal.features import engineered_features
 
 _IDLE = 8  # frames
 _LEAST = 1e-3  # N and m, smallest response and extent to divide by
 _COVERED = 1e-6
+_COUNTING = (
+    "raw sensor maximum",
+    "sensor sum",
+    "longest run of the sum",
+)  # change with the number of dead sensors
 _X, _Y, _WIDTH, _HEIGHT, _DIRECT = (
     GEOMETRY.index(name) for name in ("x", "y", "width", "height", "response_0mm")
 )
@@ -92,7 +98,8 @@ class Sites(AbstractRepresentation):
         sums = values[..., 0].sum(2, keepdim=True)
         order = [self._largest(values[..., channel], touches.valid) for channel in (1, 2)]
         x = torch.cat([means.flatten(2), *order, sums, sums.asinh()], dim=-1)
-        return Frames(x, None, self._summary(geometry, works, shares))
+        summary = torch.cat([self._summary(geometry, works, shares), _engineered(touches)], dim=1)
+        return Frames(x, None, summary)
 
     def _scaled(self, touches: Touches, geometry: Tensor) -> Tensor:
         """Return readings above idle on three scales, and whether they are at their limit, (B, T, S, 4)."""
@@ -136,6 +143,13 @@ class Sites(AbstractRepresentation):
         columns = [mean, least, most]
         found = [torch.where(column.isfinite(), column, 0) for column in columns]
         return torch.cat([count.to(mean).log(), *found, (shares.amax(1) + 1e-3).log()], dim=1)
+
+
+def _engineered(touches: Touches) -> Tensor:
+    """Return the engineered features that a dead sensor does not change, (B, D), as asinh."""
+    found = engineered_features(touches)
+    kept = [value for name, value in found.items() if not name.startswith(_COUNTING)]
+    return torch.stack([value.to(touches.readings) for value in kept], dim=1).asinh()
 
 
 def _no_geometry() -> InputError:

@@ -32,7 +32,7 @@ def shown(touches):
 def test_the_shape_does_not_depend_on_the_sensors(touches):
     frames = shown(touches)
     assert frames.x.shape == (5, 12, 36 * 3 * 4 + 2 * 10 + 2)
-    assert frames.summary.shape == (5, 1 + 3 * len(GEOMETRY) + 36 * 3)
+    assert frames.summary.shape == (5, 1 + 3 * len(GEOMETRY) + 36 * 3 + 107)
     assert torch.isfinite(frames.x).all()
     assert torch.isfinite(frames.summary).all()
 

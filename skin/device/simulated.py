@@ -13,13 +13,13 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
-from skin.device._geometry import sensor_geometry
 from skin.device._metadata import describe
 from skin.device._split import split_rows, split_slices
 from skin.device._threads import in_threads
 from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
 from skin.device.base import AbstractSimulated, Split
+from skin.device.geometry import sensor_geometry
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout

@@ -1,7 +1,7 @@
 """Touches on many skins, each drawn at random."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.device._blank import Blank
-from skin.device._drawn_skin import SkinDistribution
+from skin.device._drawn_skin import DrawnSkin, SkinDistribution
 from skin.device._split import split_slices
 from skin.device._threads import in_threads
 from skin.device.base import AbstractDevice, Split
@@ -24,9 +24,12 @@ from skin.labels import TOUCH
 from skin.layout.base import AbstractLayout
 from skin.recording import GEOMETRY, Touches
 from skin.rng import Stream, generator
+from skin.sensors import Sensors
 from skin.settings import check_settings, configured
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
+from skin.simulator.base import AbstractSimulator
 from skin.touch.gesture import GestureSettings
+from skin.wire.source import Source
 
 _GROUP = 128  # largest number of gestures on one skin at a time; fewer take longer
 _DEAD = 4  # at most one of so many sensors is dead
@@ -43,7 +46,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
     never valid.
 
     Args:
-        body, layout: not used; the skins have their own.
+        body, layout, simulator: of the skin to use the run on (:attr:`reference`); the drawn skins have their
+            own.
         skins: the distribution (:class:`skin.device._drawn_skin.SkinDistribution`).
         count: number of skins to train on.
         test_skins: number of skins to test on.
@@ -58,6 +62,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
 
     body: AbstractBody
     layout: AbstractLayout
+    simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
     skins: Mapping[str, Any]
     count: Annotated[int, Ge(1)] = 200
     test_skins: Annotated[int, Ge(1)] = 20
@@ -73,7 +78,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
         settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         check_settings(type(self), settings, "device")
         self.distribution = configured(SkinDistribution, self.skins, "device.skins")
-        self.task, self.size = TOUCH, self.body.size
+        self.task, self.size, self.sensors = TOUCH, self.body.size, self.layout.sensors(self.body)
         self.window = GestureSettings.of(self.touch).frames.window
         self._kept: dict[str, Touches] = {}
 
@@ -87,22 +92,36 @@ class Skins(ImperfectionSettings, AbstractDevice):
         """The skins to test on."""
         return self._prepare(_TEST, self.test_skins)
 
+    @property
+    def reference(self) -> Simulated:
+        """The skin of body, layout and simulator, with other imperfections in every touch."""
+        return self._simulated(DrawnSkin(self.body, self.layout, self.simulator, 0.0), 0)
+
+    def source(self) -> Source:
+        """Open a stream of test gestures on :attr:`reference`, in real time."""
+        return self.reference.source()
+
     def _prepare(self, part: int, count: int) -> list[Simulated]:
         console, shown = Console(stderr=True), sys.stderr.isatty()
         numbers = track(range(count), "preparing skins", console=console, disable=not shown)
-        return [self._skin(part, number) for number in numbers]
+        for number in numbers:
+            # What solves a skin keeps large factors; made again, it reads its operator from the disk.
+            self._skin(part, number).geometry  # noqa: B018
+        return [self._skin(part, number) for number in range(count)]
 
     def _skin(self, part: int, number: int) -> Simulated:
         random = generator(Stream.SKIN, self.skin_seed, part, number)
-        drawn = self.distribution.draw(random, mixed=part == _TRAINING)
+        return self._simulated(self.distribution.draw(random, mixed=part == _TRAINING), number)
+
+    def _simulated(self, skin: DrawnSkin, number: int) -> Simulated:
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
-        sensors = len(drawn.layout.sensors(drawn.body))
+        sensors = len(skin.layout.sensors(skin.body))
         imperfections["dead"] = [min(one, sensors // _DEAD) for one in Imperfection.of(self, None).dead_range]
         return Simulated(
-            body=drawn.body,
-            layout=drawn.layout,
-            simulator=drawn.simulator,
-            position_error=drawn.position_error,
+            body=skin.body,
+            layout=skin.layout,
+            simulator=skin.simulator,
+            position_error=skin.position_error,
             touch=self.touch,
             padded=self.padded,
             randomise=True,
@@ -139,11 +158,13 @@ class Skins(ImperfectionSettings, AbstractDevice):
         return join_skins(in_threads(draw, len(sizes)))
 
     def blank(self) -> AbstractDevice:
-        """Return a device with touches of the same shapes, for which no skin is prepared."""
-        empty = torch.zeros(1, self.window, 1)
-        geometry = torch.ones(1, len(GEOMETRY))
-        rate = GestureSettings.of(self.touch).rate
-        touches = Touches(empty, empty == 0, torch.zeros(1, 3), None, float(rate), geometry=geometry)
+        """Return a device with a touch of the same shapes on the skin of body and layout."""
+        sensors = len(self.sensors)
+        empty = torch.zeros(1, self.window, sensors)
+        geometry = torch.ones(sensors, len(GEOMETRY))
+        positions = torch.from_numpy(self.sensors.positions).float()
+        rate = float(GestureSettings.of(self.touch).rate)
+        touches = Touches(empty, empty == 0, positions, None, rate, geometry=geometry)
         return Blank.of(self.task, self.size, touches)
 
 

@@ -81,7 +81,7 @@ def test_test_skins_are_not_training_skins(device):
 def test_a_blank_device_prepares_no_skin(configured):
     fresh = build_device(validate_config(configured(*SMALL)))
     blank = fresh.blank()
-    assert blank.touches("train").readings.shape == (1, 30, 1)
+    assert blank.touches("train").readings.shape == (1, 30, 25)
     assert "training_skins" not in vars(fresh)
 
 

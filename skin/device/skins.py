@@ -15,11 +15,11 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.device._blank import Blank
-from skin.device._drawn_skin import DrawnSkin, SkinDistribution
 from skin.device._split import split_slices
 from skin.device._threads import in_threads
 from skin.device.base import AbstractDevice, Split
 from skin.device.simulated import Simulated
+from skin.device.skin_distribution import DrawnSkin, SkinDistribution
 from skin.labels import TOUCH
 from skin.layout.base import AbstractLayout
 from skin.recording import GEOMETRY, Touches
@@ -48,7 +48,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     Args:
         body, layout, simulator: of the skin to use the run on (:attr:`reference`); the drawn skins have their
             own.
-        skins: the distribution (:class:`skin.device._drawn_skin.SkinDistribution`).
+        skins: the distribution (:class:`skin.device.skin_distribution.SkinDistribution`).
         count: number of skins to train on.
         test_skins: number of skins to test on.
         skin_seed: of the skins.

@@ -1,19 +1,12 @@
 """Touches on many skins: what a batch holds, and that test skins are others."""
 
-import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from skin.body.arm import Arm
-from skin.body.sheet import Sheet
 from skin.build import build_device
 from skin.config import validate_config
-from skin.device._drawn_skin import SkinDistribution
 from skin.errors import InputError
-from skin.paths import CONF
 from skin.recording import GEOMETRY
-from skin.rng import Stream, generator
 
 SMALL = (
     "device=skins", "device.count=2", "device.test_skins=1", "device.skins.length=[0.08,0.1]",
@@ -25,32 +18,6 @@ SMALL = (
 @pytest.fixture(scope="module")
 def device(configured):
     return build_device(validate_config(configured(*SMALL)))
-
-
-@pytest.fixture(scope="module")
-def distribution():
-    settings = OmegaConf.to_container(OmegaConf.load(CONF / "device" / "skins.yaml").skins)
-    return SkinDistribution(**settings)
-
-
-def test_drawn_skins_lie_in_their_ranges(distribution):
-    kinds, bodies = set(), set()
-    for number in range(60):
-        skin = distribution.draw(generator(Stream.SKIN, 0, 0, number))
-        sensors = skin.layout.sensors(skin.body)
-        kinds.add(type(skin.layout).__name__)
-        bodies.add(type(skin.body))
-        assert 4 <= len(sensors) <= 72  # the last row of a grid may be longer than wanted
-        assert 0.08 <= max(skin.body.size) <= 0.32
-        assert max(skin.body.size) / min(skin.body.size) <= 3 + 1e-9
-        top = skin.body.layers[-1].thickness
-        assert (sensors.positions[:, 2] >= 0.5 * top - 1e-12).all()
-        assert (sensors.positions[:, 2] <= top + 1e-12).all()
-        apart = np.abs(sensors.positions[:, None, :2] - sensors.positions[None, :, :2])
-        meet = (apart < np.array(sensors.footprint) - 1e-6).all(axis=2)
-        assert meet.sum() == len(sensors), type(skin.layout)
-    assert kinds == {"Grid", "Scattered", "Hexagonal", "Random", "_Places"}
-    assert bodies == {Sheet, Arm}
 
 
 def test_touches_of_skins_with_few_sensors_are_filled_up(device):

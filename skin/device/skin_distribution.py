@@ -36,6 +36,7 @@ _POISSON = 0.49
 _TRIES = 2000
 _LEAST_CELLS = 8
 _ROUNDS = 20
+_EQUAL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,35 @@ class SkinDistribution:
             depth = top if plates else depth  # plates on beams know forces between layers only
         layout = _layout(kind, count, body.size, side, depth, generator)
         return DrawnSkin(body, layout, simulator, generator.uniform(*self.position_error))
+
+    def outside(self, body: AbstractBody, sensors: Sensors) -> list[str]:
+        """Return what of a skin lies outside the ranges, as "number of sensors 100 (4 to 64)"."""
+        shorter, longer = sorted(body.size)
+        numbers: list[tuple[str, float, tuple[float, float], str]] = [
+            ("longer side", longer, self.length, " m"),
+            ("ratio of the sides", longer / shorter, self.aspect, ""),
+            ("number of sensors", len(sensors), self.sensors, ""),
+            ("side of a footprint", math.sqrt(math.prod(sensors.footprint)), self.footprint, " m"),
+        ]
+        if isinstance(body, Arm):
+            numbers.append(("radius", body.radius, self.radius, " m"))
+        if len(body.layers) != 2:
+            numbers.append(("number of layers", len(body.layers), (2, 2), ""))
+        else:
+            (base, top), depths = body.layers, sensors.positions[:, 2]
+            numbers += [
+                ("thickness of the lower layer", base.thickness, self.base, " m"),
+                ("thickness of the upper layer", top.thickness, self.top, " m"),
+                ("modulus of the lower layer", base.material.young, self.base_young, " Pa"),
+                ("modulus of the upper layer", top.material.young, self.top_young, " Pa"),
+                ("least depth over upper layer", float(depths.min()) / top.thickness, self.depth, ""),
+                ("largest depth over upper layer", float(depths.max()) / top.thickness, self.depth, ""),
+            ]
+        return [
+            f"{name} {value:.3g}{unit} ({low:g} to {high:g}{unit})"
+            for name, value, (low, high), unit in numbers
+            if not low * (1 - _EQUAL) <= value <= high * (1 + _EQUAL)
+        ]
 
     def _body(self, generator: np.random.Generator) -> AbstractBody:
         longer = generator.uniform(*self.length)

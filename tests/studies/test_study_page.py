@@ -87,8 +87,8 @@ def test_conditions_are_columns_of_the_first_metric():
 def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
     assert variants_table(under_conditions("a"), METRICS[:2]) == [
         ["a", "overall", "big"],
-        ["none", "85.0 ± 10.0", ""],
-        ["5 dead", "85.0 ± 10.0", ""],
+        ["none", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["5 dead", "85.0 ± 10.0", "85.0 ± 10.0"],
     ]
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import pytest
 from PIL import Image
@@ -10,6 +11,7 @@ from rich.console import Console
 from experiments.studies.comparison import Paired
 from experiments.studies.outcomes import StatementResult
 from experiments.studies.study import Statement, Study, Variant
+from experiments.studies.study_figure import study_figure
 from experiments.studies.study_page import comparison_text, publish_study, variants_table
 from experiments.studies.trials import Trial
 
@@ -133,3 +135,18 @@ def test_files_and_terminal_say_the_same(tmp_path):
     ]
     with Image.open(tmp_path / "study_edges.png") as picture:
         assert picture.size[0] > 500
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
+    numbers = {4: 0.9, 25: 0.97, 9: 0.95}
+    found = [
+        trial("any", "0", share, condition=f"grid {n}") if single else trial(f"grid {n}", "0", share)
+        for n, share in numbers.items()
+    ]
+    found += [trial("any" if single else "other", "0", 0.5, condition="other" if single else "")]
+    (axis,) = study_figure(replace(STUDY, axis="number of sensors"), found).axes
+    (line,) = axis.containers
+    assert line[0].get_xdata().tolist() == [4, 9, 25]
+    assert line[0].get_ydata().tolist() == pytest.approx([90, 95, 97])
+    assert (line.get_label(), axis.get_xlabel()) == ("grid", "number of sensors")

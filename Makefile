@@ -20,7 +20,7 @@ NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/c
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install test roundings slow check bench physics peers ui reproduce-table results release-check clean
+.PHONY: help install test roundings slow check bench physics peers ui reproduce-table results release-check docs notice clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -28,7 +28,7 @@ help:  ## list the targets
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings]"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings,docs]"
 	touch $@
 
 install: $(READY)  ## create .venv; run by the other targets if needed
@@ -81,6 +81,9 @@ results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$
 
 release-check: $(READY)  ## train three models again and compare them with docs/results/runs.parquet
 	$(BIN)/skin results results.action=check
+
+notice: $(READY)  ## write NOTICE, the licences of dependencies, data and weights
+	$(BIN)/python -m experiments.notice
 
 clean:  ## remove environments and caches; keep results and runs
 	rm -rf $(VENV) $(PEERS) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

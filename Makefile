@@ -41,8 +41,9 @@ roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several
 		echo "== $$setting"; env $$setting $(TEST) $(or $(TESTS),$(NUMERICAL)) || failed="$$failed $$setting"; \
 	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
 
-slow: $(PEERS)/.ready  ## run the test suite under these settings, including the baseline libraries
+slow: $(PEERS)/.ready  ## run the test suite under these settings, including the baseline libraries, and build the documentation
 	$(MAKE) roundings TESTS=tests
+	$(MAKE) docs
 
 check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff check .
@@ -81,6 +82,10 @@ results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$
 
 release-check: $(READY)  ## train three models again and compare them with docs/results/runs.parquet
 	$(BIN)/skin results results.action=check
+
+docs: $(READY)  ## build the documentation site in site/, offline; run tutorials and gallery; warnings are errors
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -b html docs site
+	@echo "site/index.html"
 
 notice: $(READY)  ## write NOTICE, the licences of dependencies, data and weights
 	$(BIN)/python -m experiments.notice

@@ -46,5 +46,4 @@ sphinx_gallery_conf = {
 
 html_theme = "furo"
 html_title = "Tactile skin"
-html_static_path = ["_static"]
 html_show_sphinx = False

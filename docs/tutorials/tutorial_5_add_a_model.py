@@ -67,7 +67,7 @@ width: 32
 # %%
 # Train it
 # --------
-# ``--config-dir`` adds the folder. Every other part is chosen as usual; two epochs of a few touches show
+# ``--config-dir`` adds the folder. Every other part is chosen as usual. Ten epochs of a few touches only show
 # that it works.
 
 main(
@@ -79,7 +79,7 @@ main(
         "model=squared",
         "simulator=naive",
         "data.gestures=400",
-        "trainer.max_epochs=2",
+        "trainer.max_epochs=10",
         "device.test_gestures=200",
         "evaluation.safe_gestures=2000",
         "evaluation.devices=0",

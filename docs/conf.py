@@ -37,7 +37,6 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",
     "within_subsection_order": "FileNameSortKey",
     "image_scrapers": ("figure_scraper",),
-    "abort_on_example_error": True,
     "show_memory": False,
     "min_reported_time": 1e6,
     "download_all_examples": False,

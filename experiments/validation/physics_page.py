@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 
 from experiments.validation.finding import CheckResult, Finding, Law, Plot
 from skin.files import whole, write
+from skin.plot.figures import MARKS
 
 Results = Sequence[tuple[Law, CheckResult]]
 
@@ -27,6 +29,7 @@ machine.
 
 # Rounding errors in double and in single precision; the tolerance of a finding tells which applies.
 _DOUBLE, _SINGLE = 1e-10, 1e-6
+_LINES = ("-", "--", "-.", ":")  # curves differ without colour
 
 _LIMITS = """
 ## Limits
@@ -124,8 +127,9 @@ def draw(plot: Plot, path: Path) -> None:
     """Write a plot as PNG."""
     figure = Figure(figsize=(5.6, 3.4), layout="constrained")
     axes = figure.add_subplot()
-    for curve in plot.curves:
-        style = {"marker": "o", "markersize": 3.5, "linestyle": "none"} if curve.marks else {"linewidth": 1.2}
+    for curve, mark, line in zip(plot.curves, cycle(MARKS), cycle(_LINES), strict=False):
+        points = {"marker": mark, "markersize": 3.5, "linestyle": "none"}
+        style = points if curve.marks else {"linewidth": 1.2, "linestyle": line}
         axes.plot(curve.x, curve.y, label=curve.label, **style)
     if plot.log:
         axes.set(xscale="log", yscale="log")

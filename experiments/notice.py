@@ -67,8 +67,10 @@ def licence(name: str) -> str:
 
 def _statements(stated: PackageMetadata) -> Iterator[str]:
     """Yield what a package states as its licence, the most exact statement first."""
-    yield (stated.get("License-Expression") or "").strip()
-    text = (stated.get("License") or "").strip()
+    expression, text = (
+        (stated.get_all(name) or [""])[0].strip() for name in ("License-Expression", "License")
+    )
+    yield expression
     yield text if len(text) <= _LONGEST else ""
     classified = [one for one in stated.get_all("Classifier") or [] if one.startswith(_LICENCE)]
     yield ", ".join(one.rpartition(" :: ")[2] for one in classified)

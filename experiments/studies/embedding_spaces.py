@@ -174,7 +174,7 @@ def _percent(values: Sequence[float]) -> str:
 def _scatter(axis: Axes, plane: np.ndarray, classes: np.ndarray) -> None:
     for number in np.unique(classes):
         x, y = plane[classes == number].T
-        style = {"color": COLOURS[number % len(COLOURS)], "marker": MARKS[number % len(MARKS)]}
-        axis.scatter(x, y, s=7, alpha=0.6, linewidths=0, **style)
+        colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
+        axis.scatter(x, y, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
     axis.set_xticks([])
     axis.set_yticks([])

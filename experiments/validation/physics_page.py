@@ -128,9 +128,10 @@ def draw(plot: Plot, path: Path) -> None:
     figure = Figure(figsize=(5.6, 3.4), layout="constrained")
     axes = figure.add_subplot()
     for curve, mark, line in zip(plot.curves, cycle(MARKS), cycle(_LINES), strict=False):
-        points = {"marker": mark, "markersize": 3.5, "linestyle": "none"}
-        style = points if curve.marks else {"linewidth": 1.2, "linestyle": line}
-        axes.plot(curve.x, curve.y, label=curve.label, **style)
+        if curve.marks:
+            axes.plot(curve.x, curve.y, mark, markersize=3.5, label=curve.label)
+        else:
+            axes.plot(curve.x, curve.y, line, linewidth=1.2, label=curve.label)
     if plot.log:
         axes.set(xscale="log", yscale="log")
     axes.set(xlabel=plot.x, ylabel=plot.y, title=plot.title)

@@ -8,6 +8,9 @@ SEEDS ?= 1
 PART ?= all
 FRESH ?=
 PEERS := .venv-peers
+WHEEL := .venv-wheel
+# A training of a few seconds; ignore the scores.
+SMOKE := experiment=features simulator=naive data.gestures=400 device.test_gestures=200 evaluation.devices=0 evaluation.layouts=0
 TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs
 # Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
@@ -20,7 +23,7 @@ NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/c
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install test roundings slow check bench physics peers ui reproduce-table results release-check clean
+.PHONY: help install test roundings slow check bench physics peers ui reproduce-table results wheel-check release-check docs notice clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -28,7 +31,7 @@ help:  ## list the targets
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings]"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings,docs]"
 	touch $@
 
 install: $(READY)  ## create .venv; run by the other targets if needed
@@ -41,8 +44,9 @@ roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several
 		echo "== $$setting"; env $$setting $(TEST) $(or $(TESTS),$(NUMERICAL)) || failed="$$failed $$setting"; \
 	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
 
-slow: $(PEERS)/.ready  ## run the test suite under these settings, including the baseline libraries
+slow: $(PEERS)/.ready  ## run the test suite under these settings, including the baseline libraries, and build the documentation
 	$(MAKE) roundings TESTS=tests
+	$(MAKE) docs
 
 check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff check .
@@ -79,8 +83,24 @@ reproduce-table: $(READY)  ## train the models of the results table and print it
 results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$(PART)),$(PEERS)/.ready))  ## publish all results in 31 h: PART=table 9.5 h, peers 2.4 h, shifts 3.4 h, sensors 1.5 h, studies 13.7 h, design 0.17 h (JOBS=2, FRESH=1, BUDGET=smoke)
 	$(BIN)/skin results results.part=$(PART) results.budget=$(BUDGET) $(if $(FRESH),results.fresh=true) $(if $(JOBS),results.jobs=$(JOBS))
 
-release-check: $(READY)  ## train three models again and compare them with docs/results/runs.parquet
+wheel-check: $(READY)  ## install the wheel in an empty environment; train and evaluate a small model there
+	rm -rf $(WHEEL) && mkdir -p $(WHEEL)/empty
+	$(BIN)/python -m hatchling build --target wheel --directory $(WHEEL)/dist
+	$(PYTHON) -m venv $(WHEEL)/env
+	$(WHEEL)/env/bin/python -m pip install --quiet --constraint constraints.txt $(WHEEL)/dist/*.whl
+	cd $(WHEEL)/empty && unset PYTHONPATH && ../env/bin/skin train $(SMOKE) && ../env/bin/skin evaluate run=latest && test -f mlflow.db
+	rm -rf $(WHEEL)
+
+# `make demo` has no part in this check yet: add a target demo-check here when it exists.
+release-check: $(READY) wheel-check  ## check the wheel; train three models again and compare them with docs/results/runs.parquet
 	$(BIN)/skin results results.action=check
 
+docs: $(READY)  ## build the documentation site in site/, offline; run tutorials and gallery; warnings are errors
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -b html docs site
+	@echo "site/index.html"
+
+notice: $(READY)  ## write NOTICE, the licences of dependencies, data and weights
+	$(BIN)/python -m experiments.notice
+
 clean:  ## remove environments and caches; keep results and runs
-	rm -rf $(VENV) $(PEERS) *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs
+	rm -rf $(VENV) $(PEERS) $(WHEEL) site docs/generated *.egg-info .pytest_cache .ruff_cache .mypy_cache outputs

@@ -1,6 +1,6 @@
 """Class balance of a data set: shape, area, force and position per class, and leakage of labels by shape."""
 
-import sys
+import logging
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,16 @@ from skin.recording import Recording
 from skin.touch.gesture import GestureSettings
 from skin.touch.stream import only_touches
 
+_log = logging.getLogger(__name__)
+
 
 def report_balance(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
-    """Print the class balance of the gestures that a simulated device is trained on, and check it.
+    """Log the class balance of the gestures that a simulated device is trained on, and check it.
 
     Args:
         device: the device; nothing is done unless it is simulated.
         recording: its gestures; None: its training budget.
-        shown: whether to print the balance.
+        shown: whether to log the balance.
 
     Raises:
         InputError: as :func:`check_label_leakage`.
@@ -31,7 +33,7 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
     sampler = device.simulation.sampler
     found = class_balance(recording or device.recording(None, complete=False), sampler.shapes.names)
     if shown:
-        print(*balance_table(found), sep="\n", file=sys.stderr)
+        _log.info("\n".join(balance_table(found)))
     check_label_leakage(found, sampler.settings)
 
 

@@ -1,6 +1,7 @@
 """Commands: functions of a configuration that Hydra composes from the command line."""
 
 from skin import interrupt  # noqa: F401  # isort: skip
+import logging
 import os
 import signal
 import sys
@@ -52,6 +53,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                 sys.exit(2)
 
         def main(words: Sequence[str] | None = None) -> None:
+            _log_to_stderr()
             try:
                 _run(job, name, sys.argv[1:] if words is None else words)
             except Exception as error:
@@ -64,6 +66,14 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         return main
 
     return decorate
+
+
+def _log_to_stderr() -> None:
+    """Write the messages of this package to standard error; results go to standard output."""
+    logger = logging.getLogger("skin")
+    logger.setLevel(logging.INFO)
+    # A handler of an earlier command in this process would write to the standard error of that time.
+    logger.handlers = [logging.StreamHandler()]
 
 
 def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> None:

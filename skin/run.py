@@ -1,9 +1,9 @@
 """One run: build, train, evaluate, log."""
 
+import logging
 import math
 import os
 import shutil
-import sys
 import tempfile
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -43,6 +43,8 @@ from skin.stored_run import TAG
 from skin.tracking import Store
 from skin.unfinished import find_unfinished, unfinished_folder
 
+_log = logging.getLogger(__name__)
+
 SWEPT = "SKIN_SWEPT"
 """Environment variable with the settings that a sweep varies, for its jobs."""
 
@@ -80,7 +82,7 @@ def train(config: DictConfig) -> bool:
     if finished:
         note_reuse(finished[0])
         if PARENT not in os.environ:
-            print(f"run {finished[0].info.run_id} did this before: tracking.resume=false repeats it")
+            _log.info("run %s did this before: tracking.resume=false repeats it", finished[0].info.run_id)
             Console().print(metrics_table(finished[0].data.metrics, finished[0].info.run_name))
         return False
     check_evaluation(config.evaluation)
@@ -221,7 +223,7 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
     if point is not None:
         values = values | {"alarm/threshold": point.threshold, "alarm/safe_gestures": point.safe}
         if point.warning():
-            print(f"warning: {point.warning()}", file=sys.stderr)
+            _log.warning("warning: %s", point.warning())
     store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
     defined = {name: value for name, value in report.metrics.items() if not math.isnan(value)}
     store.log_metrics(run, defined | values)

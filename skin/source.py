@@ -1,10 +1,10 @@
 """The code and the processor that produce a result."""
 
 import atexit
+import logging
 import platform
 import re
 import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from skin.paths import BUNDLED, ROOT
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
+_log = logging.getLogger(__name__)
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 _reused: dict[str, str] = {}  # id -> name of reused runs of other code
 
@@ -89,8 +90,8 @@ def _warn() -> None:
         return
     count, first = len(_reused), next(iter(_reused.values()))
     what = f"finished run {first}" if count == 1 else f"{count} finished runs, such as {first}"
-    print(
-        f"warning: reused {what}, of other code (tags source_commit and source_dirty): "
+    _log.warning(
+        "warning: reused %s, of other code (tags source_commit and source_dirty): "
         "tracking.resume=false repeats them",
-        file=sys.stderr,
+        what,
     )

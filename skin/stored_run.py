@@ -1,7 +1,7 @@
 """Load a finished run: its configuration with changes, and its weights."""
 
+import logging
 import pickle
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +26,7 @@ from skin.safe_loading import load_yaml
 from skin.tracking import RECORDED, Store
 from skin.trust import check_targets
 
+_log = logging.getLogger(__name__)
 TAG = "operating_point"
 """Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
 
@@ -198,7 +199,7 @@ def load_operating_point(
             f"{lacks} and its device draws no fresh gestures: {point.sentence()}; train it again to store one"
         )
     if message:
-        print(message, file=sys.stderr, flush=True)
+        _log.warning(message)
     return point
 
 

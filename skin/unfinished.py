@@ -1,5 +1,6 @@
 """Trainings that were interrupted, and the checkpoints that continue them."""
 
+import logging
 from pathlib import Path
 
 from mlflow.entities import Run
@@ -9,6 +10,8 @@ from skin.files import unwritable
 from skin.learner.network import LAST
 from skin.source import source_tags
 from skin.tracking import Store
+
+_log = logging.getLogger(__name__)
 
 
 def find_unfinished(store: Store, settings: Tracking, identity: str) -> Run | None:
@@ -25,7 +28,9 @@ def find_unfinished(store: Store, settings: Tracking, identity: str) -> Run | No
     for run in store.find("KILLED", fingerprint=identity):
         same = all(run.data.tags.get(key) == value for key, value in source.items())
         if same and (_place(settings, run) / LAST).is_file():
-            print(f"run {run.info.run_id} was interrupted and continues: tracking.resume=false repeats it")
+            _log.info(
+                "run %s was interrupted and continues: tracking.resume=false repeats it", run.info.run_id
+            )
             return run
     return None
 

@@ -132,25 +132,25 @@ def settings(rate=0.02):
     return Evaluation(devices=0, layouts=0, gestures=1, false_alarm_rate=rate)
 
 
-def test_an_operating_point_comes_back_as_it_was_stored(capsys):
+def test_an_operating_point_comes_back_as_it_was_stored(caplog):
     point = OperatingPoint(0.8782987594604492, 0.02, 5000, 99, 0)
     assert load_operating_point(tagged(point.text()), None, RECORDED, settings()) == point
     assert load_operating_point(tagged("null"), None, RECORDED, settings()) is None
-    assert capsys.readouterr().err == ""
+    assert caplog.text == ""
 
 
-def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(capsys):
+def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(caplog):
     point = load_operating_point(tagged(), None, RECORDED, settings())
     assert (point.threshold, point.safe) == (0.5, 0)
-    said = capsys.readouterr().err
+    said = caplog.text
     assert "run abc stores no alarm threshold for 2 % false alarms" in said
     assert "its false-alarm rate is unknown; train it again" in said
 
 
-def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(capsys):
+def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(caplog):
     point = OperatingPoint(0.875, 0.02, 300, 5, None)
     assert load_operating_point(tagged(point.text()), None, RECORDED, settings(0.1)) == point
-    said = capsys.readouterr().err
+    said = caplog.text
     assert "no alarm threshold for 10 % false alarms" in said
     assert "chosen on 300 safe validation gestures for 2 % false alarms" in said
 

@@ -122,7 +122,7 @@ def test_a_run_is_named_by_its_changes_and_logs_them_and_a_skipped_one_prints_it
     assert not {"representation", "model", "fusion"} & set(params)  # rules use none of them
     again = run(tmp_path, *given)
     assert again.returncode == 0, again.stderr
-    assert "did this before" in again.stdout
+    assert "did this before" in again.stderr
     rows = [line for line in first.stdout.splitlines() if line.startswith("│")]
     assert rows == [line for line in again.stdout.splitlines() if line.startswith("│")]
     assert rows

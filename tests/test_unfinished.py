@@ -64,7 +64,7 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin,
     (left,) = store.find("KILLED")
     again = run(killed, *TRAINING)
     assert again.returncode == 0, again.stderr
-    assert f"run {left.info.run_id} was interrupted and continues" in again.stdout
+    assert f"run {left.info.run_id} was interrupted and continues" in again.stderr
     assert not last.parent.exists()
     (expected, weights), (found, same) = learned(whole), learned(killed)
     assert found.info.run_id == left.info.run_id

@@ -12,7 +12,7 @@ from sklearn.manifold import TSNE
 from experiments.studies.comparison import combine_verdicts, paired, verdict
 from experiments.studies.embedding.probe import FRAME, ProbeResult
 from experiments.studies.tables import Page
-from skin.plot.figures import COLOURS
+from skin.plot.figures import COLOURS, MARKS
 
 _ABOUT = """\
 The labels: accuracy on held-out touches of an SVM (radial basis functions on standardised vectors, cost
@@ -66,7 +66,7 @@ def spaces(found: Sequence[ProbeResult], names: Sequence[str], points: int = 400
         row[0].set_ylabel(_title(one), fontsize=8)
     for axis, name in zip(axes[0], [*names, "layout"], strict=False):
         axis.set_title(name)
-    figure.supxlabel("orange: the label holds, blue: it does not; a layout, a colour", fontsize=8)
+    figure.supxlabel("square: the label holds, circle: it does not; each layout has a mark", fontsize=8)
     return figure
 
 
@@ -174,6 +174,7 @@ def _percent(values: Sequence[float]) -> str:
 def _scatter(axis: Axes, plane: np.ndarray, classes: np.ndarray) -> None:
     for number in np.unique(classes):
         x, y = plane[classes == number].T
-        axis.scatter(x, y, s=4, color=COLOURS[number % len(COLOURS)], alpha=0.6, linewidths=0)
+        colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
+        axis.scatter(x, y, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
     axis.set_xticks([])
     axis.set_yticks([])

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from experiments.studies.tables import Page
 from skin.evaluation.margins import ALARM, Faint, MarginReport, Span
 from skin.labels import OPPOSITE, TOUCH
-from skin.plot.figures import COLOURS
+from skin.plot.figures import COLOURS, MARKS
 
 _MEASURES = {
     "big": "area",
@@ -112,9 +112,9 @@ def _figure(found: MarginReport, title: str) -> Figure:
     """Draw what is said against measure over threshold, and errors against the highest reading."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    colours = dict(zip([*TOUCH.names, ALARM], COLOURS, strict=False))
+    styles = dict(zip([*TOUCH.names, ALARM], zip(COLOURS, MARKS, strict=True), strict=False))
     for name in ("big", "dangerous", ALARM):
-        _course(left, found.spans[name], name, colours[name])
+        _course(left, found.spans[name], name, *styles[name])
     left.axvline(1, color="black", lw=0.8, ls=":")
     left.set_xscale("log")
     left.set_xlim(0.4, 2.5)
@@ -126,14 +126,9 @@ def _figure(found: MarginReport, title: str) -> Figure:
     left.set_title(title, fontsize=10)
     places = range(len(found.faint))
     for name in TOUCH.names:
-        right.plot(
-            places,
-            [100 * one.wrong[name] / one.count for one in found.faint],
-            "o-",
-            color=colours[name],
-            ms=4,
-        )
-        right.lines[-1].set_label(name)
+        colour, mark = styles[name]
+        shares = [100 * one.wrong[name] / one.count for one in found.faint]
+        right.plot(places, shares, marker=mark, color=colour, ms=4, label=name)
     right.set_xticks(places, [f"{_span(one)}\n{one.count}" for one in found.faint], fontsize=7)
     right.set_xlabel("highest reading above idle, N; touches")
     right.set_ylabel("wrong, %")
@@ -142,12 +137,20 @@ def _figure(found: MarginReport, title: str) -> Figure:
     return figure
 
 
-def _course(axis: Axes, each: list[Span], name: str, colour: str) -> None:
+def _course(axis: Axes, each: list[Span], name: str, colour: str, mark: str) -> None:
     shares = [100 * one.said / one.count for one in each]
     spread = [
         [share - 100 * one.range[0] for share, one in zip(shares, each, strict=True)],
         [100 * one.range[1] - share for share, one in zip(shares, each, strict=True)],
     ]
     axis.errorbar(
-        [one.mean for one in each], shares, spread, fmt="o-", color=colour, ms=4, lw=1, capsize=2, label=name
+        [one.mean for one in each],
+        shares,
+        spread,
+        marker=mark,
+        color=colour,
+        ms=4,
+        lw=1,
+        capsize=2,
+        label=name,
     )

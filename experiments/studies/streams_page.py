@@ -9,7 +9,7 @@ from torch import Tensor
 from experiments.studies.tables import Page
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.sliding_windows import WindowReport
-from skin.plot.figures import COLOURS
+from skin.plot.figures import COLOURS, MARKS
 
 
 def build_streams_page(found: WindowReport, title: str) -> Page:
@@ -107,11 +107,10 @@ def _figure(found: WindowReport, title: str) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
     names = list(found.bins[0].accuracy) if found.bins else []
     places = range(len(found.bins))
-    for name, colour in zip(names, COLOURS, strict=False):
-        left.plot(
-            places, [100 * one.accuracy[name] for one in found.bins], "o-", color=colour, ms=4, label=name
-        )
-        left.plot(places, [100 * one.majority[name] for one in found.bins], ":", color=colour, lw=1)
+    for name, colour, mark in zip(names, COLOURS, MARKS, strict=False):
+        style = {"marker": mark, "color": colour}
+        left.plot(places, [100 * one.accuracy[name] for one in found.bins], ms=4, label=name, **style)
+        left.plot(places, [100 * one.majority[name] for one in found.bins], ":", ms=2, lw=1, **style)
     left.set_xticks(places, [f"{one.name}\n{one.count}" for one in found.bins])
     left.set_xlabel("share of the touch in the window, number of windows")
     left.set_ylabel("accuracy, % (dotted: commoner answer)")

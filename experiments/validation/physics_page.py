@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 
 from experiments.validation.finding import CheckResult, Finding, Law, Plot
 from skin.files import whole, write
+from skin.plot.figures import MARKS
 
 Results = Sequence[tuple[Law, CheckResult]]
 
@@ -27,12 +29,13 @@ machine.
 
 # Rounding errors in double and in single precision; the tolerance of a finding tells which applies.
 _DOUBLE, _SINGLE = 1e-10, 1e-6
+_LINES = ("-", "--", "-.", ":")  # curves differ without colour
 
 _LIMITS = """
 ## Limits
 
 - **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
-  [results](results.md#what-the-numbers-are-worth).
+  [results](results.md#limitations).
 - **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Material under a
   wide object must move sideways. Elements that are as long as the skin is thick restrict this motion, most
   of all beside the edge of the object: see `mesh` for the default mesh, a finer one and coarser ones.
@@ -124,9 +127,11 @@ def draw(plot: Plot, path: Path) -> None:
     """Write a plot as PNG."""
     figure = Figure(figsize=(5.6, 3.4), layout="constrained")
     axes = figure.add_subplot()
-    for curve in plot.curves:
-        style = {"marker": "o", "markersize": 3.5, "linestyle": "none"} if curve.marks else {"linewidth": 1.2}
-        axes.plot(curve.x, curve.y, label=curve.label, **style)
+    for curve, mark, line in zip(plot.curves, cycle(MARKS), cycle(_LINES), strict=False):
+        if curve.marks:
+            axes.plot(curve.x, curve.y, mark, markersize=3.5, label=curve.label)
+        else:
+            axes.plot(curve.x, curve.y, line, linewidth=1.2, label=curve.label)
     if plot.log:
         axes.set(xscale="log", yscale="log")
     axes.set(xlabel=plot.x, ylabel=plot.y, title=plot.title)

@@ -187,6 +187,6 @@ def force_and_reading(force: Tensor, readings: Tensor, rate: float) -> Figure:
         axis.set_ylabel("applied force, N", color=COLOURS[0])
         axis.set_xlabel("time, s")
         twin = axis.twinx()
-        twin.plot(time, values[:, sensor], color=COLOURS[4])
-        twin.set_ylabel(f"sensor {sensor}, N", color=COLOURS[4])
+        twin.plot(time, values[:, sensor], color=COLOURS[4], linestyle="--")
+        twin.set_ylabel(f"sensor {sensor}, N (dashed)", color=COLOURS[4])
     return figure

@@ -13,7 +13,7 @@ from skin.settings import checked
 
 @checked("representation")
 class Fourier(AbstractRepresentation):
-    """Returns log(1 + |FFT|) of the sensor image, zero frequency in the middle (report, section 2.2).
+    """Returns ``log(1 + |FFT|)`` of the sensor image, zero frequency in the middle (report, section 2.2).
 
     It shows regular patterns of active sensors. Absolute positions are lost with the phase.
 

@@ -266,3 +266,35 @@ def test_the_page_draws_what_it_is_sent(browser):
         assert said in text
     # Half of the scale: between teal and yellow, and not the darkness of no force.
     assert min(colour[:2]) > 60
+
+
+ANNOUNCED = "return [...document.querySelectorAll('[role=alert]')].map(one => one.textContent)"
+
+
+def test_the_page_announces_an_alarm_and_its_end_once(browser):
+    subject = display()
+    subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
+    subject.set_verdict(None, "filling the window")
+    with web.serve_page(subject, 0) as address:
+        browser.open(address)
+
+        def until(texts):
+            deadline = monotonic() + 300
+            while browser.run("return pictures") < 1 or browser.run(ANNOUNCED) != texts:
+                assert monotonic() < deadline, browser.run(ANNOUNCED)
+                sleep(0.1)
+
+        until([""])
+        browser.run(
+            "window.changes = 0; new MutationObserver(() => changes++)"
+            ".observe(document.querySelector('[role=alert]'), {childList: true, characterData: true})"
+        )
+        subject.set_verdict(PRESSED)
+        until(["Alarm: dangerous touch"])
+        subject.set_verdict(None, "the device has stopped sending", alarm=True)
+        while "stopped sending" not in browser.run("return document.body.innerText"):
+            sleep(0.1)
+        assert browser.run("return changes") == 1
+        assert browser.run("return document.getElementById('head').getAttribute('role')") == "status"
+        subject.set_verdict(None, "the device has stopped sending")
+        until([""])

@@ -1,0 +1,48 @@
+"""Configuration of the documentation site; ``make docs`` builds it."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+
+import skin  # noqa: E402
+
+project = "Tactile skin"
+author = "The skin developers"
+copyright = "2026, the skin developers"
+version = release = skin.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["results/*.md", "firmware", "tutorials", "gallery"]
+myst_heading_anchors = 4  # links between pages name headings, as on GitHub
+
+autosummary_generate = True
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+napoleon_use_ivar = True  # attributes of a dataclass are listed once
+templates_path = ["_templates"]
+
+sphinx_gallery_conf = {
+    "examples_dirs": ["tutorials", "gallery"],
+    "gallery_dirs": ["generated/tutorials", "generated/gallery"],
+    "filename_pattern": r"\.py$",
+    "within_subsection_order": "FileNameSortKey",
+    "image_scrapers": ("figure_scraper",),
+    "show_memory": False,
+    "min_reported_time": 1e6,
+    "download_all_examples": False,
+    "show_signature": False,
+}
+
+html_theme = "furo"
+html_title = "Tactile skin"
+html_show_sphinx = False

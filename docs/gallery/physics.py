@@ -1,0 +1,21 @@
+"""
+Laws of mechanics
+=================
+
+Simulated displacements and forces against independent solutions (:doc:`/physics`). The meshes are those of
+``skin validate validate.quick=true``, coarser than the published ones.
+"""
+
+from pathlib import Path
+from tempfile import mkdtemp
+
+from experiments.validation.laws import select_laws
+from experiments.validation.physics_page import draw
+
+folder, paths = Path(mkdtemp()), []
+for law in select_laws(["boussinesq", "hertz", "locking"]):
+    outcome = law.check(True)
+    print(f"{law.name}: {law.statement} Worst error {max(one.error for one in outcome.findings):.1e}")
+    for plot in outcome.plots:
+        paths.append(folder / f"{plot.name}.png")
+        draw(plot, paths[-1])

@@ -1,0 +1,47 @@
+"""Links of the pages lead somewhere, on GitHub as on the site, and every page is in the site."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import skin
+from skin.paths import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = sorted(
+    [*DOCS.glob("*.md"), *(DOCS / "adr").glob("*.md"), *ROOT.glob("*.md")],
+    key=lambda path: str(path.relative_to(ROOT)),
+)
+FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+
+
+def slugs(path: Path) -> set[str]:
+    """Return the anchors of a page: its headings as GitHub names them, and those written as HTML."""
+    text = path.read_text()
+    headings = re.findall(r"^#+ (.+)$", FENCED.sub("", text), re.MULTILINE)
+    named = {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+    return named | set(re.findall(r'<a (?:name|id)="([^"]+)"', text))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", FENCED.sub("", page.read_text())):
+        if not re.match(r"[a-z]+:", target):
+            name, _, anchor = target.partition("#")
+            path = (page.parent / name).resolve() if name else page
+            assert path.exists(), target
+            if anchor:
+                assert anchor in slugs(path), target
+
+
+def test_every_page_is_in_the_table_of_contents():
+    text = (DOCS / "index.md").read_text()
+    for page in DOCS.glob("*.md"):
+        if page.name != "index.md":
+            assert f"\n{page.stem}\n" in text, page
+
+
+def test_the_reference_lists_the_public_names():
+    names = set(re.findall(r"^\| `skin\.(\w+)`", (DOCS / "api.md").read_text(), re.MULTILINE))
+    assert names == set(skin.__all__)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from skin.labels import longest_run
+from skin.gesture_measures import longest_run
 from skin.recording import Touches
 
 LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle, where the noise is NOISE

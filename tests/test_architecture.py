@@ -28,6 +28,7 @@ learner
 evaluation build unfinished
 stored_run
 trained
+exported
 hardware
 plot
 design

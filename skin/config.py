@@ -101,6 +101,7 @@ class Config:
     seconds: float | None = None
     web: bool | None = None
     live: dict[str, Any] | None = None
+    export: dict[str, Any] | None = None
     gestures: int | None = None
     format: str | None = None
     emulate: dict[str, Any] | None = None

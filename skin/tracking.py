@@ -8,14 +8,12 @@ os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
 
 import json
 import platform
-import signal
 import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import psutil
@@ -31,6 +29,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from skin.config import Tracking
 from skin.errors import InputError
 from skin.files import whole
+from skin.interrupt import ends_on_signal
 from skin.source import source_tags
 
 PROCESS = "process"
@@ -180,24 +179,6 @@ def _gone(process: str) -> bool:
         return True
     except (ValueError, TypeError, psutil.Error):
         return False
-
-
-@contextmanager
-def ends_on_signal() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread."""
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    try:
-        before = signal.signal(signal.SIGTERM, leave)
-    except ValueError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _make(path: Path, artifacts: Path) -> None:

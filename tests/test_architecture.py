@@ -13,7 +13,7 @@ errors interrupt paths option
 trust earlier_settings
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body
+config recording body gesture_measures
 command
 files safe_loading recording_metadata layout summary plausibility
 recording_file touch tracking
@@ -28,6 +28,7 @@ learner
 evaluation build unfinished
 stored_run
 trained
+exported
 hardware
 plot
 design

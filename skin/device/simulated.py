@@ -58,7 +58,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
         stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
             of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
-        direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
+        direction: the direction of sliding is a label too, as its cosines
+            (``skin.gesture_measures.sliding``).
         data_seed: seed of the budget.
         seed: seed of the device's constants and noise; each seed is another device.
         gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`. The rate

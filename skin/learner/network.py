@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from annotated_types import Ge, Le, Lt
-from torch import Tensor
+from torch import Tensor, nn
 
 from skin.config import PARENT
 from skin.error_messages import one_line
@@ -167,6 +167,14 @@ class Network(AbstractLearner):
             RuntimeError: before ``fit`` or ``load``.
         """
         return self._map(touches, lambda of, frames: of.fusion(frames))
+
+    def pipeline(self, positions: Tensor) -> nn.Module:
+        """Return representation and network as one module, in evaluation mode."""
+        from skin.learner._pipeline import Pipeline
+
+        if self._classifier is None or self._data is None:
+            raise RuntimeError("fit or load the learner first")
+        return Pipeline(self._data.representation_for(positions), self._classifier).cpu().eval()
 
     def _map(self, touches: Touches, function: "Callable[[TouchClassifier, Frames], Tensor]") -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""

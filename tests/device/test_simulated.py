@@ -9,7 +9,7 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.labels import movie_labels
+from skin.gesture_measures import movie_labels
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
 from skin.rng import Stream, generator

@@ -55,7 +55,7 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    positions = data.touches("train").positions
+    positions = data.example.positions
     return device, Engine(
         learner, device.task, positions, device.window, device.model_rate, Detection(_TOUCH)
     )

@@ -6,7 +6,8 @@ configuration. ``shards/00000.parquet`` and so on are recordings (:mod:`skin.rec
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -146,7 +147,8 @@ class DataSet:
                 f"{self.path(missing[0]).name} is: repeat the skin generate that made it, which adds them"
             )
         for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
-            about = read_description(self.path(number))
+            with _mended():
+                about = read_description(self.path(number))
             own = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
             if own != (count, first, self.manifest.config_hash):
                 raise InputError(f"{self.path(number)} is not the shard that {MANIFEST} describes: {_AGAIN}")
@@ -161,7 +163,14 @@ class DataSet:
         Raises:
             InputError: the shard is damaged.
         """
-        try:
+        with _mended():
             return read_recording(self.path(number), complete)
-        except InputError as error:
-            raise InputError(f"{error}: {_AGAIN}") from error
+
+
+@contextmanager
+def _mended() -> Iterator[None]:
+    """Add to an InputError about a shard what to do."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{error}: {_AGAIN}") from error

@@ -89,6 +89,7 @@ def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
     if manifest.config_hash != source["config_hash"]:
         before, now = dict(_flat(manifest.config)), dict(_flat(source["config"]))
         changed = [name for name in before | now if before.get(name, ...) != now.get(name, ...)]
+        changed.sort(key=lambda name: name.count("."))  # settings before what is derived from them
         said = [f"{name}={before.get(name)}, not {now.get(name)}" for name in changed[:3]]
         what = "; ".join(said) or "other contents of the files that its settings name, or another version"
         raise InputError(f"{folder} was begun with {what}: repeat those settings, or add out= with a new one")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
+from hashlib import sha256
 from typing import Any
 
 import pytorch_lightning as pl
@@ -11,10 +12,10 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from skin.classifier import Batch
-from skin.device.base import AbstractDevice
+from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import Task
-from skin.recording import Touches
+from skin.recording import Touches, touches_hash
 from skin.representation.base import AbstractRepresentation, Frames
 from skin.settings import checked
 from skin.signal.augmentation import Augmentation
@@ -27,8 +28,9 @@ class TouchData(pl.LightningDataModule):
     """Data module with batches of a device's touches in a representation.
 
     Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
-    one. A device that draws fresh gestures is called again every epoch. Processes that train together share
-    each training batch; each of them validates on all gestures.
+    one. A device that draws fresh gestures is called again every epoch. If a device makes its touches in
+    parts, each epoch has the parts in another order, and shuffles the touches of each. Processes that train
+    together share each training batch; each of them validates on all gestures.
 
     Args:
         device: source of touches.
@@ -75,15 +77,51 @@ class TouchData(pl.LightningDataModule):
     @property
     def window(self) -> int:
         """Number of frames per touch."""
-        return self.touches("train").readings.shape[1]
+        return self.example.readings.shape[1]
 
-    def touches(self, split: str, epoch: int = 0) -> Touches:
+    @cached_property
+    def example(self) -> Touches:
+        """The first touch of the training split."""
+        for touches in self.parts("train"):
+            return touches[torch.tensor([0])]
+        raise InputError("there are no touches to train on: generate or record more")
+
+    @property
+    def hash(self) -> str:
+        """Hash of the readings and labels of the training split."""
+        hashes = [touches_hash(touches) for touches in self.parts("train")]
+        return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode()).hexdigest()[:16]
+
+    def count(self, split: Split) -> list[int]:
+        """Return the number of touches of each part of a split, in the order of :meth:`parts`."""
+        parts = self.device.parts(split)
+        return [len(self.touches(split))] if parts is None else [part.count for part in parts]
+
+    def parts(
+        self, split: Split, epoch: int = 0, generator: torch.Generator | None = None
+    ) -> Iterator[Touches]:
+        """Yield the touches of a split, all at once unless the device makes them in parts.
+
+        Args:
+            split: of the device.
+            epoch: as of :meth:`touches`.
+            generator: shuffles the parts; None leaves them in order.
+        """
+        parts = self.device.parts(split)
+        if parts is None:
+            yield self.touches(split, epoch)
+            return
+        order = range(len(parts)) if generator is None else torch.randperm(len(parts), generator=generator)
+        for number in order:
+            yield parts[number].make().touches
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split; those of epoch 0 are kept."""
         if epoch == 0 or not getattr(self.device, "fresh", False):
             if split not in self._drawn:
-                self._drawn[split] = self.device.touches(split)  # type: ignore[arg-type]
+                self._drawn[split] = self.device.touches(split)
             return self._drawn[split]
-        return self.device.touches(split, epoch)  # type: ignore[arg-type]
+        return self.device.touches(split, epoch)
 
     def representation_for(self, positions: Tensor) -> AbstractRepresentation:
         """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
@@ -137,26 +175,26 @@ class TouchData(pl.LightningDataModule):
 class _Batches:
     """The batches of one split; no torch DataLoader, which would touch every sample by itself."""
 
-    def __init__(self, data: TouchData, split: str) -> None:
+    def __init__(self, data: TouchData, split: Split) -> None:
         self.data, self.split = data, split
 
     def __len__(self) -> int:
-        return -(-len(self.data.touches(self.split)) // self.data.batch_size)
+        return sum(-(-count // self.data.batch_size) for count in self.data.count(self.split))
 
     def __iter__(self) -> Iterator[Touches]:
         data = self.data
         if self.split != "train":
-            touches = data.touches(self.split)
-            for start in range(0, len(touches), data.batch_size):
-                yield touches[start : start + data.batch_size]
+            for touches in data.parts(self.split):
+                for start in range(0, len(touches), data.batch_size):
+                    yield touches[start : start + data.batch_size]
             return
         epoch = data.trainer.current_epoch if data.trainer else 0
-        touches = data.touches(self.split, epoch)
         # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
-        for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
-            batch = touches[index]
-            yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
+        for touches in data.parts(self.split, epoch, generator):
+            for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
+                batch = touches[index]
+                yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
 
     def _share(self, batch: Touches) -> Touches:
         """Return this process's part of a batch where several train together.

@@ -10,6 +10,8 @@ BUNDLED = _PACKAGE if (_PACKAGE / "conf").is_dir() else ROOT
 """The folder of ``conf`` and ``data``; a wheel has them inside the package."""
 
 CONF = BUNDLED / "conf"
+MANIFEST = "manifest.json"
+"""The file that makes a folder a data set."""
 
 
 def candidates(given: str | Path) -> list[Path]:

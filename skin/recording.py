@@ -1,7 +1,7 @@
 """Touches, the type that every device yields, and Recording, its stored form."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -156,6 +156,19 @@ class Recording:
         )
 
 
+@dataclass(frozen=True)
+class Part:
+    """Consecutive touches of a whole that need not fit into memory: they are made when they are needed.
+
+    Attributes:
+        count: number of touches.
+        make: draws or reads them.
+    """
+
+    count: int
+    make: Callable[[], Recording]
+
+
 def _expect(values: Tensor | None, name: str, *shapes: tuple[int, ...]) -> None:
     """Raise a ValueError where a tensor, if there is one, has none of some shapes."""
     if values is not None and tuple(values.shape) not in shapes:
@@ -188,7 +201,7 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
 
 
 def touches_hash(touches: Touches) -> str:
-    """Return a hash of readings and labels."""
+    """Return a hash of readings and labels, 16 hexadecimal digits."""
     content = hashlib.sha256(touches.readings.contiguous().numpy().tobytes())
     if touches.labels is not None:
         content.update(touches.labels.contiguous().numpy().tobytes())

@@ -36,7 +36,6 @@ from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
-from skin.recording import Touches, touches_hash
 from skin.settings import import_target
 from skin.source import note_reuse
 from skin.stored_run import TAG
@@ -95,7 +94,7 @@ def train(config: DictConfig) -> bool:
     with store.run(name, identity, os.environ.get(PARENT), again) as run:
         logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
         learner.unfinished = unfinished_folder(config.tracking, run)
-        describe(store, run.info.run_id, config, data.touches("train"))
+        describe(store, run.info.run_id, config, data.hash)
         learner.fit(data, logger)
         point = choose_operating_point(learner, device, config.evaluation)
         report = evaluate(learner, device, config.evaluation, point)
@@ -152,18 +151,18 @@ def _option(part: DictConfig, name: str) -> str:
     return option_name(import_target(part["_target_"], name))
 
 
-def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
+def describe(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
     """Log the configuration of a run before it starts.
 
     Args:
         store: where.
         run: its id.
         config: its configuration; unused groups may be left out.
-        touches: of its training.
+        data_hash: of the touches of its training.
     """
     chosen = {key: value for key, value in plain(config).items() if value is not None}
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(chosen)), "config.yaml")
-    store.client.set_tag(run, "data_hash", touches_hash(touches))
+    store.client.set_tag(run, "data_hash", data_hash)
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)
     used = [group for group in groups if group in config and group not in unused]

@@ -86,7 +86,7 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device.blank())
     load_learner(store, run, learner, data)
-    known = data.touches("train")
+    known = data.example
     point = load_operating_point(run, learner, stored, config.evaluation)
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
 

@@ -17,7 +17,7 @@ config recording body gesture_measures
 command
 files safe_loading recording_metadata layout summary plausibility
 recording_file touch tracking
-simulator
+simulator data_set
 contact
 signal
 wire representation
@@ -33,7 +33,7 @@ hardware
 plot
 design
 console progress variants
-run
+run generation
 sweep
 commands
 cli

@@ -56,7 +56,7 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    positions = data.touches("train").positions
+    positions = data.example.positions
     classify = window_classifier(learner, positions, device.model_rate)
     return device, Engine(
         classify, device.task, len(positions), device.window, device.model_rate, Detection(_TOUCH)

@@ -44,7 +44,7 @@ class SelfShare:
         from skin.representation.graph import self_share
 
         data = build_data(subject.config, subject.device)
-        graph = data.representation_for(data.touches("train").positions)
+        graph = data.representation_for(data.example.positions)
         return Measurement({"self_share": self_share(graph.adjacency)})  # type: ignore[arg-type]
 
 

@@ -208,8 +208,8 @@ class Network(AbstractLearner):
         """
         from skin.classifier import TouchClassifier
 
-        frames, _ = data.frames(data.touches("train")[:1])
-        kind = data.representation_for(data.touches("train").positions).kind
+        frames, _ = data.frames(data.example)
+        kind = data.representation_for(data.example.positions).kind
         fusion = self._fusion(kind, tuple(frames.x.shape[2:]), frames.x.shape[1])
         classifier = TouchClassifier(
             fusion,

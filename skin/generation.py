@@ -46,10 +46,11 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
     Raises:
         InputError: the folder has something else, or cannot be written.
     """
-    parts = device.parts()
-    if parts is None:
+    known = device.parts()
+    if known is None:
         whole = device.recording()
-        parts = [Part(len(whole), lambda: whole)]
+        known = [Part(len(whole), lambda: whole)]
+    parts = list(known)
     source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(plain(config)))}
     if not (folder / MANIFEST).is_file():
         _begin(device, parts, source, folder)
@@ -64,7 +65,7 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
     return f"{manifest.gestures} gestures in {len(found.counts)} shards, {size / 1e6:.0f} MB"
 
 
-def _begin(device: AbstractDevice, parts: Sequence[Part], source: dict[str, Any], folder: Path) -> None:
+def _begin(device: AbstractDevice, parts: list[Part], source: dict[str, Any], folder: Path) -> None:
     """Draw the first shard, check the balance of its touches, and write the manifest."""
     if folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
         raise InputError(f"{folder} exists and has no {MANIFEST}: add out= with a new or an empty folder")
@@ -121,7 +122,7 @@ def _locked(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _write_missing(parts: Sequence[Part], manifest: Manifest, folder: Path) -> None:
+def _write_missing(parts: list[Part], manifest: Manifest, folder: Path) -> None:
     """Draw and write the shards that a folder lacks."""
     missing, firsts = manifest.missing(folder), manifest.firsts
     progress = _Progress(manifest.gestures, sum(parts[n].count for n in missing))

@@ -46,7 +46,7 @@ from skin.unfinished import find_unfinished, unfinished_folder
 SWEPT = "SKIN_SWEPT"
 """Environment variable with the settings that a sweep varies, for its jobs."""
 
-_STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
+_STEERING = ("hydra", "shard", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
 # A run's name has the first ones in any case; the others choose the machine.
 _NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))

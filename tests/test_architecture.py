@@ -13,7 +13,7 @@ errors interrupt paths option
 trust earlier_settings
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body
+config recording body shard
 command
 files safe_loading recording_metadata layout summary plausibility
 recording_file touch tracking

@@ -24,6 +24,7 @@ from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Run, ViewType
 from mlflow.exceptions import MlflowException
+from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
@@ -69,12 +70,10 @@ class Store:
         try:
             with _alone(uri, artifacts):
                 client = MlflowClient(tracking_uri=uri)
-                found = client.get_experiment_by_name(settings.experiment)
-                if found is None:
-                    location = (artifacts / settings.experiment).resolve().as_uri()
-                    identity = client.create_experiment(settings.experiment, artifact_location=location)
-                else:
-                    identity = found.experiment_id
+                # A server keeps the artifacts of its runs, unless a folder is given.
+                served = uri.startswith("http") and settings.artifacts is None
+                location = None if served else (artifacts / settings.experiment).resolve().as_uri()
+                identity = _experiment(client, settings.experiment, location)
         except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
@@ -153,6 +152,18 @@ class Store:
         metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
         for start in range(0, len(metrics), 1000):
             self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
+
+
+def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
+    """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
+    if (found := client.get_experiment_by_name(name)) is None:
+        try:
+            return client.create_experiment(name, artifact_location=location)
+        except MlflowException as error:
+            if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+                raise
+            found = client.get_experiment_by_name(name)
+    return found.experiment_id
 
 
 def _where() -> str:

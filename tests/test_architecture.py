@@ -15,7 +15,7 @@ settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
 config recording body shard
 command
-files safe_loading recording_metadata layout summary plausibility
+files safe_loading recording_metadata layout summary plausibility outbox
 recording_file touch tracking
 simulator
 contact
@@ -25,7 +25,7 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished
+evaluation build unfinished claim run_logger
 stored_run
 trained
 hardware

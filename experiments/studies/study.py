@@ -86,6 +86,7 @@ class Study:
     differences: str | None = None
     statements: Sequence[Statement] = ()
     minutes: float | None = None
+    axis: str | None = None
 
     @classmethod
     def of(cls, config: DictConfig) -> "Study":

@@ -173,13 +173,11 @@ class Network(AbstractLearner):
         if self._classifier is None or self._data is None:
             raise RuntimeError("fit or load the learner first")
         classifier = self._classifier.eval()
-        representation = self._data.representation_for(touches.positions.cpu()).to(classifier.device)
         parts = []
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
                 part = touches[start : start + CHUNK].to(classifier.device)
-                frames = representation.show(part)
-                parts.append(function(classifier, frames).cpu())
+                parts.append(function(classifier, self._data.show(part)).cpu())
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:

@@ -21,7 +21,7 @@ PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
 
 # Settings without effect on results.
-_STEERING = ("tracking", "trust")
+_STEERING = ("shard", "tracking", "trust")
 
 
 @dataclass
@@ -84,6 +84,7 @@ class Config:
     evaluation: Evaluation | None = None
     tracking: Tracking | None = None
     contact: dict[str, Any] | None = None
+    shard: str | None = None
     # What a command other than training adds.
     run: str | None = None
     trust: bool = False

@@ -17,11 +17,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
 from skin.build import build_data, build_device, build_learner
+from skin.claim import claim, refuse_twice
 from skin.class_balance import report_balance
 from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
@@ -36,6 +36,7 @@ from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
+from skin.run_logger import RunLogger
 from skin.settings import import_target
 from skin.source import note_reuse
 from skin.stored_run import TAG
@@ -47,21 +48,10 @@ _log = logging.getLogger(__name__)
 SWEPT = "SKIN_SWEPT"
 """Environment variable with the settings that a sweep varies, for its jobs."""
 
-_STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
+_STEERING = ("hydra", "shard", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
 # A run's name has the first ones in any case; the others choose the machine.
 _NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
-
-
-class _OpenLogger(MLFlowLogger):
-    """Logs a training to its run and leaves the run open.
-
-    Lightning's own calls a run FINISHED when the fit ends; one that is killed during its evaluation would
-    then count as finished without having any result.
-    """
-
-    def finalize(self, status: str = "success") -> None:
-        """Do nothing: the run ends with its evaluation."""
 
 
 def train(config: DictConfig) -> bool:
@@ -84,6 +74,8 @@ def train(config: DictConfig) -> bool:
             _log.info("run %s did this before: tracking.resume=false repeats it", finished[0].info.run_id)
             Console().print(metrics_table(finished[0].data.metrics, finished[0].info.run_name))
         return False
+    if config.tracking.resume:
+        refuse_twice(store, identity["fingerprint"])
     check_evaluation(config.evaluation)
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
@@ -91,8 +83,11 @@ def train(config: DictConfig) -> bool:
     report_balance(device, shown=PARENT not in os.environ)
     name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
     again = find_unfinished(store, config.tracking, identity["fingerprint"])
-    with store.run(name, identity, os.environ.get(PARENT), again) as run:
-        logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
+    with (
+        store.run(name, identity, os.environ.get(PARENT), again) as run,
+        claim(store, run, config.tracking.resume),
+    ):
+        logger = RunLogger(store, run.info.run_id)
         learner.unfinished = unfinished_folder(config.tracking, run)
         describe(store, run.info.run_id, config, data.hash)
         learner.fit(data, logger)

@@ -13,9 +13,9 @@ errors interrupt paths option
 trust earlier_settings
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body gesture_measures
+config recording body gesture_measures shard
 command
-files safe_loading recording_metadata layout summary plausibility
+files safe_loading recording_metadata layout summary plausibility outbox
 recording_file touch tracking
 simulator data_set
 contact
@@ -25,7 +25,7 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished
+evaluation build unfinished claim run_logger
 stored_run
 trained
 exported

@@ -26,7 +26,7 @@ SMOKE = (
     "tracking.experiment=smoke",
 )
 """Overrides that shrink every run to a second; its scores are to be ignored."""
-_OWN = ("study", "smoke", "out")
+_OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")
 
 

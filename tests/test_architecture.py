@@ -25,8 +25,8 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished
-stored_run
+evaluation build unfinished pretrained
+stored_run model_card
 trained
 hardware
 plot

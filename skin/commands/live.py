@@ -8,6 +8,7 @@ hardware is needed. Ctrl-C stops.
 """
 
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,16 @@ if TYPE_CHECKING:
 @command("live")
 def main(config: DictConfig) -> None:
     """Restore a finished run, open the skin, and show verdicts until the command is ended."""
+    show(config, overrides())
+
+
+def show(config: DictConfig, given: Sequence[str]) -> None:
+    """Show the predictions of a run for a skin until the command is ended.
+
+    Args:
+        config: of the command.
+        given: settings that replace those of the run, as overrides; ``config`` has their values.
+    """
     from skin.hardware.live.live_settings import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
@@ -34,12 +45,12 @@ def main(config: DictConfig) -> None:
     quiet()
     torch.set_num_threads(config.tracking.threads or 1)
     try:
-        _watch(config, live)
+        _watch(config, live, given)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: "LiveSettings") -> None:
+def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> None:
     from rich.console import Console
 
     from skin.build import build_device
@@ -52,7 +63,7 @@ def _watch(config: DictConfig, live: "LiveSettings") -> None:
 
     store, messages = Store.open(config.tracking), Console(stderr=True)
     run = find_run(store, config.run)
-    stored, given = load_configuration(store, run, config.trust), overrides()
+    stored = load_configuration(store, run, config.trust)
     device = build_device(apply_overrides(stored, config, given))
     # The training data stay those of the run, for any watched device.
     trained = apply_overrides(

@@ -23,7 +23,7 @@ NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/c
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install test roundings slow cluster check bench physics peers ui reproduce-table results wheel-check release-check docs notice clean
+.PHONY: help install test roundings slow cluster check bench physics peers demo ui reproduce-table results wheel-check release-check docs notice clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -73,6 +73,9 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs, with their defaults and tuned (SEEDS=3)
 	$(BIN)/skin train --config-dir experiments/peers/conf -m 'seed=range($(SEEDS))' \
 		experiment=lightgbm,minirocket,multirocket_hydra,lightgbm_tuned,minirocket_tuned,multirocket_tuned
+
+demo: $(READY)  ## show the predictions of a pretrained model for an emulated skin on 127.0.0.1:8765; Ctrl-C stops
+	@$(BIN)/skin demo
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	@echo "runs: http://127.0.0.1:5000/#/experiments"

@@ -87,6 +87,8 @@ class Config:
     shard: str | None = None
     # What a command other than training adds.
     run: str | None = None
+    name: str | None = None
+    licence: str | None = None
     trust: bool = False
     n: int | None = None
     out: str | None = field(default=None)

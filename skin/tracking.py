@@ -174,8 +174,8 @@ def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
         except MlflowException as error:
             if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                 raise
-            found = client.get_experiment_by_name(name)
-    return found.experiment_id
+            return _experiment(client, name, location)
+    return str(found.experiment_id)
 
 
 def _where() -> str:

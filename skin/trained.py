@@ -54,10 +54,10 @@ class Trained:
 
 
 def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) -> Trained:
-    """Return a finished training run.
+    """Return a pretrained model or a finished training run.
 
     Args:
-        name: the beginning of its id; ``latest`` is the last one that finished.
+        name: of the model, or the beginning of the run's id; ``latest`` is the last run that finished.
         uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
         trust: allow any class in its configuration, which may run any code.
 

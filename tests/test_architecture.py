@@ -25,8 +25,8 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished claim run_logger
-stored_run
+evaluation build unfinished claim run_logger pretrained
+stored_run model_card
 trained
 exported
 hardware

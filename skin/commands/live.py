@@ -9,7 +9,7 @@ device= the simulator of the run is used: no hardware is needed. Ctrl-C stops.
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from skin.command import command
-from skin.config import plain
+from skin.config import overrides, plain
 
 if TYPE_CHECKING:
     from skin.hardware.live.display import Display
@@ -27,16 +27,26 @@ if TYPE_CHECKING:
 @command("live")
 def main(config: DictConfig) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
+    show(config, overrides())
+
+
+def show(config: DictConfig, given: Sequence[str]) -> None:
+    """Show the predictions of a run for a skin until the command is ended.
+
+    Args:
+        config: of the command.
+        given: settings that replace those of the run, as overrides; ``config`` has their values.
+    """
     from skin.hardware.live.live_settings import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
     try:
-        _watch(config, live)
+        _watch(config, live, given)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: "LiveSettings") -> None:
+def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> None:
     from rich.console import Console
 
     from skin.hardware.live.display import Display, DisplayInfo
@@ -49,9 +59,11 @@ def _watch(config: DictConfig, live: "LiveSettings") -> None:
 
         watched = watch_model(config.run, plain(config)["device"], live, messages.print)
     else:
+        from skin.console import quiet
         from skin.hardware.live.trained_run import watch_run
 
-        watched = watch_run(config, live, messages.print)
+        quiet()
+        watched = watch_run(config, live, messages.print, given)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         # Opened last, because frames arrive from now on.

@@ -1,13 +1,11 @@
 """A finished run for a live view."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from omegaconf import DictConfig
 
 from skin.build import build_device
-from skin.config import overrides
-from skin.console import quiet
 from skin.hardware.live import engine_builder
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched
@@ -16,22 +14,24 @@ from skin.tracking import Store
 from skin.trained import load_trained
 
 
-def watch_run(config: DictConfig, live: LiveSettings, say: Callable[[str], None]) -> Watched:
+def watch_run(
+    config: DictConfig, live: LiveSettings, say: Callable[[str], None], given: Sequence[str]
+) -> Watched:
     """Return a finished run and the device of a configuration.
 
     Args:
         config: of the command.
         live: settings of the live view.
         say: called with each message for the user.
+        given: settings that replace those of the run, as overrides; ``config`` has their values.
 
     Raises:
         InputError: there is no such run, or it cannot be loaded.
     """
-    quiet()
     torch.set_num_threads(config.tracking.threads or 1)
     store = Store.open(config.tracking)
     run = find_run(store, config.run)
-    stored, given = load_configuration(store, run, config.trust), overrides()
+    stored = load_configuration(store, run, config.trust)
     device = build_device(apply_overrides(stored, config, given))
     # The training data stay those of the run, for any watched device.
     trained = apply_overrides(

@@ -26,14 +26,14 @@ classifier class_balance
 datamodule
 learner
 evaluation build unfinished
-stored_run
+stored_run fine_tuning
 trained
 hardware
 plot
 design
 console progress variants
 run
-sweep
+sweep adaptation
 commands
 cli
 __main__

@@ -12,6 +12,7 @@ from skin.recording import Touches
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
+    from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
 
@@ -47,6 +48,17 @@ class AbstractLearner(ABC):
             InputError: this learner has no encoder.
         """
         raise InputError(f"{type(self).__name__} has no encoder: give a run of a network")
+
+    @property
+    def network(self) -> "TouchClassifier":
+        """The trained network; what changes its weights changes the learner.
+
+        Raises:
+            InputError: this learner is no network.
+        """
+        raise InputError(
+            f"{type(self).__name__} has no network to fine-tune: give a run of a network, such as best_fresh"
+        )
 
     @abstractmethod
     def save(self, folder: Path) -> Path:

@@ -81,27 +81,24 @@ def test_gestures_are_held_out_of_what_predicts_them(trained, network):
     _, data = trained
     touches = data.touches("train")[:48]
     labels = torch.rand(48, 4, generator=torch.Generator().manual_seed(2)).round()
-    long = replace(SMALL, epochs=80, patience=80, lr=[1e-2])
+    long = replace(SMALL, epochs=40, patience=40, lr=[1e-2])
     found = fine_tune(network, data, replace(touches, labels=labels), long)
     assert ((found.after > 0.5) == (labels > 0.5)).float().mean() < 0.65
-    assert len(found.trials[0].losses) == 81
+    assert len(found.trials[0].losses) == 41
 
 
-def test_the_head_alone_can_be_trained_and_batch_norms_keep_their_statistics(trained, network):
+@pytest.mark.parametrize("layers", ["head", "all"])
+def test_the_chosen_layers_are_trained_and_batch_norms_keep_their_statistics(trained, network, layers):
     _, data = trained
     before = deepcopy(network.state_dict())
-    assert fine_tune(
-        network, data, other_skin(data.touches("train")), replace(SMALL, layers=["head"])
-    ).better
-    changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
-    assert changed
-    assert all(name.startswith("head.") for name in changed)
-    assert fine_tune(network, data, other_skin(data.touches("train")), SMALL).better
+    settings = replace(SMALL, layers=[layers], epochs=4)
+    assert fine_tune(network, data, other_skin(data.touches("validation")), settings).better
     after = network.state_dict()
-    statistics = [name for name in before if "running" in name]
+    changed = {name for name in before if not torch.equal(after[name], before[name])}
+    statistics = {name for name in before if "running" in name or "num_batches" in name}
     assert statistics
-    assert all(torch.equal(after[name], before[name]) for name in statistics)
-    assert not equal({"x": after["fusion.head.first.weight"]}, {"x": before["fusion.head.first.weight"]})
+    trainable = set(before) - statistics
+    assert changed == {name for name in trainable if layers == "all" or name.startswith("head.")}
 
 
 def test_the_choice_with_the_lowest_held_out_loss_is_taken(trained, network):

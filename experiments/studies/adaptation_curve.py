@@ -19,7 +19,7 @@ from skin.settings import configured
 def measure_adaptation(subject: Subject, rows: Sequence[str], epochs: int | None) -> Measurement:
     """Return the metrics ``zero_shot/…``, ``adapted/…`` and ``<row>/…`` on the test gestures of the device.
 
-    The run is fine-tuned, and the rows are trained, on the training split of the device. The rows also use its
+    The run is fine-tuned and the rows are trained on the training split of the device. The rows also use its
     validation split. ``adapted/changed`` is 1 if fine-tuning was better on held-out gestures, else 0.
 
     Args:

@@ -49,7 +49,7 @@ class FineTuning:
     gestures: Annotated[int, Ge(LEAST)] | None = None
     folds: Annotated[int, Ge(2), Le(LEAST)] = 4
     layers: Annotated[Sequence[Layers], MinLen(1)] = ("head", "all")
-    lr: Annotated[Sequence[PositiveFloat], MinLen(1)] = (3e-4, 1e-3)
+    lr: Annotated[Sequence[PositiveFloat], MinLen(1)] = (1e-4, 5e-4)
     epochs: PositiveInt = 60
     patience: PositiveInt = 10
     batch_size: PositiveInt = 32

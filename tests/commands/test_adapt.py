@@ -1,21 +1,23 @@
 """`skin adapt` makes a run of another skin from few gestures, which all commands take."""
 
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 
 import pytest
+
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.recording_file import read_recording, write_recording
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 NETWORK = ["representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual"]
 SMALL = [
-    "device.test_gestures=160",
     "evaluation.devices=0",
     "evaluation.layouts=0",
     "evaluation.safe_gestures=64",
 ]
+TEST = "device.test_gestures=160"
 QUICK = ["adapt.layers=[all]", "adapt.lr=[0.001]", "adapt.epochs=12", *SMALL]
 OTHER = ["device.gain_spread=0.3", "device.time_constant=0.4", "device.seed=3"]
 
@@ -25,7 +27,7 @@ def folder(run, tmp_path_factory):
     """A folder with a finished run of a network."""
     folder = tmp_path_factory.mktemp("runs")
     quick = ["data.gestures=480", "trainer.max_epochs=15", "optimizer.lr=0.003", "fusion.hidden=16"]
-    done = run(folder, "train", *NETWORK, *SKIN, *SMALL, *quick)
+    done = run(folder, "train", *NETWORK, *SKIN, *SMALL, TEST, *quick)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -61,7 +63,7 @@ def tags(folder, run):
 def adapted(run, folder):
     """The run to adapt, the run that was made of it with simulated gestures, and what the command printed."""
     parent = runs(folder)[-1]
-    done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", *QUICK)
+    done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", TEST, *QUICK)
     assert done.returncode == 0, done.stderr
     return parent, runs(folder)[-1], done.stdout
 
@@ -99,7 +101,7 @@ def test_the_new_run_is_shown_live(run, folder, adapted):
 def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
     parent, made, _ = adapted
     before = runs(folder)
-    done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", *QUICK)
+    done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", TEST, *QUICK)
     assert f"run {made} did this before" in done.stdout
     assert runs(folder) == before
 
@@ -116,14 +118,14 @@ def test_a_recording_is_adapted_to_and_the_rest_of_it_is_reported(run, folder, s
     assert "same/overall/accuracy" not in metrics(folder, runs(folder)[-1])
     assert "validation/overall/accuracy" in metrics(folder, runs(folder)[-1])
     # The skin of the new run is simulated, so that it does not need the file.
-    again = run(folder, "evaluate", f"run={made}", *SMALL[:1])
+    again = run(folder, "evaluate", f"run={made}", TEST)
     assert again.returncode == 0, again.stderr
 
 
 @pytest.mark.slow
 def test_what_is_not_better_keeps_the_weights(run, folder, adapted):
     parent = adapted[0]
-    line = ["adapt.gestures=16", "adapt.lr=[1000]", "adapt.layers=[all]", "adapt.epochs=2", *SMALL]
+    line = ["adapt.gestures=16", "adapt.lr=[1000]", "adapt.layers=[all]", "adapt.epochs=2", TEST, *SMALL]
     done = run(folder, "adapt", f"run={parent}", *OTHER, *line)
     assert done.returncode == 0, done.stderr
     assert f"the new run keeps the weights of run {parent}" in " ".join(done.stdout.split())
@@ -135,7 +137,7 @@ def test_what_is_not_better_keeps_the_weights(run, folder, adapted):
 @pytest.fixture(scope="module")
 def bad(run, folder, session):
     """A run of rules, and recordings without labels and with few gestures."""
-    done = run(folder, "train", "experiment=rules", *SKIN, *SMALL, "data.gestures=80")
+    done = run(folder, "train", "experiment=rules", *SKIN, *SMALL, TEST, "data.gestures=80")
     assert done.returncode == 0, done.stderr
     known = read_recording(session)
     unknown = replace(known, touches=replace(known.touches, labels=None))
@@ -167,3 +169,33 @@ def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, bad, row, 
     assert (done.returncode, reason in done.stderr) == (2, True), done.stderr
     assert "Traceback" not in done.stderr
     assert query(folder, "select count(*) from runs") == before
+
+
+@contextmanager
+def emulated(begin, folder, seed):
+    """Run an emulator of a skin whose gains and positions nobody knows; give the settings of its port."""
+    hidden = [*OTHER, "device.position_error=0.005", "emulate.speed=10", f"emulate.seed={seed}"]
+    with begin(folder, "emulate", *SKIN, *hidden) as process:
+        port = next(process.lines())
+        yield [f"device.port={port}", "device.scale=0.0390625", "device.labels=announced"]
+
+
+@pytest.mark.slow
+def test_gestures_recorded_at_a_port_make_the_run_better_on_others(run, begin, folder, adapted):
+    for name, seed, count in (("few", 0, 48), ("others", 1, 96)):
+        with emulated(begin, folder, seed) as port:
+            done = run(
+                folder, "record", *SKIN, *port, f"out={name}.csv", f"device.gestures={count}", store=False
+            )
+        assert done.returncode == 0, done.stderr
+        assert f"{count} gestures" in done.stdout
+    recorded = ["device=recording", "device.path=few.parquet", "adapt.gestures=48"]
+    done = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
+    assert done.returncode == 0, done.stderr
+    made, accuracies = runs(folder)[-1], []
+    for one in (adapted[0], made):
+        others = ["device=recording", "device.path=others.parquet", "device.test=all"]
+        done = run(folder, "evaluate", f"run={one}", *others)
+        assert done.returncode == 0, done.stderr
+        accuracies.append(metrics(folder, runs(folder)[-1])["same/overall/accuracy"])
+    assert accuracies[1] > accuracies[0] + 0.02

@@ -50,7 +50,7 @@ class _Job:
         parent: the run to adapt.
         stored: its configuration.
         device: the skin, or its recording.
-        twin: a simulated device with the body and layout of the skin. Its constants may be others.
+        twin: a simulated device with the body and layout of the skin. Its imperfections are those of the run.
         config: of the adapted run.
     """
 
@@ -110,13 +110,14 @@ def _plan(store: Store, config: DictConfig, settings: FineTuning, given: Sequenc
     parent = find_run(store, config.run)
     stored = load_configuration(store, parent, config.trust)
     there = apply_overrides(stored, config, given)
-    # Only simulated devices have fresh gestures, on which the threshold of the alarm is chosen.
+    # The device of the run, on this skin: its fresh gestures determine the threshold of the alarm.
     own = [one for one in given if _group(one) not in ("device", "profile")]
     own += [] if "simulator" in stored.device else ["device=simulated"]
     nominal = apply_overrides(stored, compose("adapt", own), own)
     if "test" in there.device:  # a recording, which is used as a whole
         there = validate_config(OmegaConf.merge(there, {"device": {"test": "all"}}))
-    device, twin = build_device(there), build_device(nominal)
+    device, known = build_device(there), build_device(nominal)
+    twin = known.reference or known
     if device.task != twin.task:
         raise InputError(
             f"run {parent.info.run_id} predicts {', '.join(twin.task.names)}, the gestures have the labels "

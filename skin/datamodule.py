@@ -1,6 +1,9 @@
 """The LightningDataModule: touches as batches of frames."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 import pytorch_lightning as pl
 import torch
@@ -12,7 +15,7 @@ from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.labels import Task
 from skin.recording import Touches
-from skin.representation.base import AbstractRepresentation
+from skin.representation.base import AbstractRepresentation, Frames
 from skin.settings import checked
 from skin.signal.augmentation import Augmentation
 
@@ -33,6 +36,8 @@ class TouchData(pl.LightningDataModule):
         batch_size: gestures per batch.
         seed: of the order of gestures and of their augmentation; epoch e uses (seed, e).
         augmentation: changes the touches of training batches; None leaves them.
+        geometry: returns that of the configured skin, (S, G), for touches that do not tell it (of a port or a
+            file); None: there is none.
 
     Attributes:
         device: as given.
@@ -47,6 +52,7 @@ class TouchData(pl.LightningDataModule):
         batch_size: PositiveInt = 64,
         seed: int = 0,
         augmentation: Augmentation | None = None,
+        geometry: Callable[[], Tensor] | None = None,
     ) -> None:
         super().__init__()
         if augmentation is not None and augmentation.reverse and device.task.direction:
@@ -55,7 +61,7 @@ class TouchData(pl.LightningDataModule):
                 "data.direction=true"
             )
         self.device, self.batch_size, self.seed = device, batch_size, seed
-        self._make = representation
+        self._make, self._geometry = representation, geometry
         # An augmentation without effect must not draw random numbers.
         self.augmentation = None if augmentation == Augmentation() else augmentation
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
@@ -85,7 +91,10 @@ class TouchData(pl.LightningDataModule):
         Raises:
             InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
         """
-        if positions.ndim != 2:
+        if self._known is not None and self._known[1].layout_free:
+            return self._known[1]
+        make: Any = getattr(self._make, "func", self._make)
+        if positions.ndim != 2 and not make.layout_free:
             raise InputError(
                 "representations are built for one layout, got positions per frame: give one position "
                 "(x, y, z) per sensor, and how far it moves as Touches.motion"
@@ -97,8 +106,20 @@ class TouchData(pl.LightningDataModule):
     def frames(self, touches: Touches) -> Batch:
         """Return the frames of touches and their labels (B, L), on the touches' device."""
         labels = touches.known_labels
-        representation = self.representation_for(touches.positions.cpu()).to(touches.readings.device)
-        return representation.show(touches), labels
+        return self.show(touches), labels
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches, on the touches' device."""
+        place = touches.readings.device
+        representation = self.representation_for(touches.positions.cpu()).to(place)
+        if representation.layout_free and touches.geometry is None and self._geometry is not None:
+            touches = replace(touches, geometry=self._configured_geometry.to(place))
+        return representation.show(touches)
+
+    @cached_property
+    def _configured_geometry(self) -> Tensor:
+        assert self._geometry is not None
+        return self._geometry()
 
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""

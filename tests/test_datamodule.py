@@ -1,10 +1,13 @@
 """Batches: every gesture once an epoch, in an order that only the seed decides."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
+from skin.build import build_data, build_device
+from skin.config import validate_config
 from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.labels import TOUCH_SLIDING
@@ -140,3 +143,14 @@ def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made
     made_up_device.task = TOUCH_SLIDING
     with pytest.raises(InputError, match=r"set data.augment.reverse=false"):
         TouchData(made_up_device, Readings, augmentation=Augmentation(reverse=True))
+
+
+def test_touches_without_geometry_get_that_of_the_configured_skin(configured):
+    config = validate_config(configured("representation=sites", "simulator=solid", "simulator.divisions=1"))
+    device = build_device(config)
+    touches, data = device.touches("test")[:8], build_data(config, device)
+    unknown = replace(touches, geometry=None)
+    torch.testing.assert_close(data.show(unknown).x, data.show(touches).x)
+    torch.testing.assert_close(data.show(unknown).summary, data.show(touches).summary)
+    other = build_data(validate_config(configured("representation=sites", "simulator=naive")), device)
+    assert not torch.allclose(other.show(unknown).x, data.show(touches).x)

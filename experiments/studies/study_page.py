@@ -38,11 +38,14 @@ _HEADINGS = {
 def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
     """Return a line per variant: mean ± two standard errors over seeds, devices and gestures, in per cent.
 
-    Where there are conditions, each is a column of the first metric.
+    Where there are conditions, each is a column of the first metric; of a single variant, each is a line.
     """
     found = group_trials(trials)
     variants = list(dict.fromkeys(variant for variant, _ in found))
     conditions = list(dict.fromkeys(condition for _, condition in found if condition))
+    if conditions and len(variants) == 1:
+        lines = [[name, *(_cell(found[variants[0], name], one) for one in metrics)] for name in conditions]
+        return [[variants[0], *map(_heading, metrics)], *lines]
     if conditions:
         head = ["variant", *conditions]
         cells = {key: _cell(each, metrics[0]) for key, each in found.items()}
@@ -105,10 +108,11 @@ def publish_study(
     """
     console = console or Console()
     changed = differences(study, trials)
-    further = study.metrics[1:] if any(one.condition for one in trials) else []
+    several = len({one.variant.name for one in trials}) > 1
+    further = study.metrics[1:] if several and any(one.condition for one in trials) else []
     tables = {
         "Variants": variants_table(trials, study.metrics),
-        # Where conditions take the columns, each metric has a table.
+        # Where conditions take the columns, each further metric has a table.
         **({_heading(one): variants_table(trials, [one]) for one in further}),
         f"Differences in {_heading(study.metrics[0])}": differences_table(changed, study.metrics[0]),
         "Statements": statements_table(conclusions(study.statements, trials)),

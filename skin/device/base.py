@@ -50,6 +50,11 @@ class AbstractDevice(ABC):
         return None
 
     @property
+    def reference(self) -> "AbstractSimulated | None":
+        """The simulated skin of the configuration, on which thresholds of ``skin live`` are tuned."""
+        return self.simulation
+
+    @property
     def wired(self) -> "AbstractWired | None":
         """This device, if it reads a skin at a port; else None."""
         return None

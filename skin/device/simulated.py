@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from skin.device._threads import in_threads
 from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
 from skin.device.base import AbstractSimulated, Split
+from skin.device.geometry import sensor_geometry
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
@@ -134,6 +136,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         randomness = generator(Stream.TRACKING, self.data_seed)
         return estimated(model, sampler, self.imperfection, len(self.sensors), randomness)
 
+    @cached_property
+    def geometry(self) -> Tensor:
+        """Where the sensors are and what they respond to, (S, G), :data:`skin.recording.GEOMETRY`."""
+        same = self.position_error == 0
+        model = self.model if same else modelled(self.simulator, self.body, self.sensors, self.model_rate)
+        return sensor_geometry(self.body, self.sensors, model)
+
     @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
@@ -155,7 +164,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def fresh_touches(self, count: int) -> Touches:
         """Return touches that belong to no split, for choosing a threshold after the training."""
-        return self._draw(False, Stream.ALARM, count, self.data_seed).touches
+        return self.draw(Stream.ALARM, count, self.data_seed)
+
+    def draw(self, stream: Stream, count: int, *key: int) -> Touches:
+        """Return touches of a stream of randomness at a key."""
+        return self._draw(False, stream, count, *key).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the same touches with the applied force and the gestures' parameters."""
@@ -237,7 +250,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, self.model_rate, self.tracker.motion(movie))
+        motion = self.tracker.motion(movie)
+        touches = Touches(readings, valid, positions, labels, self.model_rate, motion, geometry=self.geometry)
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.

@@ -177,13 +177,11 @@ class Network(AbstractLearner):
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""
         classifier = self.network.eval()
         assert self._data is not None
-        representation = self._data.representation_for(touches.positions.cpu()).to(classifier.device)
         parts = []
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
                 part = touches[start : start + CHUNK].to(classifier.device)
-                frames = representation.show(part)
-                parts.append(function(classifier, frames).cpu())
+                parts.append(function(classifier, self._data.show(part)).cpu())
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:

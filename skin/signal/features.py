@@ -207,7 +207,7 @@ def _spread(x: Tensor, places: Tensor, rise: Tensor) -> dict[str, Tensor]:
     for name, values in {"strongest frame": strongest, "maxima": x.amax(dim=1)}.items():
         weight = (values - 0.1 - rise[:, None]).clamp(min=0)
         weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
-        offset = places - (weight @ places)[:, None]
+        offset = places - weight[:, None] @ places
         moments = torch.einsum("bs,bsi,bsj->bij", weight, offset, offset)
         large, small = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1).unbind(dim=1)
         result |= {

@@ -68,15 +68,27 @@ def test_a_line_per_variant_with_mean_and_two_standard_errors():
     assert third[:2] == ["weight=stiffness (1 failed)", "failed"]
 
 
-def test_conditions_are_columns_of_the_first_metric():
-    found = [
-        trial("a", "0", 0.8 + n / 10, condition=name, device=str(n))
-        for name in ("none", "5 dead")
+def under_conditions(name):
+    return [
+        trial(name, "0", 0.8 + n / 10, condition=condition, device=str(n))
+        for condition in ("none", "5 dead")
         for n in (0, 1)
     ]
-    assert variants_table(found, METRICS) == [
+
+
+def test_conditions_are_columns_of_the_first_metric():
+    assert variants_table([*under_conditions("a"), *under_conditions("b")], METRICS) == [
         ["variant", "none", "5 dead"],
         ["a", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["b", "85.0 ± 10.0", "85.0 ± 10.0"],
+    ]
+
+
+def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
+    assert variants_table(under_conditions("a"), METRICS[:2]) == [
+        ["a", "overall", "big"],
+        ["none", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["5 dead", "85.0 ± 10.0", "85.0 ± 10.0"],
     ]
 
 

@@ -45,17 +45,17 @@ def make_engine(
 
 def _longest(of: Trained) -> float:
     """Return the longest touch that a run was trained on, s; two thirds of its window if unknown."""
-    if of.device.simulation is not None:
-        return of.device.simulation.sampler.settings.press[1]
+    if of.device.reference is not None:
+        return of.device.reference.sampler.settings.press[1]
     return of.window * 2 / 3 / of.rate
 
 
 def _tuned(device: AbstractDevice, learned: bool) -> float:
-    if device.simulation is None:
+    if device.reference is None:
         if learned:
             return _FAINT
         raise InputError("this run has no contact threshold: give live.touch=0.3 (N), or train on streams")
-    known = device.simulation.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches(
+    known = device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches(
         "validation"
     )
     assert known.labels is not None

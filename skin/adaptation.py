@@ -182,7 +182,7 @@ def choose_gestures(device: AbstractDevice, settings: FineTuning) -> tuple[Touch
 
 
 def simulated_budget(count: int) -> int:
-    """Return the smallest budget of gestures with at least ``count`` in its training split."""
+    """Return the budget of gestures whose training split, 80 %, has ``count`` of them or one more."""
     return -(-count * 10 // 8)
 
 

@@ -117,6 +117,11 @@ def _plan(store: Store, config: DictConfig, settings: FineTuning, given: Sequenc
     if "test" in there.device:  # a recording, which is used as a whole
         there = validate_config(OmegaConf.merge(there, {"device": {"test": "all"}}))
     device, known = build_device(there), build_device(nominal)
+    if device.simulation is None and device.reference is not None:
+        raise InputError(
+            f"run {parent.info.run_id} was trained on many skins: name the one to adapt to, as in "
+            "device=recording device.path=session.parquet or device=simulated layout.path=sensors.csv"
+        )
     twin = known.reference or known
     if device.task != twin.task:
         raise InputError(
@@ -149,13 +154,6 @@ def choose_gestures(device: AbstractDevice, settings: FineTuning) -> tuple[Touch
     A simulated device draws as many as are wanted: the training split that ``skin train`` has with
     ``data.gestures`` = n / 0.8 and the same seed. The others are its test gestures. For all other devices, a
     part of the touches of :meth:`AbstractDevice.all_touches` is drawn, and the others are the rest.
-
-    Args:
-        device: the skin.
-        settings: number and seed of the gestures.
-
-    Returns:
-        n gestures, and a device, or None if there are no others.
 
     Raises:
         InputError: there are fewer gestures than wanted, or than can be used.

@@ -27,7 +27,7 @@ datamodule
 learner
 evaluation build unfinished
 stored_run fine_tuning
-trained
+trained adaptation_target
 hardware
 plot
 design

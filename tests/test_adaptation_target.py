@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from skin.adaptation import choose_gestures, simulated_budget
+from skin.adaptation_target import choose_gestures, simulated_budget
 from skin.build import build_device
 from skin.device._split import split_slices
 from skin.errors import InputError

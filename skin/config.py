@@ -118,6 +118,7 @@ class Config:
     benchmark: dict[str, Any] | None = None
     results: dict[str, Any] | None = None
     design: dict[str, Any] | None = None
+    adapt: dict[str, Any] | None = None
 
 
 def validate_config(config: DictConfig) -> DictConfig:

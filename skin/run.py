@@ -94,7 +94,7 @@ def train(config: DictConfig) -> bool:
         point = choose_operating_point(learner, device, config.evaluation)
         report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
-        _keep(store, run, learner)
+        log_learner(store, run, learner)
         log_report(store, run, report, device.task, values)
     shutil.rmtree(learner.unfinished, ignore_errors=True)
     if PARENT not in os.environ:
@@ -110,8 +110,8 @@ def _limit_threads(number: int | None) -> None:
         torch.set_num_threads(number)
 
 
-def _keep(store: Store, run: Run, learner: AbstractLearner) -> None:
-    """Log the trained learner."""
+def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
+    """Log what a learner has learned, for :func:`skin.stored_run.load_learner`."""
     with tempfile.TemporaryDirectory() as folder:
         path = learner.save(Path(folder))
         store.client.log_artifact(run.info.run_id, str(path))

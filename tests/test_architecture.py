@@ -26,15 +26,15 @@ classifier class_balance
 datamodule
 learner
 evaluation build unfinished claim run_logger pretrained
-stored_run model_card
-trained
+stored_run model_card fine_tuning
+trained adaptation_target
 exported
 hardware
 plot
 design
 console progress variants
 run generation
-sweep
+sweep adaptation
 commands
 cli
 __main__

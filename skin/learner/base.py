@@ -12,6 +12,7 @@ from skin.recording import Touches
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
+    from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
 
@@ -60,6 +61,17 @@ class AbstractLearner(ABC):
         raise InputError(
             f"learner {type(self).__name__} cannot be exported: give a run of learner=network, or of an "
             "ensemble of networks"
+        )
+
+    @property
+    def network(self) -> "TouchClassifier":
+        """The trained network; what changes its weights changes the learner.
+
+        Raises:
+            InputError: this learner is no network.
+        """
+        raise InputError(
+            f"{type(self).__name__} has no network to fine-tune: give a run of a network, such as best_fresh"
         )
 
     @abstractmethod

@@ -159,14 +159,19 @@ class Network(AbstractLearner):
         return self._map(touches, lambda of, frames: probabilities(of(frames), of.task))
 
     def embeddings(self, touches: Touches) -> Tensor:
-        """Return the embeddings of touches, (B, E), which are the input of the dense layers.
+        """Return the embeddings of touches, (B, E), which are the input of the dense layers."""
+        return self._map(touches, lambda of, frames: of.fusion(frames))
 
-        Accepts the same touches as :meth:`probabilities`.
+    @property
+    def network(self) -> "TouchClassifier":
+        """The trained network.
 
         Raises:
             RuntimeError: before ``fit`` or ``load``.
         """
-        return self._map(touches, lambda of, frames: of.fusion(frames))
+        if self._classifier is None:
+            raise RuntimeError("fit or load the learner first")
+        return self._classifier
 
     def pipeline(self, positions: Tensor) -> nn.Module:
         """Return representation and network as one module, in evaluation mode."""
@@ -178,9 +183,8 @@ class Network(AbstractLearner):
 
     def _map(self, touches: Touches, function: "Callable[[TouchClassifier, Frames], Tensor]") -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""
-        if self._classifier is None or self._data is None:
-            raise RuntimeError("fit or load the learner first")
-        classifier = self._classifier.eval()
+        classifier = self.network.eval()
+        assert self._data is not None
         parts = []
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
@@ -190,10 +194,8 @@ class Network(AbstractLearner):
 
     def save(self, folder: Path) -> Path:
         """Write the weights to ``weights.pt`` in ``folder`` and return its path."""
-        if self._classifier is None:
-            raise RuntimeError("fit or load the learner first")
         path = Path(folder) / "weights.pt"
-        torch.save(self._classifier.state_dict(), path)
+        torch.save(self.network.state_dict(), path)
         return path
 
     def load(self, data: "TouchData", path: Path) -> None:

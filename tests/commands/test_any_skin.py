@@ -60,3 +60,17 @@ def test_it_watches_nine_sensors_at_a_port(begin, folder):
         live = both.enter_context(begin(folder, "live", *reader, *OWN, *store, "seconds=8"))
         assert live.wait() == 0, live.err
     assert re.search(r"[1-9]\d* verdicts", live.err), live.err
+
+
+@pytest.mark.slow
+def test_it_is_adapted_to_a_skin_that_must_be_named(run, folder):
+    quick = ["adapt.gestures=8", "adapt.layers=[head]", "adapt.lr=[0.001]", "adapt.epochs=2"]
+    quick += ["evaluation.safe_gestures=64"]
+    done = run(folder, "adapt", *OWN, *quick)
+    assert done.returncode == 2, done.stderr
+    assert "was trained on many skins: name the one to adapt to" in done.stderr
+    done = run(folder, "adapt", "device=simulated", "device.test_gestures=200", *OWN, *quick)
+    assert done.returncode == 0, done.stderr
+    found = metrics(folder)[-1]
+    assert 0 < found["before/overall/accuracy"] <= 1
+    assert 0 < found["same/overall/accuracy"] <= 1

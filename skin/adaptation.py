@@ -17,7 +17,7 @@ from skin.evaluation.operating_point import OperatingPoint, choose_operating_poi
 from skin.evaluation.report import evaluate
 from skin.fine_tuning import Adaptation, FineTuning, fine_tune
 from skin.learner.base import AbstractLearner
-from skin.recording import Touches
+from skin.recording import Touches, touches_hash
 from skin.run import describe, log_learner, log_report, tags
 from skin.settings import configured
 from skin.source import note_reuse
@@ -62,7 +62,7 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
     values = {} if others is None else _before(learner, others, point)
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
     with store.run(name, identity, parent.info.run_id) as run:
-        describe(store, run.info.run_id, target.config, touches)
+        describe(store, run.info.run_id, target.config, touches_hash(touches))
         found = fine_tune(network, data, touches, settings)
         log_learner(store, run, learner)
         if found.better and point is not None:

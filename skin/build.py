@@ -89,7 +89,7 @@ def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
 
 def _geometry(config: DictConfig) -> "Tensor":
     """Return what the sensors of the configured skin respond to, (S, G)."""
-    from skin.device.geometry import sensor_geometry
+    from skin.sensor_geometry import sensor_geometry
 
     skin = build_skin(config)
     return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))

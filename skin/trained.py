@@ -10,11 +10,11 @@ from torch import Tensor
 from skin.build import build_data, build_device, build_learner, build_skin
 from skin.config import Tracking, plain, validate_config
 from skin.device.base import AbstractDevice
-from skin.device.skin_distribution import SkinDistribution
 from skin.evaluation.operating_point import OperatingPoint
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.settings import configured
+from skin.skin_distribution import SkinDistribution
 from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 

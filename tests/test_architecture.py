@@ -18,7 +18,7 @@ command
 files safe_loading recording_metadata layout summary plausibility outbox
 recording_file touch tracking
 simulator data_set
-contact
+contact sensor_geometry skin_distribution
 signal
 wire representation
 device fusion

@@ -19,12 +19,12 @@ from skin.device._threads import grouped, joined
 from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
 from skin.device.base import AbstractSimulated, Split
-from skin.device.geometry import sensor_geometry
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
 from skin.recording import Part, Recording, Touches
 from skin.rng import Stream, generator
+from skin.sensor_geometry import sensor_geometry
 from skin.sensors import Sensors
 from skin.settings import check_settings
 from skin.signal.device_sampling import draw_constants, idle_excess, measure

@@ -19,7 +19,6 @@ from skin.device._split import split_slices
 from skin.device._threads import in_threads
 from skin.device.base import AbstractDevice, Split
 from skin.device.simulated import Simulated
-from skin.device.skin_distribution import DrawnSkin, SkinDistribution
 from skin.labels import TOUCH
 from skin.layout.base import AbstractLayout
 from skin.recording import GEOMETRY, Touches
@@ -28,6 +27,7 @@ from skin.sensors import Sensors
 from skin.settings import check_settings, configured
 from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.simulator.base import AbstractSimulator
+from skin.skin_distribution import DrawnSkin, SkinDistribution
 from skin.touch.gesture import GestureSettings
 from skin.wire.source import Source
 
@@ -48,7 +48,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     Args:
         body, layout, simulator: of the skin to use the run on (:attr:`reference`); the drawn skins have their
             own.
-        skins: the distribution (:class:`skin.device.skin_distribution.SkinDistribution`).
+        skins: the distribution (:class:`skin.skin_distribution.SkinDistribution`).
         count: number of skins to train on.
         test_skins: number of skins to test on.
         skin_seed: of the skins.

@@ -8,10 +8,10 @@ import torch
 
 from skin.body.base import Layer
 from skin.body.sheet import Sheet
-from skin.device.geometry import sensor_geometry
 from skin.layout.grid import Grid
 from skin.material import Material
 from skin.recording import GEOMETRY
+from skin.sensor_geometry import sensor_geometry
 from skin.simulator.naive import Naive
 from skin.simulator.solid import Solid
 

@@ -7,11 +7,11 @@ from omegaconf import OmegaConf
 from skin.body.arm import Arm
 from skin.body.base import Layer
 from skin.body.sheet import Sheet
-from skin.device.skin_distribution import SkinDistribution
 from skin.layout.grid import Grid
 from skin.material import Material
 from skin.paths import CONF
 from skin.rng import Stream, generator
+from skin.skin_distribution import SkinDistribution
 
 
 @pytest.fixture(scope="module")

@@ -166,6 +166,22 @@ class Embeddings(ProbeSettings):
 
 
 @dataclass(frozen=True)
+class UnseenSkins:
+    """Accuracy on each of the skins that ``device=skins`` tests on.
+
+    Args:
+        gestures: number of touches on each.
+    """
+
+    gestures: Annotated[int, Ge(1)] = 1000
+
+    def __call__(self, subject: Subject) -> Measurement:
+        from experiments.studies.unseen_skins import measure_unseen_skins
+
+        return measure_unseen_skins(subject, self.gestures)
+
+
+@dataclass(frozen=True)
 class Adaptation:
     """Accuracy after fine-tuning on the gestures of a device, beside rows that are trained on them.
 

@@ -57,7 +57,7 @@ def eigenvalues(x: Any, uplo: str = "L", compute_v: bool = False) -> tuple[Any, 
     # The difference of mean and radius would lose the digits of a small eigenvalue.
     determinant = op.Sub(op.Mul(first, last), op.Mul(mixed, mixed))
     small = op.Div(determinant, op.Max(large, _double(_TINY)))
-    return op.Cast(op.Concat(small, large, axis=1), to=_FLOAT), x
+    return op.CastLike(op.Concat(small, large, axis=1), x), x
 
 
 def singular_values(

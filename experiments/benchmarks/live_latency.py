@@ -40,6 +40,11 @@ def measure_latency(
     """
     torch.set_num_threads(1)
     device, engine = _untrained(row) if run is None else _trained(run, uri)
+    return time_verdicts(device, engine, frames)
+
+
+def time_verdicts(device: AbstractSimulated, engine: Engine, frames: int) -> dict[str, float]:
+    """Return the times of :func:`measure_latency` for an engine on a stream of a device."""
     taken = np.array([_seconds(engine, frame) for frame in _stream(device, engine, frames + _WARM)])[_WARM:]
     wall, core = 1e3 * taken.T
     return {

@@ -66,6 +66,7 @@ def run_all(
     }
     found["device"] = {"decode_core_share": decode_core_share()}
     found["live"] = run_alone("live_latency", "measure_latency", 1000)
+    found["live"]["onnx"] = run_alone("onnx_latency", "measure_onnx_latency", 1000)
     say("operator")
     found["operator"] = {
         name: run_alone("building", "measure_building", name, repeats) for name in SIMULATORS

@@ -6,6 +6,7 @@
 The file is compared with the run on simulated or recorded touches first.
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,7 +49,7 @@ def main(config: DictConfig) -> None:
 
     from skin.console import quiet
     from skin.exported.writer import write_model
-    from skin.hardware.live.engine_builder import describe
+    from skin.hardware.live.engine_builder import describe, simulator_warning
     from skin.stored_run import apply_overrides, find_run, load_configuration
     from skin.tracking import Store
     from skin.trained import load_trained
@@ -59,6 +60,8 @@ def main(config: DictConfig) -> None:
     stored = load_configuration(store, run, config.trust)
     of = load_trained(store, run, apply_overrides(stored, config, []), stored)
     module = of.learner.pipeline(of.positions)  # refused before anything is simulated
+    if advice := simulator_warning(stored):
+        print(advice, file=sys.stderr)
     described = describe(of, run.info.run_id, str(run.info.run_name), settings.touch)
     path = path or results(None) / f"{str(run.info.run_name).split()[0]}_{run.info.run_id[:8]}.onnx"
     touches = _touches(of, settings.touches)

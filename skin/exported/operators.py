@@ -40,7 +40,7 @@ def cummax(x: Any, dim: int) -> tuple[Any, Any]:
     """
     until = op.Trilu(op.ConstantOfShape([x.shape[1], x.shape[1]], value=_ONE), upper=0)
     earlier = op.Mul(op.Unsqueeze(x, [1]), op.CastLike(op.Unsqueeze(until, [0, 3]), x))
-    return op.ReduceMax(earlier, [2], keepdims=0), x
+    return op.ReduceMax(earlier, [2], keepdims=0), op.Cast(x, to=_INT64)
 
 
 def eigenvalues(x: Any, uplo: str = "L", compute_v: bool = False) -> tuple[Any, Any]:
@@ -57,7 +57,7 @@ def eigenvalues(x: Any, uplo: str = "L", compute_v: bool = False) -> tuple[Any, 
     # The difference of mean and radius would lose the digits of a small eigenvalue.
     determinant = op.Sub(op.Mul(first, last), op.Mul(mixed, mixed))
     small = op.Div(determinant, op.Max(large, _double(_TINY)))
-    return op.Cast(op.Concat(small, large, axis=1), to=_FLOAT), x
+    return op.CastLike(op.Concat(small, large, axis=1), x), op.Identity(x)
 
 
 def singular_values(
@@ -84,7 +84,9 @@ def singular_values(
         found.append(value)
     largest = op.Sqrt(op.Max(op.Concat(*found, axis=1), _double(0.0)))
     others = min(rows, columns) - len(found)
-    return x, op.Pad(op.Cast(largest, to=_FLOAT), [0, 0, 0, others]), x
+    found = op.Pad(op.Cast(largest, to=_FLOAT), [0, 0, 0, others])
+    # Not x itself, to which the exporter would give the shape of the output.
+    return op.Identity(x), found, op.Identity(x)
 
 
 def _largest_eigenvalue(matrix: Any, identity: Any) -> tuple[Any, Any]:

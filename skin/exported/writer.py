@@ -63,13 +63,15 @@ def _convert(module: nn.Module, touches: Touches) -> Any:
         raise InputError(
             "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
         ) from error
-    example = touches[:3]
+    # Batches of one touch would be taken for the only size.
+    example = touches.readings.new_zeros(3, *touches.readings.shape[1:])
+    module(example, example == 0)  # its own errors are clearer than those of the exporter
     batch = {0: torch.export.Dim("batch")}
     with _quiet():
         try:
             program = torch.onnx.export(
                 module,
-                (example.readings, example.valid),
+                (example, example == 0),
                 dynamo=True,
                 input_names=["readings", "valid"],
                 output_names=["probabilities"],

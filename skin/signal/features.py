@@ -222,9 +222,12 @@ def _spread(x: Tensor, places: Tensor, rise: Tensor) -> Iterable[Block]:
     for name, values in {"strongest frame": strongest, "maxima": x.amax(dim=1)}.items():
         weight = (values - 0.1 - rise[:, None]).clamp(min=0)
         weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
-        offset = places - weight[:, None] @ places
-        moments = torch.einsum("bs,bsi,bsj->bij", weight, offset, offset)
-        axes = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1)
+        # In single precision the breadth of sensors in a line would be the root of rounding errors.
+        share, place = weight.double(), places.double()
+        share = share / share.sum(dim=1, keepdim=True).clamp(min=0.5)
+        offset = place - share[:, None] @ place
+        moments = torch.einsum("bs,bsi,bsj->bij", share, offset, offset)
+        axes = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1).to(x.dtype)
         evenness = weight.square().sum(dim=1, keepdim=True).clamp(min=1e-6).reciprocal()
         names = [f"{measure} of the {name}" for measure in ("length", "breadth", "evenness")]
         yield names, torch.cat([axes, evenness], dim=1)

@@ -130,15 +130,15 @@ def _tuned(device: AbstractDevice, learned: bool) -> float:
     return ContactThreshold.tuned(rise(known), known.labels[:, -1] > 0.5).least
 
 
-def simulator_warning(stored: DictConfig, device: AbstractDevice) -> str | None:
+def simulator_warning(stored: DictConfig, device: AbstractDevice | None = None) -> str | None:
     """Return a warning if a run trained with equation 10 is used on a real skin; else None.
 
     Args:
         stored: the run's configuration.
-        device: the watched device.
+        device: the watched device; None: a real skin.
     """
     reading = OmegaConf.select(stored, "device.simulator.reading")
-    if reading != "equation10" or device.wired is None:
+    if reading != "equation10" or (device is not None and device.wired is None):
         return None
     return (
         "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "

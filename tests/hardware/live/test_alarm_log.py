@@ -1,0 +1,65 @@
+"""The log of alarms."""
+
+import json
+from datetime import UTC, datetime, timedelta
+from time import monotonic
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.hardware.live.alarm_log import AlarmLog, log_alarms
+from skin.hardware.live.display import Display, DisplayInfo
+from skin.hardware.live.verdict import Verdict
+
+
+def display():
+    return Display(DisplayInfo("run", "port", np.zeros((4, 3)), (0.1, 0.1), 4.0))
+
+
+def verdict(dangerous):
+    return Verdict(
+        1.5, monotonic(), {"dangerous": 0.9}, True, {"dangerous": dangerous}, dangerous, False, (), 0.4
+    )
+
+
+def test_each_change_is_a_line_with_its_time(tmp_path):
+    shown, path = display(), tmp_path / "logs" / "alarms.jsonl"
+    before = datetime.now(UTC)
+    with log_alarms(shown, path):
+        shown.set_verdict(None, "filling the window: 20 %")
+        for dangerous in (False, True, True):
+            shown.set_verdict(verdict(dangerous))
+        shown.set_verdict(None, "unplugged", True)
+        shown.set_verdict(verdict(True))
+        shown.set_verdict(verdict(False))
+    shown.set_verdict(verdict(True))  # after the end
+    found = [json.loads(line) for line in path.read_text().splitlines()]
+    events = ["started", "resumed", "alarm", "stale", "resumed", "cleared", "ended"]
+    assert [one["event"] for one in found] == events
+    alarm, stale = found[2], found[3]
+    assert (alarm["probabilities"], alarm["contact"]) == ({"dangerous": 0.9}, 0.4)
+    assert (stale["reason"], stale["alarm"]) == ("unplugged", True)
+    times = [datetime.fromisoformat(one["time"]) for one in found]
+    slack = timedelta(milliseconds=2)
+    assert all(before - slack <= time <= datetime.now(UTC) + slack for time in times)
+    with log_alarms(shown, path):
+        pass
+    assert len(path.read_text().splitlines()) == len(found) + 2  # appended
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"live\.log=FILE"), log_alarms(display(), tmp_path / "file" / "log"):
+        pass
+
+
+def test_a_full_disk_ends_the_log_and_not_the_view(capsys):
+    class Full:
+        def write(self, text):
+            raise OSError("No space left on device")
+
+    log = AlarmLog(Full())
+    log.observe(verdict(True), "", False)
+    log.observe(verdict(False), "", False)
+    assert capsys.readouterr().err == "the alarm log ends here: No space left on device\n"

@@ -1,0 +1,141 @@
+"""The live view of an exported model: in a process of its own, without torch."""
+
+import json
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
+from skin.hardware.live.engine_builder import describe
+from skin.hardware.live.live_settings import LiveSettings
+from skin.hardware.live.verdict import DebounceSettings
+from skin.hardware.live.watched import watch_model
+from skin.learner.network import Network
+from skin.paths import ROOT
+from skin.wire.text import Header, encode_header, encode_line
+
+pytest.importorskip("onnxruntime")
+RATE = 100.0  # Hz, of the device
+PATIENCE = 300  # s
+LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, DebounceSettings())
+WATCH = """
+import sys
+from skin.cli import main
+try:
+    main(["live", *sys.argv[1:]])
+finally:
+    print("torch" in sys.modules, "mlflow" in sys.modules, file=sys.stderr)
+"""
+
+
+@pytest.fixture(scope="module")
+def model(configured, tmp_path_factory):
+    """Return the file of a small untrained network with six sensors, whose alarm is above 0.25."""
+    from skin.build import build_data, build_device, build_learner
+    from skin.exported.writer import write_model
+    from skin.trained import Trained
+
+    sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
+    config = configured("simulator=naive", *sizes, "representation=readings", "model=mlp", "fusion=early")
+    device, learner = build_device(config), build_learner(config)
+    assert isinstance(learner, Network)
+    data = build_data(config, device)
+    learner.build(data)
+    known = data.touches("train")
+    point = OperatingPoint(0.25, 0.02, 5000, 100, 0)
+    of = Trained(device, learner, device.window, known.positions, device.model_rate, point)
+    path = tmp_path_factory.mktemp("model") / "skin.onnx"
+    write_model(learner.pipeline(of.positions), describe(of, "abc", "small", 0.3), known, path)
+    return path
+
+
+@pytest.fixture
+def skin():
+    """Return the address of a skin of six sensors that is touched for one of five seconds, without end."""
+    stop = Event()
+
+    def serve():
+        rng, peer = np.random.default_rng(0), server.accept()[0]
+        peer.sendall(encode_header(Header(n=6, rate=RATE, unit="N")))
+        with peer, suppress(OSError):  # the reader has ended
+            for number in range(10**6):
+                touched = 3.0 * (number / RATE % 5.0 > 4.0)
+                values = rng.normal(touched, 0.02, size=6).round(4)
+                peer.sendall(encode_line(values, number, round(1e6 * number / RATE)))
+                if stop.wait(1 / RATE):
+                    return
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE)
+        thread = Thread(target=serve)
+        thread.start()
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+        stop.set()
+        thread.join(PATIENCE)
+
+
+def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
+    words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
+    words += ["seconds=15", "live.log=alarms.jsonl"]
+    done = subprocess.run(
+        [sys.executable, "-c", WATCH, *words],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines()[-1] == "False False"
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["number"] for line in lines] == list(range(lines[0]["number"], lines[-1]["number"] + 1))
+    said = [line for line in lines if not line["stale"]]
+    assert {line["touched"] for line in said} == {False, True}
+    assert set(said[-1]["probabilities"]) == {"big", "dynamic", "press", "dangerous"}
+    logged = [json.loads(line)["event"] for line in (tmp_path / "alarms.jsonl").read_text().splitlines()]
+    assert logged[0] == "started"
+    assert "alarm" in logged
+    assert logged[-1] == "ended"
+
+
+def test_only_a_skin_at_a_port_is_watched(model):
+    with pytest.raises(InputError, match="add device=serial"):
+        watch_model(str(model), {"seed": 0}, LIVE, print)
+
+
+def test_the_settings_of_the_file_and_of_the_command(model):
+    said = []
+    watched = watch_model(str(model), {"port": "socket://x:1", "labels": "announced"}, LIVE, said.append)
+    assert (watched.title, watched.span, len(watched.positions)) == ("small", 3.0, 6)
+    assert said[-1] == "alarm above 0.2500"
+    other = LiveSettings(0, 4.0, 0.5, 0.2, None, None, DebounceSettings(above=0.75))
+    watch_model(str(model), {"port": "socket://x:1"}, other, said.append)
+    assert said[-1] == "alarm above 0.7500"
+
+
+@pytest.mark.slow
+def test_the_example_without_this_package(model, begin, tmp_path):
+    example = ROOT / "docs" / "examples" / "onnx_only.py"
+    assert len(example.read_text().splitlines()) <= 40
+    sizes = ["layout=grid", "layout.rows=2", "layout.columns=3"]
+    with begin(tmp_path, "emulate", "simulator=naive", *sizes, "link=skin", "emulate.idle=4") as emulator:
+        while "device.scale=" not in emulator.out:
+            assert emulator.poll() is None, emulator.err
+        scale = emulator.out.partition("device.scale=")[2].split()[0]
+        with subprocess.Popen(
+            [sys.executable, "-I", example, model, tmp_path / "skin", scale],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+        ) as reader:
+            lines = [json.loads(reader.stdout.readline()) for _ in range(100)]
+            reader.terminate()
+    assert {line["touched"] for line in lines} == {False, True}
+    assert all(0 <= line[name] <= 1 for line in lines for name in ("big", "dynamic", "press", "dangerous"))
+    assert all(line["alarm"] == (line["touched"] and line["dangerous"] > 0.25) for line in lines)

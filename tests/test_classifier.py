@@ -8,6 +8,7 @@ from hydra.utils import instantiate
 
 from skin.classifier import TouchClassifier, probabilities
 from skin.datamodule import TouchData
+from skin.device.base import AbstractDevice
 from skin.fusion.base import AbstractFusion
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 from skin.layout.scattered import Scattered
@@ -47,7 +48,7 @@ def test_the_rows_have_the_parameters_of_the_report(row, parameters, configured)
     positions = torch.from_numpy(Scattered(5, 5, seed=1).sensors(body).positions).float()
     readings = torch.zeros(1, 30, 25)
 
-    class Device:
+    class Device(AbstractDevice):
         task, size = TOUCH, body.size
 
         def touches(self, split, epoch=0):

@@ -105,3 +105,14 @@ def test_a_renamed_option_keeps_its_fingerprint(configured, override):
     assert old != now
     assert renamed(old) == now
     assert config_hash(old) == config_hash(now)
+
+
+def test_a_data_set_counts_by_its_manifest(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hashes = []
+    for manifest in (None, "one", "other"):
+        if manifest:
+            (tmp_path / "touches").mkdir(exist_ok=True)
+            (tmp_path / "touches" / "manifest.json").write_text(manifest)
+        hashes.append({config_hash({"path": path}) for path in ("touches", "./touches")})
+    assert len(set.union(*hashes)) == 6

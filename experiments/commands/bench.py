@@ -64,6 +64,7 @@ def run_all(
     found["generation"] = {
         name: run_alone("generation", "measure_generation", name, repeats) for name in SIMULATORS
     }
+    found["generate"] = run_alone("data_sets", "measure_data_set", 16 * 4096, repeats)
     found["device"] = {"decode_core_share": decode_core_share()}
     found["live"] = run_alone("live_latency", "measure_latency", 1000)
     found["live"]["onnx"] = run_alone("onnx_latency", "measure_onnx_latency", 1000)

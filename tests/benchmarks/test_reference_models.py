@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from torch.nn import functional as F
 
 from skin.datamodule import TouchData
+from skin.device.base import AbstractDevice
 from skin.layout.file import File
 from skin.recording import Touches
 
@@ -29,7 +30,7 @@ def plain():
     return module
 
 
-class Device:
+class Device(AbstractDevice):
     """Yields six touches of random readings on the default layout."""
 
     def __init__(self, task, body):

@@ -23,6 +23,20 @@ def test_generation_reports_rates_and_its_own_memory():
     assert len(ballast) == 400_000_000
 
 
+def test_a_data_set_is_measured_beside_drawing_alone():
+    figures = run_alone("data_sets", "measure_data_set", 64, 1)
+    assert set(figures) == {
+        "gestures_per_second",
+        "ratio_to_generation",
+        "bytes_per_gesture",
+        "peak_memory_bytes",
+    }
+    # readings alone are 3000 bytes, which noise keeps from shrinking much; few gestures have a large footer
+    assert 2000 < figures["bytes_per_gesture"] < 10000
+    assert 2e8 < figures["peak_memory_bytes"] < 1e9
+    assert 0 < figures["ratio_to_generation"] < 10
+
+
 def test_bad_arguments_exit_with_2(run, tmp_path):
     done = run(tmp_path, "bench", "benchmark.repeats=1", store=False)
     assert done.returncode == 2

@@ -8,6 +8,7 @@ import torch
 from hydra.utils import instantiate
 
 from skin.datamodule import TouchData
+from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.evaluation.metrics import metrics
 from skin.labels import TOUCH_SLIDING
@@ -119,7 +120,7 @@ def test_nothing_is_told_before_it_has_learnt(made, tmp_path):
         make().save(tmp_path)
 
 
-class Sliding:
+class Sliding(AbstractDevice):
     """Yields bumps that slide over 16 sensors, 6 mm a frame, every way; each fourth one goes nowhere."""
 
     task, size, rate = TOUCH_SLIDING, (0.16, 0.16), 10.0

@@ -5,6 +5,7 @@ import os
 # Before mlflow is imported, because it sends telemetry by default.
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 # Seconds, not minutes, until a server counts as away: waits of 0, 2 and 4 s between the attempts.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
@@ -175,8 +176,8 @@ def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
         except MlflowException as error:
             if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                 raise
-            found = client.get_experiment_by_name(name)
-    return found.experiment_id
+            return _experiment(client, name, location)
+    return str(found.experiment_id)
 
 
 def _where() -> str:

@@ -23,7 +23,7 @@ NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/c
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install test roundings slow check bench physics peers ui reproduce-table results wheel-check release-check docs notice clean
+.PHONY: help install test roundings slow cluster check bench physics peers demo ui reproduce-table results wheel-check release-check docs notice clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -31,7 +31,7 @@ help:  ## list the targets
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings,docs]"
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[dev,parallel,embeddings,docs,export,data,server]"
 	touch $@
 
 install: $(READY)  ## create .venv; run by the other targets if needed
@@ -44,9 +44,13 @@ roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several
 		echo "== $$setting"; env $$setting $(TEST) $(or $(TESTS),$(NUMERICAL)) || failed="$$failed $$setting"; \
 	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
 
-slow: $(PEERS)/.ready  ## run the test suite under these settings, including the baseline libraries, and build the documentation
+slow: $(PEERS)/.ready  ## run the test suite under these settings, with the baseline libraries, a cluster and the documentation
 	$(MAKE) roundings TESTS=tests
+	$(MAKE) cluster
 	$(MAKE) docs
+
+cluster: $(READY)  ## check a job array and concurrent writers on real SLURM and PostgreSQL, where they are installed
+	experiments/cluster/check.sh
 
 check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff check .
@@ -69,6 +73,9 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs, with their defaults and tuned (SEEDS=3)
 	$(BIN)/skin train --config-dir experiments/peers/conf -m 'seed=range($(SEEDS))' \
 		experiment=lightgbm,minirocket,multirocket_hydra,lightgbm_tuned,minirocket_tuned,multirocket_tuned
+
+demo: $(READY)  ## show the predictions of a pretrained model for an emulated skin on 127.0.0.1:8765; Ctrl-C stops
+	@$(BIN)/skin demo
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	@echo "runs: http://127.0.0.1:5000/#/experiments"

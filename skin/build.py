@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
@@ -18,6 +19,8 @@ from skin.settings import check_groups, configured
 from skin.simulator.base import AbstractSimulator
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from skin.datamodule import TouchData
 
 
@@ -74,7 +77,22 @@ def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
     augmentation = configured(Augmentation, groups["data"]["augment"], "data.augment")
     check_groups({"representation": groups["representation"]})
     representation = instantiate(groups["representation"])
-    return TouchData(device, representation, config.data.batch_size, config.seed, augmentation)
+    return TouchData(
+        device,
+        representation,
+        config.data.batch_size,
+        config.seed,
+        augmentation,
+        partial(_geometry, config),
+    )
+
+
+def _geometry(config: DictConfig) -> "Tensor":
+    """Return what the sensors of the configured skin respond to, (S, G)."""
+    from skin.device.geometry import sensor_geometry
+
+    skin = build_skin(config)
+    return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
 
 
 def build_learner(config: DictConfig) -> AbstractLearner:

@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from skin.config import validate_config
 from skin.error_messages import JobInputError, to_input_error
 from skin.paths import CONF
+from skin.shard import left_out
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
 
@@ -41,6 +42,8 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         @wraps(task)
         def job(config: DictConfig) -> Any:
             started.append(True)
+            if HydraConfig.get().mode == RunMode.MULTIRUN and left_out():
+                return None
             try:
                 return task(validate_config(config))
             except Exception as error:

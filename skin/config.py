@@ -21,7 +21,7 @@ PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
 
 # Settings without effect on results.
-_STEERING = ("tracking", "trust")
+_STEERING = ("shard", "tracking", "trust")
 
 
 @dataclass
@@ -84,8 +84,11 @@ class Config:
     evaluation: Evaluation | None = None
     tracking: Tracking | None = None
     contact: dict[str, Any] | None = None
+    shard: str | None = None
     # What a command other than training adds.
     run: str | None = None
+    name: str | None = None
+    licence: str | None = None
     trust: bool = False
     n: int | None = None
     out: str | None = field(default=None)
@@ -101,6 +104,7 @@ class Config:
     seconds: float | None = None
     web: bool | None = None
     live: dict[str, Any] | None = None
+    export: dict[str, Any] | None = None
     gestures: int | None = None
     format: str | None = None
     emulate: dict[str, Any] | None = None
@@ -114,6 +118,7 @@ class Config:
     benchmark: dict[str, Any] | None = None
     results: dict[str, Any] | None = None
     design: dict[str, Any] | None = None
+    adapt: dict[str, Any] | None = None
 
 
 def validate_config(config: DictConfig) -> DictConfig:

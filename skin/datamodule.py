@@ -1,6 +1,10 @@
 """The LightningDataModule: touches as batches of frames."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property
+from hashlib import sha256
+from typing import Any
 
 import pytorch_lightning as pl
 import torch
@@ -8,11 +12,11 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from skin.classifier import Batch
-from skin.device.base import AbstractDevice
+from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.labels import Task
-from skin.recording import Touches
-from skin.representation.base import AbstractRepresentation
+from skin.recording import Touches, touches_hash
+from skin.representation.base import AbstractRepresentation, Frames
 from skin.settings import checked
 from skin.signal.augmentation import Augmentation
 
@@ -24,8 +28,9 @@ class TouchData(pl.LightningDataModule):
     """Data module with batches of a device's touches in a representation.
 
     Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
-    one. A device that draws fresh gestures is called again every epoch. Processes that train together share
-    each training batch; each of them validates on all gestures.
+    one. A device that draws fresh gestures is called again every epoch. If a device makes its touches in
+    parts, each epoch has the parts in another order, and shuffles the touches of each. Processes that train
+    together share each training batch; each of them validates on all gestures.
 
     Args:
         device: source of touches.
@@ -33,6 +38,8 @@ class TouchData(pl.LightningDataModule):
         batch_size: gestures per batch.
         seed: of the order of gestures and of their augmentation; epoch e uses (seed, e).
         augmentation: changes the touches of training batches; None leaves them.
+        geometry: returns that of the configured skin, (S, G), for touches that do not tell it (of a port or a
+            file); None: there is none.
 
     Attributes:
         device: as given.
@@ -47,6 +54,7 @@ class TouchData(pl.LightningDataModule):
         batch_size: PositiveInt = 64,
         seed: int = 0,
         augmentation: Augmentation | None = None,
+        geometry: Callable[[], Tensor] | None = None,
     ) -> None:
         super().__init__()
         if augmentation is not None and augmentation.reverse and device.task.direction:
@@ -55,7 +63,7 @@ class TouchData(pl.LightningDataModule):
                 "data.direction=true"
             )
         self.device, self.batch_size, self.seed = device, batch_size, seed
-        self._make = representation
+        self._make, self._geometry = representation, geometry
         # An augmentation without effect must not draw random numbers.
         self.augmentation = None if augmentation == Augmentation() else augmentation
         self._known: tuple[Tensor, AbstractRepresentation] | None = None
@@ -69,15 +77,51 @@ class TouchData(pl.LightningDataModule):
     @property
     def window(self) -> int:
         """Number of frames per touch."""
-        return self.touches("train").readings.shape[1]
+        return self.example.readings.shape[1]
 
-    def touches(self, split: str, epoch: int = 0) -> Touches:
+    @cached_property
+    def example(self) -> Touches:
+        """The first touch of the training split."""
+        for touches in self.parts("train"):
+            return touches[torch.tensor([0])]
+        raise InputError("there are no touches to train on: generate or record more")
+
+    @property
+    def hash(self) -> str:
+        """Hash of the readings and labels of the training split."""
+        hashes = [touches_hash(touches) for touches in self.parts("train")]
+        return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode()).hexdigest()[:16]
+
+    def count(self, split: Split) -> list[int]:
+        """Return the number of touches of each part of a split, in the order of :meth:`parts`."""
+        parts = self.device.parts(split)
+        return [len(self.touches(split))] if parts is None else [part.count for part in parts]
+
+    def parts(
+        self, split: Split, epoch: int = 0, generator: torch.Generator | None = None
+    ) -> Iterator[Touches]:
+        """Yield the touches of a split, all at once unless the device makes them in parts.
+
+        Args:
+            split: of the device.
+            epoch: as of :meth:`touches`.
+            generator: shuffles the parts; None leaves them in order.
+        """
+        parts = self.device.parts(split)
+        if parts is None:
+            yield self.touches(split, epoch)
+            return
+        order = range(len(parts)) if generator is None else torch.randperm(len(parts), generator=generator)
+        for number in order:
+            yield parts[number].make().touches
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split; those of epoch 0 are kept."""
         if epoch == 0 or not getattr(self.device, "fresh", False):
             if split not in self._drawn:
-                self._drawn[split] = self.device.touches(split)  # type: ignore[arg-type]
+                self._drawn[split] = self.device.touches(split)
             return self._drawn[split]
-        return self.device.touches(split, epoch)  # type: ignore[arg-type]
+        return self.device.touches(split, epoch)
 
     def representation_for(self, positions: Tensor) -> AbstractRepresentation:
         """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
@@ -85,7 +129,10 @@ class TouchData(pl.LightningDataModule):
         Raises:
             InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
         """
-        if positions.ndim != 2:
+        if self._known is not None and self._known[1].layout_free:
+            return self._known[1]
+        make: Any = getattr(self._make, "func", self._make)
+        if positions.ndim != 2 and not make.layout_free:
             raise InputError(
                 "representations are built for one layout, got positions per frame: give one position "
                 "(x, y, z) per sensor, and how far it moves as Touches.motion"
@@ -97,8 +144,20 @@ class TouchData(pl.LightningDataModule):
     def frames(self, touches: Touches) -> Batch:
         """Return the frames of touches and their labels (B, L), on the touches' device."""
         labels = touches.known_labels
-        representation = self.representation_for(touches.positions.cpu()).to(touches.readings.device)
-        return representation.show(touches), labels
+        return self.show(touches), labels
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches, on the touches' device."""
+        place = touches.readings.device
+        representation = self.representation_for(touches.positions.cpu()).to(place)
+        if representation.layout_free and touches.geometry is None and self._geometry is not None:
+            touches = replace(touches, geometry=self._configured_geometry.to(place))
+        return representation.show(touches)
+
+    @cached_property
+    def _configured_geometry(self) -> Tensor:
+        assert self._geometry is not None
+        return self._geometry()
 
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""
@@ -116,26 +175,26 @@ class TouchData(pl.LightningDataModule):
 class _Batches:
     """The batches of one split; no torch DataLoader, which would touch every sample by itself."""
 
-    def __init__(self, data: TouchData, split: str) -> None:
+    def __init__(self, data: TouchData, split: Split) -> None:
         self.data, self.split = data, split
 
     def __len__(self) -> int:
-        return -(-len(self.data.touches(self.split)) // self.data.batch_size)
+        return sum(-(-count // self.data.batch_size) for count in self.data.count(self.split))
 
     def __iter__(self) -> Iterator[Touches]:
         data = self.data
         if self.split != "train":
-            touches = data.touches(self.split)
-            for start in range(0, len(touches), data.batch_size):
-                yield touches[start : start + data.batch_size]
+            for touches in data.parts(self.split):
+                for start in range(0, len(touches), data.batch_size):
+                    yield touches[start : start + data.batch_size]
             return
         epoch = data.trainer.current_epoch if data.trainer else 0
-        touches = data.touches(self.split, epoch)
         # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
         generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
-        for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
-            batch = touches[index]
-            yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
+        for touches in data.parts(self.split, epoch, generator):
+            for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
+                batch = touches[index]
+                yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
 
     def _share(self, batch: Touches) -> Touches:
         """Return this process's part of a batch where several train together.

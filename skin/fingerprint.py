@@ -8,7 +8,7 @@ from typing import Any
 
 from skin import __version__
 from skin.earlier_settings import in_frames
-from skin.paths import candidates
+from skin.paths import MANIFEST, candidates
 
 RENAMED: dict[str, str] = {
     "skin.learner.features.Features": "skin.learner.boosted_trees.BoostedTrees",
@@ -80,11 +80,11 @@ def _strings(value: Any) -> Iterator[str]:
 
 
 def _file(name: str) -> Path | None:
-    """Return the file that a setting names, or None."""
-    if "/" not in name and "." not in name:
-        return None
+    """Return the file that a setting names, the manifest of a data set, or None."""
+    plain = "/" not in name and "." not in name
     try:
-        return next((found for found in candidates(name) if found.is_file()), None)
+        paths = [path / MANIFEST if plain or path.is_dir() else path for path in candidates(name)]
+        return next((found for found in paths if found.is_file()), None)
     except OSError:
         return None
 

@@ -1,7 +1,10 @@
-"""Handle Ctrl-C from the first import on: the command ends without a traceback."""
+"""Handle Ctrl-C and SIGTERM: the command ends without a traceback, and resources are closed."""
 
+import signal
 import sys
-from types import TracebackType
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
 
 _usual = sys.excepthook
 
@@ -13,3 +16,21 @@ def _handle(kind: type[BaseException], error: BaseException, trace: TracebackTyp
 
 
 sys.excepthook = _handle
+
+
+@contextmanager
+def ends_on_signal() -> Iterator[None]:
+    """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    try:
+        before = signal.signal(signal.SIGTERM, leave)
+    except ValueError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -7,9 +7,11 @@ ROOT = _PACKAGE.parent
 """The repository, where the package is imported from one."""
 
 BUNDLED = _PACKAGE if (_PACKAGE / "conf").is_dir() else ROOT
-"""The folder of ``conf`` and ``data``; a wheel has them inside the package."""
+"""The folder of ``conf``, ``data`` and ``models``; a wheel has them inside the package."""
 
 CONF = BUNDLED / "conf"
+MANIFEST = "manifest.json"
+"""The file that makes a folder a data set."""
 
 
 def candidates(given: str | Path) -> list[Path]:

@@ -1,7 +1,7 @@
 """Touches, the type that every device yields, and Recording, its stored form."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,18 @@ from torch import Tensor
 from skin.errors import InputError
 from skin.labels import Task
 
+REACHES = (0.0, 0.01, 0.02, 0.04)
+"""Distances from a sensor at which its response to a fingertip is known, m."""
+
+GEOMETRY = (
+    *("x", "y", "depth", "normal_x", "normal_y", "normal_z", "footprint_x", "footprint_y"),
+    *("width", "height", "thickness", "share"),
+    *(f"response_{1e3 * reach:g}mm" for reach in REACHES),
+)
+"""What is known of a sensor and its skin: m, unit vectors; extent and thickness of the body, m; reading under
+uniform pressure as a share of the force on the footprint; readings under a fingertip of 1 N at the distances
+:data:`REACHES`, N."""
+
 
 @dataclass(frozen=True)
 class Touches:
@@ -19,13 +31,15 @@ class Touches:
     Attributes:
         readings: (B, T, S), N.
         valid: (B, T, S), bool: False for invalid readings (dead sensor, lost frame).
-        positions: (S, 3) or (B, T, S, 3), m: x right and y down from the upper left corner, z depth.
+        positions: (S, 3), (B, S, 3) or (B, T, S, 3), m: x right and y down from the upper left corner, z
+            depth.
         labels: (B, L), 0 or 1, float; or None.
         rate: frames per second, Hz.
         motion: (B, T, S, 3), m, how far each sensor is from its place in ``positions``, along the same axes;
             None if unknown.
         saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
             if unknown.
+        geometry: (S, G) or (B, S, G), the columns :data:`GEOMETRY` of each sensor; None if unknown.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -38,6 +52,7 @@ class Touches:
     rate: float
     motion: Tensor | None = None
     saturated: Tensor | None = None
+    geometry: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.readings.ndim != 3:
@@ -46,8 +61,10 @@ class Touches:
             raise ValueError(f"valid must be bool, got {self.valid.dtype}")
         batch, time, sensors = self.readings.shape
         each, moving = (batch, time, sensors), (batch, time, sensors, 3)
+        known = (sensors, len(GEOMETRY))
         _expect(self.valid, "valid", each)
-        _expect(self.positions, "positions", (sensors, 3), moving)
+        _expect(self.positions, "positions", (sensors, 3), (batch, sensors, 3), moving)
+        _expect(self.geometry, "geometry", known, (batch, *known))
         _expect(self.motion, "motion", moving)
         _expect(self.saturated, "saturated", each)
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
@@ -66,6 +83,7 @@ class Touches:
             self.rate,
             None if self.motion is None else self.motion[index],
             None if self.saturated is None else self.saturated[index],
+            self.geometry if self.geometry is None or self.geometry.ndim == 2 else self.geometry[index],
         )
 
     @property
@@ -138,6 +156,19 @@ class Recording:
         )
 
 
+@dataclass(frozen=True)
+class Part:
+    """Consecutive touches of a whole that need not fit into memory: they are made when they are needed.
+
+    Attributes:
+        count: number of touches.
+        make: draws or reads them.
+    """
+
+    count: int
+    make: Callable[[], Recording]
+
+
 def _expect(values: Tensor | None, name: str, *shapes: tuple[int, ...]) -> None:
     """Raise a ValueError where a tensor, if there is one, has none of some shapes."""
     if values is not None and tuple(values.shape) not in shapes:
@@ -170,7 +201,7 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
 
 
 def touches_hash(touches: Touches) -> str:
-    """Return a hash of readings and labels."""
+    """Return a hash of readings and labels, 16 hexadecimal digits."""
     content = hashlib.sha256(touches.readings.contiguous().numpy().tobytes())
     if touches.labels is not None:
         content.update(touches.labels.contiguous().numpy().tobytes())

@@ -10,7 +10,8 @@ layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``ski
 
 import hashlib
 import json
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +27,42 @@ from skin.errors import InputError
 from skin.files import tabular, whole
 from skin.labels import Task
 from skin.recording import Recording, Touches
-from skin.recording_metadata import check_metadata, check_rows
+from skin.recording_metadata import (
+    FORMAT,
+    UNITS,
+    check_metadata,
+    check_rows,
+    column_types,
+    describe_recording,
+    numbered,
+)
 
-FORMAT = 1
-UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m", "size": "m", "rate": "Hz"}
+_EACH_FRAME = ("reading_", "force", "D_s_", "D_t_")
 
 
-def write_recording(recording: Recording, path: str | Path) -> Path:
+def write_recording(recording: Recording, path: str | Path, first: int = 0) -> Path:
     """Write a recording atomically.
 
     Args:
         recording: to write.
         path: ``x.parquet`` or ``x.csv``.
+        first: number of its first touch in the column ``simulation``.
 
     Raises:
         InputError: another ending, or a folder that cannot be written.
     """
     path = tabular(path, "a recording")
-    table, about = _table(recording), _describe(recording)
+    about = describe_recording(recording, first)
+    table = _table(recording, about)
     with whole(path) as partial:
         if path.suffix == ".parquet":
             text = json.dumps(about)
             table = table.replace_schema_metadata({"skin": text, "skin_sha256": _sha256(text.encode())})
-            pa.parquet.write_table(table, partial, compression="zstd", write_page_checksum=True)
+            # A dictionary of noisy readings would take most of the time and save no space.
+            dictionary = [name for name in table.column_names if not name.startswith(_EACH_FRAME)]
+            pa.parquet.write_table(
+                table, partial, compression="zstd", use_dictionary=dictionary, write_page_checksum=True
+            )
         else:
             pa.csv.write_csv(table, partial)
             # The table is moved last, because the sidecar is useless without it.
@@ -56,21 +70,41 @@ def write_recording(recording: Recording, path: str | Path) -> Path:
     return path
 
 
-def read_recording(path: str | Path) -> Recording:
+def read_recording(path: str | Path, complete: bool = True) -> Recording:
     """Read a recording of :func:`write_recording`; equal to the last bit.
+
+    Args:
+        path: ``x.parquet`` or ``x.csv``.
+        complete: read force, displacements and parameters too.
 
     Raises:
         InputError: no such file, not a recording, damaged, or rows that are not whole touches.
     """
     path = tabular(path, "a recording")
+    with _refused(path):
+        about, task = _described(path)
+        if not complete:
+            about |= {"force": False, "displacement": False, "parameters": []}
+        return _recording(_read_table(path, about), about, task)
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """Return everything that a recording contains beside its rows, as :func:`describe_recording` does.
+
+    Raises:
+        InputError: as of :func:`read_recording`; the rows are not read.
+    """
+    with _refused(path):
+        return _described(path)[0]
+
+
+@contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with a file that is no recording into an InputError."""
     if not path.is_file():
         raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
     try:
-        about = _read_about(path)
-        if isinstance(about, dict) and about.get("format") != FORMAT:
-            raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
-        task = check_metadata(about, str(path))
-        return _recording(_read_table(path, about), about, task)
+        yield
     except InputError:
         raise
     except (OSError, pa.ArrowException, ValueError, KeyError, OverflowError, RecursionError) as error:
@@ -78,60 +112,25 @@ def read_recording(path: str | Path) -> Recording:
         raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
 
 
+def _described(path: Path) -> tuple[dict[str, Any], Task]:
+    about = _read_about(path)
+    if isinstance(about, dict) and about.get("format") != FORMAT:
+        raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
+    return about, check_metadata(about, str(path))
+
+
 def _sidecar(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def _numbered(name: str, count: int) -> list[str]:
-    digits = max(2, len(str(count - 1)))
-    return [f"{name}_{number:0{digits}d}" for number in range(count)]
-
-
-def _columns(about: dict[str, Any]) -> dict[str, pa.DataType]:
-    """Return the name and type of every column, in order."""
-    task, sensors = about["task"], len(about["positions"])
-    columns = {"simulation": pa.int32(), "frame": pa.int32()}
-    if about["labelled"]:
-        cosines = 2 if task.get("direction") else 0  # older recordings do not say
-        kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
-        columns |= dict(zip(task["names"], kinds, strict=True))
-    names = _numbered("reading", sensors) + ["force"] * about["force"]
-    limits = _numbered("saturated", sensors) if about.get("saturated") else []  # older recordings do not say
-    if about["displacement"]:
-        names += _numbered("D_s", sensors) + _numbered("D_t", sensors)
-    names += [f"gesture_{name}" for name in about["parameters"]]
-    return columns | dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
-
-
-def _describe(recording: Recording) -> dict[str, Any]:
-    touches = recording.touches
-    return {
-        "format": FORMAT,
-        "units": UNITS,
-        "gestures": len(touches),
-        "frames": touches.readings.shape[1],
-        "rate": touches.rate,
-        "positions": touches.positions.tolist(),
-        "footprint": list(recording.footprint),
-        "size": list(recording.size),
-        "task": asdict(recording.task),
-        "labelled": touches.labels is not None,
-        "force": recording.force is not None,
-        "displacement": recording.displacement is not None,
-        "saturated": touches.saturated is not None,
-        "parameters": list(recording.parameters),
-        "metadata": recording.metadata,
-    }
-
-
-def _table(recording: Recording) -> pa.Table:
+def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
     touches = recording.touches
     batch, time, sensors = touches.readings.shape
 
     def per_gesture(values: Tensor) -> np.ndarray:
         return np.repeat(values.cpu().numpy(), time)
 
-    arrays = [np.repeat(np.arange(batch), time), np.tile(np.arange(time), batch)]
+    arrays = [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)]
     arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
     readings = touches.readings.reshape(-1, sensors).cpu().numpy()
     invalid = ~touches.valid.reshape(-1, sensors).cpu().numpy()
@@ -143,7 +142,7 @@ def _table(recording: Recording) -> pa.Table:
     arrays += [per_gesture(values) for values in recording.parameters.values()]
     if touches.saturated is not None:
         arrays += list(touches.saturated.reshape(-1, sensors).T.cpu().numpy())
-    columns = _columns(_describe(recording))
+    columns = column_types(about)
     return pa.table(
         {
             name: pa.array(np.ma.getdata(array), kind, mask=np.ma.getmaskarray(array), safe=False)
@@ -172,7 +171,7 @@ def _read_about(path: Path) -> dict[str, Any]:
 
 
 def _read_table(path: Path, about: dict[str, Any]) -> pa.Table:
-    columns = _columns(about)
+    columns = column_types(about)
     if path.suffix == ".csv":
         convert = pa.csv.ConvertOptions(column_types=columns, include_columns=list(columns))
         table = pa.csv.read_csv(path, convert_options=convert)
@@ -188,7 +187,8 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
     batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
     rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
-    whole = np.stack([np.repeat(np.arange(batch), time), np.tile(np.arange(time), batch)], axis=1)
+    first = about.get("first", 0)  # older recordings do not say
+    whole = np.stack([np.repeat(np.arange(batch) + first, time), np.tile(np.arange(time), batch)], axis=1)
     if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
         raise ValueError(
             f"row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
@@ -199,9 +199,9 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
 
     def columns(name: str) -> Tensor:
-        return torch.stack([column(one) for one in _numbered(name, sensors)], dim=-1)
+        return torch.stack([column(one) for one in numbered(name, sensors)], dim=-1)
 
-    present = [table[name].is_valid().to_numpy() for name in _numbered("reading", sensors)]
+    present = [table[name].is_valid().to_numpy() for name in numbered("reading", sensors)]
     touches = Touches(
         columns("reading"),
         torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),

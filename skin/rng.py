@@ -21,6 +21,7 @@ class Stream(IntEnum):
     TRACKING = 9
     ALARM = 10
     PLACEMENT = 11
+    SKIN = 12
 
 
 def generator(stream: Stream, *key: int) -> np.random.Generator:

@@ -17,11 +17,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
 from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
 from skin.build import build_data, build_device, build_learner
+from skin.claim import claim, refuse_twice
 from skin.class_balance import report_balance
 from skin.config import PARENT, fingerprint, overrides, plain
 from skin.console import quiet
@@ -36,7 +36,7 @@ from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
-from skin.recording import Touches, touches_hash
+from skin.run_logger import RunLogger
 from skin.settings import import_target
 from skin.source import note_reuse
 from skin.stored_run import TAG
@@ -48,21 +48,10 @@ _log = logging.getLogger(__name__)
 SWEPT = "SKIN_SWEPT"
 """Environment variable with the settings that a sweep varies, for its jobs."""
 
-_STEERING = ("hydra", "tracking", "trust", "sweep")  # no result depends on them
+_STEERING = ("hydra", "shard", "tracking", "trust", "sweep")  # no result depends on them
 _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
 # A run's name has the first ones in any case; the others choose the machine.
 _NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
-
-
-class _OpenLogger(MLFlowLogger):
-    """Logs a training to its run and leaves the run open.
-
-    Lightning's own calls a run FINISHED when the fit ends; one that is killed during its evaluation would
-    then count as finished without having any result.
-    """
-
-    def finalize(self, status: str = "success") -> None:
-        """Do nothing: the run ends with its evaluation."""
 
 
 def train(config: DictConfig) -> bool:
@@ -85,6 +74,8 @@ def train(config: DictConfig) -> bool:
             _log.info("run %s did this before: tracking.resume=false repeats it", finished[0].info.run_id)
             Console().print(metrics_table(finished[0].data.metrics, finished[0].info.run_name))
         return False
+    if config.tracking.resume:
+        refuse_twice(store, identity["fingerprint"])
     check_evaluation(config.evaluation)
     device = build_device(config)
     data, learner = build_data(config, device), build_learner(config)
@@ -92,15 +83,18 @@ def train(config: DictConfig) -> bool:
     report_balance(device, shown=PARENT not in os.environ)
     name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
     again = find_unfinished(store, config.tracking, identity["fingerprint"])
-    with store.run(name, identity, os.environ.get(PARENT), again) as run:
-        logger = _OpenLogger(tracking_uri=store.uri, run_id=run.info.run_id)
+    with (
+        store.run(name, identity, os.environ.get(PARENT), again) as run,
+        claim(store, run, config.tracking.resume),
+    ):
+        logger = RunLogger(store, run.info.run_id)
         learner.unfinished = unfinished_folder(config.tracking, run)
-        describe(store, run.info.run_id, config, data.touches("train"))
+        describe(store, run.info.run_id, config, data.hash)
         learner.fit(data, logger)
         point = choose_operating_point(learner, device, config.evaluation)
         report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
-        _keep(store, run, learner)
+        log_learner(store, run, learner)
         log_report(store, run, report, device.task, values)
     shutil.rmtree(learner.unfinished, ignore_errors=True)
     if PARENT not in os.environ:
@@ -116,8 +110,8 @@ def _limit_threads(number: int | None) -> None:
         torch.set_num_threads(number)
 
 
-def _keep(store: Store, run: Run, learner: AbstractLearner) -> None:
-    """Log the trained learner."""
+def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
+    """Log what a learner has learned, for :func:`skin.stored_run.load_learner`."""
     with tempfile.TemporaryDirectory() as folder:
         path = learner.save(Path(folder))
         store.client.log_artifact(run.info.run_id, str(path))
@@ -152,18 +146,18 @@ def _option(part: DictConfig, name: str) -> str:
     return option_name(import_target(part["_target_"], name))
 
 
-def describe(store: Store, run: str, config: DictConfig, touches: Touches) -> None:
+def describe(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
     """Log the configuration of a run before it starts.
 
     Args:
         store: where.
         run: its id.
         config: its configuration; unused groups may be left out.
-        touches: of its training.
+        data_hash: of the touches of its training.
     """
     chosen = {key: value for key, value in plain(config).items() if value is not None}
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(chosen)), "config.yaml")
-    store.client.set_tag(run, "data_hash", touches_hash(touches))
+    store.client.set_tag(run, "data_hash", data_hash)
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)
     used = [group for group in groups if group in config and group not in unused]

@@ -22,6 +22,7 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
 from skin.fingerprint import renamed
 from skin.learner.base import AbstractLearner
+from skin.pretrained import find_pretrained
 from skin.safe_loading import load_yaml
 from skin.tracking import RECORDED, Store
 from skin.trust import check_targets
@@ -57,13 +58,15 @@ _FIXED = (
 
 
 def find_run(store: Store, name: str) -> Run:
-    """Return the finished training run whose id or fingerprint begins with ``name``.
+    """Return a pretrained model, or the finished training run whose id or fingerprint begins with ``name``.
 
     ``latest`` is the last finished one that has weights. Of runs with equal fingerprints the last one counts.
 
     Raises:
-        InputError: no run or more than one matches.
+        InputError: no run or more than one matches, or the files of the model were altered.
     """
+    if (pretrained := find_pretrained(name)) is not None:
+        return pretrained
     runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
     if name == "latest":
         found = [run for run in runs if RECORDED not in run.data.tags][:1]
@@ -90,7 +93,7 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
         InputError: the configuration cannot be read, or names a class that is not allowed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        path = _fetched(store, run, "config.yaml", folder)
+        path = fetch(store, run, "config.yaml", folder)
         try:
             stored = renamed(load_yaml(path))
         except (ValueError, OSError) as error:
@@ -157,7 +160,7 @@ def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchDa
             f"run {run.info.run_id} names {name!r} as what it learned, which is no file of its own"
         )
     with tempfile.TemporaryDirectory() as folder:
-        path = _fetched(store, run, name, folder)
+        path = fetch(store, run, name, folder)
         try:
             learner.load(data, path)
         except InputError:
@@ -203,23 +206,27 @@ def load_operating_point(
     return point
 
 
+def fetch(store: Store, run: Run, name: str, folder: str) -> Path:
+    """Copy a file or folder of a run into ``folder`` and return its path.
+
+    Raises:
+        InputError: the run does not have it, or it cannot be read.
+    """
+    place = run.info.artifact_uri
+    try:
+        # Not by its id: a pretrained model is not in the database.
+        return Path(download_artifacts(f"{place}/{name}", dst_path=folder, tracking_uri=store.uri))
+    except (MlflowException, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"run {run.info.run_id} has no {name} in {place}: {reason}") from error
+
+
 def _reason(error: Exception) -> str:
     """Return a short message; that of torch on a pickle would advise to run its code."""
     if isinstance(error, pickle.PickleError):
         return "it holds something else than numbers"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else type(error).__name__
-
-
-def _fetched(store: Store, run: Run, name: str, folder: str) -> Path:
-    """Copy a file or folder of a run into ``folder``."""
-    identity = run.info.run_id
-    try:
-        return Path(
-            download_artifacts(run_id=identity, artifact_path=name, dst_path=folder, tracking_uri=store.uri)
-        )
-    except (MlflowException, OSError) as error:
-        raise InputError(f"run {identity} has no {name} in {run.info.artifact_uri}: {error}") from error
 
 
 def _follow(whole: DictConfig, composed: DictConfig) -> None:

@@ -4,10 +4,10 @@ import atexit
 import os
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
@@ -20,6 +20,7 @@ from skin.config import plain, validate_config
 from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.progress import SweepProgress, expected_seconds, format_duration
+from skin.shard import LEFT_OUT, Shard
 from skin.source import note_reuse
 
 if TYPE_CHECKING:
@@ -69,26 +70,33 @@ class Sweep(Callback):
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
     closed at exit. A parent that has no children by then, because each job was finished before or refused, is
-    deleted.
+    deleted. The results in a parent are of all jobs of the sweep, also of those in other shards.
 
     Args:
         parent: whether the jobs are runs; a command whose jobs run sweeps of their own has no parent run.
+        runs: fingerprints of the runs to train; None: those of the shard.
     """
 
-    def __init__(self, parent: bool = True) -> None:
-        self._wanted = parent
+    def __init__(self, parent: bool = True, runs: Collection[str] | None = None) -> None:
+        self._wanted, self._runs = parent, runs
         self._store: Store | None = None
         self._parent: Run | None = None
         self._resume = True
         self._jobs: list[dict[str, str]] = []
         self._fingerprints: list[str] = []
+        self._own: list[int] = []
         self._swept: list[str] = []
         self._progress = SweepProgress([])
         self._began = 0.0
 
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Refuse to divide a single job."""
+        if self._wanted and (shard := config.get("shard")) is not None:
+            _refuse(InputError(f"shard={shard} divides the jobs of a multirun or a study: add -m"))
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the parent run, and pass it to the jobs."""
-        if not self._wanted or "tracking" not in config:
+        if not self._wanted:
             return
         try:
             self._open(config)
@@ -96,16 +104,17 @@ class Sweep(Callback):
             refused = to_input_error(error)
             if refused is None:
                 raise
-            # Errors of all jobs are reported once, before the first; Hydra passes only exits on here.
-            print(refused, file=sys.stderr)
-            sys.exit(2)
+            _refuse(refused)
 
     def _open(self, config: DictConfig) -> None:
-        """Make the folder that Hydra writes to, and the parent run."""
-        settings = validate_config(_without_hydra(config)).tracking
+        """Choose the jobs, and make the folder that Hydra writes to, and the parent run."""
         # Swept or not, Hydra lists only what belongs to jobs here.
         self._jobs = sweep_jobs(_words(config), config.hydra.sweeper.params or {})
         self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
+        if "tracking" not in config:
+            self._choose(config, [""] * len(self._jobs))
+            return
+        settings = validate_config(_without_hydra(config)).tracking
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
@@ -113,30 +122,44 @@ class Sweep(Callback):
         from skin.tracking import Store
         from skin.variants import sweep_title
 
+        identities = [tags(job) if job else {} for job in composed]
+        self._fingerprints = [one.get("fingerprint", "") for one in identities]
+        self._choose(config, self._fingerprints)
         self._store = store = Store.open(settings)
         name = config.hydra.runtime.choices.get("sweep") or sweep_title(self._jobs, self._swept) or "sweep"
         self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
         atexit.register(self._close)
         os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
         _share_cores(config.hydra.launcher)
-        identities = [tags(job) if job else {} for job in composed]
-        self._fingerprints = [one.get("fingerprint", "") for one in identities]
-        pairs = zip(composed, identities, strict=True)
+        own = [(composed[number], identities[number]) for number in self._own]
         self._progress = SweepProgress(
-            [expected_seconds(store, job, one) if job else None for job, one in pairs]
+            [expected_seconds(store, job, one) if job else None for job, one in own]
         )
+
+    def _choose(self, config: DictConfig, fingerprints: Sequence[str]) -> None:
+        """Choose the jobs of this shard, and tell the others that they have nothing to do."""
+        shard = Shard.parse(config.shard) if config.get("shard") is not None else Shard(1, 1)
+        # A job without a fingerprint is refused, or is no training; its overrides identify it.
+        names = [one or str(job) for one, job in zip(fingerprints, self._jobs, strict=True)]
+        chosen = shard.part(names) if self._runs is None else self._runs
+        self._own = [number for number, name in enumerate(names) if name in chosen]
+        os.environ[LEFT_OUT] = " ".join(str(number) for number in set(range(len(names))) - {*self._own})
+        if not self._own:
+            if self._runs is None:
+                print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
+            sys.exit(0)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Print which job begins."""
         self._began = time.monotonic()
-        if self._parent:
+        if self._parent and config.hydra.job.num in self._own:
             left = self._progress.left()
             rest = "" if left is None else f" about {format_duration(left)} left"
             print(f"{self._label(config)} …{rest}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""
-        if not self._parent:
+        if not self._parent or config.hydra.job.num not in self._own:
             return
         took, skipped = time.monotonic() - self._began, job_return._return_value is False
         if job_return.status == JobStatus.FAILED:
@@ -145,14 +168,14 @@ class Sweep(Callback):
             print(f"{self._label(config)} was finished before", flush=True)
         else:
             print(f"{self._label(config)} took {format_duration(took)}", flush=True)
-        self._progress.finish(self._jobs.index(_chosen(_words(config))), took, skipped)
+        self._progress.finish(self._own.index(config.hydra.job.num), took, skipped)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Close the parent run."""
         self._close()
 
     def _close(self) -> None:
-        """End the parent run, once: FINISHED only if every job came to its end."""
+        """End the parent run, once: FINISHED only if every job of the shard came to its end."""
         store, self._store = self._store, None
         if store is None or self._parent is None:
             return
@@ -170,14 +193,15 @@ class Sweep(Callback):
         keys = [key for key in self._swept if key != "seed"]
         found: dict[tuple[str, ...], list[Run]] = {}
         once = dict(zip(self._fingerprints, self._jobs, strict=True))  # seed=0,0 is one run
+        missing = {self._fingerprints[number] for number in self._own}
         for identity, job in once.items():
             # One that was finished before counts, unless it was to be repeated.
             runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else own)
             found.setdefault(tuple(job[key] for key in keys), []).extend(runs[:1])
             for run in runs[:1]:
                 note_reuse(run)  # jobs in other processes warn of nothing
-        whole = sum(map(len, found.values())) == len(once)
-        store.client.set_terminated(parent.info.run_id, "FINISHED" if whole else "FAILED")
+            missing -= {identity} if runs else set()
+        store.client.set_terminated(parent.info.run_id, "FAILED" if missing else "FINISHED")
         if not store.find(**own):
             store.client.delete_run(parent.info.run_id)
         elif done := {values: runs for values, runs in found.items() if runs}:
@@ -186,7 +210,13 @@ class Sweep(Callback):
     def _label(self, config: DictConfig) -> str:
         job = _chosen(_words(config))
         chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
-        return f"[{config.hydra.job.num + 1}/{len(self._jobs)}] {chosen}"
+        return f"[{self._own.index(config.hydra.job.num) + 1}/{len(self._own)}] {chosen}"
+
+
+def _refuse(error: InputError) -> NoReturn:
+    """End the command; Hydra passes only exits on from a callback."""
+    print(error, file=sys.stderr)
+    sys.exit(2)
 
 
 def _without_hydra(config: DictConfig) -> DictConfig:

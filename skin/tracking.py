@@ -5,17 +5,18 @@ import os
 # Before mlflow is imported, because it sends telemetry by default.
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+# Seconds, not minutes, until a server counts as away: waits of 0, 2 and 4 s between the attempts.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
 
 import json
 import platform
-import signal
 import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import psutil
@@ -24,6 +25,7 @@ from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Run, ViewType
 from mlflow.exceptions import MlflowException
+from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
@@ -31,6 +33,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from skin.config import Tracking
 from skin.errors import InputError
 from skin.files import whole
+from skin.interrupt import ends_on_signal
+from skin.outbox import OutboxClient, answers
 from skin.source import source_tags
 
 PROCESS = "process"
@@ -62,19 +66,24 @@ class Store:
         """Return the experiment, made with its database where they are missing.
 
         Raises:
-            InputError: the database is none, belongs to another version of MLflow, or cannot be written.
+            InputError: the database is none, belongs to another version of MLflow, or cannot be written; or
+                the server does not answer.
         """
         uri = settings.uri or f"sqlite:///{Path.cwd() / 'mlflow.db'}"
         artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
+        remote = uri.startswith(("http://", "https://"))
+        if remote and not answers(uri):
+            raise InputError(
+                f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "
+                "tracking.uri; without it, finished runs are not known, and nothing begins"
+            )
         try:
             with _alone(uri, artifacts):
-                client = MlflowClient(tracking_uri=uri)
-                found = client.get_experiment_by_name(settings.experiment)
-                if found is None:
-                    location = (artifacts / settings.experiment).resolve().as_uri()
-                    identity = client.create_experiment(settings.experiment, artifact_location=location)
-                else:
-                    identity = found.experiment_id
+                client = OutboxClient(uri, artifacts / "kept") if remote else MlflowClient(tracking_uri=uri)
+                # A server keeps the artifacts of its runs, unless a folder is given.
+                served = remote and settings.artifacts is None
+                location = None if served else (artifacts / settings.experiment).resolve().as_uri()
+                identity = _experiment(client, settings.experiment, location)
         except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise InputError(
@@ -82,6 +91,8 @@ class Store:
                 "tracking.uri=sqlite:////FOLDER/runs.db"
             ) from error
         store = cls(client, uri, identity, settings.recorded)
+        if isinstance(client, OutboxClient):
+            client.upload()
         store._close_abandoned()
         return store
 
@@ -114,7 +125,7 @@ class Store:
         Only processes of this machine can be checked. Runs without the tag are left unchanged.
         """
         for run in self.find("RUNNING"):
-            if _gone(run.data.tags.get(PROCESS, "")):
+            if is_gone(run.data.tags.get(PROCESS, "")):
                 self.client.set_terminated(run.info.run_id, "KILLED")
 
     @contextmanager
@@ -155,6 +166,18 @@ class Store:
             self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
 
 
+def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
+    """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
+    if (found := client.get_experiment_by_name(name)) is None:
+        try:
+            return client.create_experiment(name, artifact_location=location)
+        except MlflowException as error:
+            if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+                raise
+            return _experiment(client, name, location)
+    return str(found.experiment_id)
+
+
 def _where() -> str:
     """Return an identifier of the machine, or of the container with its own process numbers."""
     try:
@@ -169,35 +192,17 @@ def _me() -> str:
     return json.dumps([_where(), os.getpid(), psutil.Process().create_time()])
 
 
-def _gone(process: str) -> bool:
-    """Return whether a tagged process of this machine no longer exists."""
+def is_gone(process: str) -> bool | None:
+    """Return whether a tagged process no longer exists; None for those of other machines."""
     try:
         where, number, started = json.loads(process)
         if where != _where():
-            return False
+            return None
         return abs(psutil.Process(number).create_time() - started) > _SET_CLOCK
     except psutil.NoSuchProcess:
         return True
     except (ValueError, TypeError, psutil.Error):
-        return False
-
-
-@contextmanager
-def ends_on_signal() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread."""
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    try:
-        before = signal.signal(signal.SIGTERM, leave)
-    except ValueError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        return None
 
 
 def _make(path: Path, artifacts: Path) -> None:

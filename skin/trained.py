@@ -1,17 +1,20 @@
 """A finished training run that predicts, for scripts and for ``skin live``."""
 
+import warnings
 from dataclasses import dataclass
 
 from mlflow.entities import Run
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from skin.build import build_data, build_device, build_learner
-from skin.config import Tracking, validate_config
+from skin.build import build_data, build_device, build_learner, build_skin
+from skin.config import Tracking, plain, validate_config
 from skin.device.base import AbstractDevice
+from skin.device.skin_distribution import SkinDistribution
 from skin.evaluation.operating_point import OperatingPoint
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.settings import configured
 from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
@@ -51,10 +54,10 @@ class Trained:
 
 
 def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) -> Trained:
-    """Return a finished training run.
+    """Return a pretrained model or a finished training run.
 
     Args:
-        name: the beginning of its id; ``latest`` is the last one that finished.
+        name: of the model, or the beginning of the run's id; ``latest`` is the last run that finished.
         uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
         trust: allow any class in its configuration, which may run any code.
 
@@ -79,9 +82,24 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
     Raises:
         InputError: its weights do not fit the configuration.
     """
+    _warn_of_unknown_skin(stored, config)
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device.blank())
     load_learner(store, run, learner, data)
-    known = data.touches("train")
+    known = data.example
     point = load_operating_point(run, learner, stored, config.evaluation)
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
+
+
+def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:
+    """Warn where a run that was trained on drawn skins is used on one that they do not include."""
+    if (ranges := OmegaConf.select(stored, "device.skins")) is None:
+        return
+    distribution, skin = configured(SkinDistribution, plain(ranges), "device.skins"), build_skin(config)
+    if outside := distribution.outside(skin.body, skin.sensors):
+        warnings.warn(
+            f"this skin is unlike those that the run was trained on: {', '.join(outside)}; its verdicts may "
+            "be worse than the run's results",
+            UserWarning,
+            stacklevel=3,
+        )

@@ -13,11 +13,11 @@ errors interrupt paths option
 trust earlier_settings
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body
+config recording body gesture_measures shard
 command
-files safe_loading recording_metadata layout summary plausibility
+files safe_loading recording_metadata layout summary plausibility outbox
 recording_file touch tracking
-simulator
+simulator data_set
 contact
 signal
 wire representation
@@ -25,15 +25,16 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished
-stored_run
-trained
+evaluation build unfinished claim run_logger pretrained
+stored_run model_card fine_tuning
+trained adaptation_target
+exported
 hardware
 plot
 design
 console progress variants
-run
-sweep
+run generation
+sweep adaptation
 commands
 cli
 __main__

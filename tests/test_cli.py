@@ -31,7 +31,7 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     main([verb, "--help"])
     text = capsys.readouterr().out
     assert f"skin {verb} " in text
-    assert ("fusion" in text) == (verb in ("train", "evaluate", "live", "compare"))
+    assert ("fusion" in text) == (verb in ("adapt", "train", "evaluate", "live", "compare"))
     assert "[serial]" in text if verb in ("listen", "record") else "[simulated]" in text
     assert "hydra" not in text
 

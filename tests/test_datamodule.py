@@ -1,19 +1,23 @@
 """Batches: every gesture once an epoch, in an order that only the seed decides."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
+from skin.build import build_data, build_device
+from skin.config import validate_config
 from skin.datamodule import TouchData
+from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.labels import TOUCH_SLIDING
-from skin.recording import Touches
+from skin.recording import Part, Recording, Touches
 from skin.representation.readings import Readings
 from skin.signal.augmentation import Augmentation
 
 
-class Numbered:
+class Numbered(AbstractDevice):
     """Yields touches whose readings are their number, plus 1000 times the epoch."""
 
     size, fresh = (0.16, 0.16), False
@@ -27,14 +31,31 @@ class Numbered:
         return Touches(readings, readings >= 0, torch.ones(2, 3), torch.zeros(self.count, 4), 10.0)
 
 
+class InParts(Numbered):
+    """Makes its touches in parts of 7, 12 and 4."""
+
+    def parts(self, split=None):
+        return [Part(stop - start, partial(self._part, slice(start, stop))) for start, stop in CUTS]
+
+    def _part(self, rows):
+        whole = Numbered.touches(self, "train")[rows]
+        return Recording(whole, self.task, self.size, (0.01, 0.01))
+
+    def touches(self, split, epoch=0):
+        raise AssertionError("its touches do not fit into memory")
+
+
+CUTS = [(0, 7), (7, 19), (19, 23)]
+
+
 class Trainer:
     current_epoch, world_size, global_rank = 0, 1, 0
 
 
 @pytest.fixture
 def make(made_up_device):
-    def make(seed=0, fresh=False, **options):
-        device = Numbered(made_up_device.task)
+    def make(seed=0, fresh=False, kind=Numbered, **options):
+        device = kind(made_up_device.task)
         device.fresh = fresh
         data = TouchData(device, partial(Readings, scale=1.0), seed=seed, **({"batch_size": 5} | options))
         data.trainer = Trainer()
@@ -82,6 +103,45 @@ def test_the_order_follows_from_seed_and_epoch(make):
     second = flat(data.train_dataloader())
     assert second != first
     assert flat(make(seed=1).train_dataloader()) != second
+
+
+def test_an_epoch_shows_every_gesture_of_every_part_once(make):
+    data = make(kind=InParts)
+    batches = data.train_dataloader()
+    assert len(batches) == len(numbers(batches)) == 2 + 3 + 1
+    first, again = flat(batches), flat(batches)
+    assert first == again
+    assert sorted(first) == list(range(23))
+    data.trainer.current_epoch = 1
+    second = flat(data.train_dataloader())
+    assert sorted(second) == list(range(23))
+    assert second != first
+
+
+def test_parts_come_in_another_order_each_epoch_and_one_after_the_other(make):
+    data, orders = make(kind=InParts), set()
+    for epoch in range(12):
+        data.trainer.current_epoch = epoch
+        part = [sum(number >= stop for _, stop in CUTS) for number in flat(data.train_dataloader())]
+        order = [one for one, before in zip(part, [None, *part], strict=False) if one != before]
+        assert sorted(order) == [0, 1, 2]
+        orders.add(tuple(order))
+    assert len(orders) > 2
+
+
+def test_validation_in_parts_keeps_its_order(make):
+    data = make(kind=InParts)
+    assert flat(data.val_dataloader()) == list(range(23))
+    assert len(data.val_dataloader()) == 6
+    assert data.window == 6
+
+
+def test_the_hash_is_of_all_parts(make, monkeypatch):
+    one = make(kind=InParts).hash
+    assert one == make(kind=InParts).hash
+    assert len(one) == 16
+    monkeypatch.setitem(globals(), "CUTS", [(0, 7), (7, 19)])
+    assert make(kind=InParts).hash != one
 
 
 def test_the_order_leaves_the_random_state_alone(make):
@@ -140,3 +200,14 @@ def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made
     made_up_device.task = TOUCH_SLIDING
     with pytest.raises(InputError, match=r"set data.augment.reverse=false"):
         TouchData(made_up_device, Readings, augmentation=Augmentation(reverse=True))
+
+
+def test_touches_without_geometry_get_that_of_the_configured_skin(configured):
+    config = validate_config(configured("representation=sites", "simulator=solid", "simulator.divisions=1"))
+    device = build_device(config)
+    touches, data = device.touches("test")[:8], build_data(config, device)
+    unknown = replace(touches, geometry=None)
+    torch.testing.assert_close(data.show(unknown).x, data.show(touches).x)
+    torch.testing.assert_close(data.show(unknown).summary, data.show(touches).summary)
+    other = build_data(validate_config(configured("representation=sites", "simulator=naive")), device)
+    assert not torch.allclose(other.show(unknown).x, data.show(touches).x)

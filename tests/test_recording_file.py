@@ -16,7 +16,7 @@ import torch
 from skin.errors import InputError
 from skin.labels import TOUCH, Task
 from skin.recording import Recording, Touches
-from skin.recording_file import read_recording, write_recording
+from skin.recording_file import read_description, read_recording, write_recording
 
 BATCH, TIME, SENSORS = 7, 5, 3
 
@@ -108,6 +108,22 @@ def test_units_and_layout_are_in_the_file(tmp_path):
     assert about["units"]["reading"] == "N"
     assert about["positions"] == kept.touches.positions.tolist()
     assert about["metadata"]["seed"] == 3
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_touches_are_numbered_from_the_first(tmp_path, suffix):
+    kept = recording()
+    path = write_recording(kept, tmp_path / f"x.{suffix}", first=5000)
+    table = pa.csv.read_csv(path) if suffix == "csv" else pa.parquet.read_table(path)
+    assert table["simulation"].unique().to_pylist() == list(range(5000, 5000 + BATCH))
+    assert same(read_recording(path), kept)
+    assert read_description(path)["first"] == 5000
+
+
+def test_what_is_not_complete_has_the_touches_only(tmp_path):
+    kept = recording()
+    found = read_recording(write_recording(kept, tmp_path / "x.parquet"), complete=False)
+    assert same(found, replace(kept, force=None, displacement=None, parameters={}))
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):

@@ -234,3 +234,32 @@ def test_a_job_may_take_a_value_from_another_setting(run, tmp_path):
         found = database.execute("select name, status from runs where name like 'device.noise%'").fetchall()
     database.close()
     assert found == [("device.noise=0.05,0.1", "FINISHED")]
+
+
+@pytest.mark.slow
+def test_shards_train_every_job_once_and_the_last_one_tells_the_results_of_all(run, tmp_path):
+    said = []
+    for shard in ("1/2", "2/2", "3/3"):
+        done = run(tmp_path, *sweep(tmp_path, "seed=0,1,0", f"shard={shard}"), store=False)
+        assert done.returncode == 0, done.stderr
+        said.append(done.stdout)
+    assert "shard 3/3 has no job: the sweep has only 2" in said[2]
+    children = [(name, status) for name, status, parent in runs(tmp_path) if parent]
+    assert sorted(children) == [(f"rules naive seed {seed}", "FINISHED") for seed in (0, 1)]
+    (second, first), _ = parents(tmp_path)
+    assert [run.info.status for run in (first, second)] == ["FINISHED", "FINISHED"]
+    assert [run.data.metrics["n"] for run in (first, second)] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["shard=1/2"], "shard=1/2 divides the jobs of a multirun or a study: add -m"),
+        (["-m", "shard=0/2"], "shard=0/2 names no part: give i/n"),
+    ],
+)
+def test_a_shard_of_nothing_is_refused(run, tmp_path, words, said):
+    done = run(tmp_path, "train", *words, *SMALL)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in done.stderr
+    assert not (tmp_path / "m.db").exists()

@@ -47,7 +47,13 @@ def test_the_wheel_has_the_package_and_its_files(unpacked):
     package, metadata = sorted(unpacked.iterdir())
     assert (package.name, metadata.suffix) == ("skin", ".dist-info")
     assert "skin = skin.cli:main" in (metadata / "entry_points.txt").read_text()
-    for folder, inside in [("skin", ""), ("conf", "conf"), ("data/shapes",) * 2, ("data/layouts",) * 2]:
+    for folder, inside in [
+        ("skin", ""),
+        ("conf",) * 2,
+        ("models",) * 2,
+        ("data/shapes",) * 2,
+        ("data/layouts",) * 2,
+    ]:
         paths = [path for path in (ROOT / folder).rglob("*") if path.is_file() and path.suffix != ".pyc"]
         assert paths
         for path in paths:

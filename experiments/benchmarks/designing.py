@@ -8,10 +8,10 @@ from torch import Tensor
 from experiments.benchmarks.harness import median_seconds, training_config
 from skin.build import build_device
 from skin.design.bound import Bound
-from skin.design.fingertip import Fingertip
 from skin.design.placement_problem import PlacementProblem
 from skin.design.readings import reading_covariance
 from skin.device.base import AbstractSimulated
+from skin.touch.fingertip import Fingertip
 
 SENSORS, TOUCHES, DISTANCE = 25, 3000, 0.012  # m; defaults of `skin design design=place`
 _STEPS = (1e-6, 1e-6, 1e-6, 1e-3)  # m, m, m, N

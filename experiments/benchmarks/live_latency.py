@@ -13,6 +13,7 @@ from experiments.benchmarks.harness import training_config
 from skin.build import build_data, build_device, build_learner
 from skin.device.base import AbstractSimulated
 from skin.hardware.live.engine import Detection, Engine
+from skin.hardware.live.engine_builder import window_classifier
 from skin.learner.network import Network
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion
@@ -55,9 +56,10 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    positions = data.touches("train").positions
+    positions = data.example.positions
+    classify = window_classifier(learner, positions, device.model_rate)
     return device, Engine(
-        learner, device.task, positions, device.window, device.model_rate, Detection(_TOUCH)
+        classify, device.task, len(positions), device.window, device.model_rate, Detection(_TOUCH)
     )
 
 

@@ -31,6 +31,8 @@ def main(config: DictConfig) -> None:
 
     quiet()
     if not study.trainings and study.rows is None and study.run is None:
+        if config.shard is not None:
+            raise InputError(f"study={study.name} has no runs to divide: leave out shard={config.shard}")
         _measure_skin(study, folder)
     else:
         _compare(study, config, folder)
@@ -44,20 +46,27 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
     from experiments.studies.runs import find_runs, train_study
     from experiments.studies.study_page import publish_study
     from experiments.studies.trials import run_trials
+    from skin.shard import Shard
     from skin.tracking import Store
 
+    shard = Shard.parse(config.shard) if config.shard is not None else None
     if study.trainings:
-        store, planned = train_study(study, config.smoke)
+        store, planned = train_study(study, shard, config.smoke)
     else:
         store = Store.open(config.tracking)
         planned = find_runs(study, config, store)
+        if shard:
+            own = shard.part(one.run.data.tags["fingerprint"] for one in planned if one.run)
+            planned = [one for one in planned if one.run and one.run.data.tags["fingerprint"] in own]
     found, console = [], Console(stderr=True)
     shown = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
     for trial in (trial for one in shown for trial in run_trials(store, one, study, config, folder)):
         found.append(trial)
         if trial.line:
             print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *trial.files, sep="\n", flush=True)
-    if study.metrics:
+    if shard:
+        print(f"shard {config.shard} is measured: the same command without shard= writes the results")
+    elif study.metrics:
         smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
         title = smoke + ", ".join([f"{study.name}: {study.about}", *(SMOKE if smoke else ()), *settings])

@@ -37,7 +37,10 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
 
     quiet()
-    multirun(words)
+    code = multirun(words)
+    if config.shard is not None:
+        print(f"shard {config.shard} is done: the same command without shard= writes the table")
+        sys.exit(code)
     budget = settings["budget"]
     folder = results(config.out) / ("" if budget == "full" else budget)
     sys.exit(1 if write_results(words, budget, folder) else 0)

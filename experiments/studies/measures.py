@@ -3,6 +3,7 @@
 They import heavy packages when called, so that errors in their settings are reported early.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
@@ -44,7 +45,7 @@ class SelfShare:
         from skin.representation.graph import self_share
 
         data = build_data(subject.config, subject.device)
-        graph = data.representation_for(data.touches("train").positions)
+        graph = data.representation_for(data.example.positions)
         return Measurement({"self_share": self_share(graph.adjacency)})  # type: ignore[arg-type]
 
 
@@ -162,3 +163,21 @@ class Embeddings(ProbeSettings):
         found = list(track(steps, "probing", count, console=Console(stderr=True)))
         names = device.task.names
         return Measurement({}, build_embeddings_page(found, names))
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """Accuracy after fine-tuning on the gestures of a device, beside rows that are trained on them.
+
+    Args:
+        rows: names of experiments.
+        epochs: of their trainings; None: those of the experiments.
+    """
+
+    rows: Sequence[str] = ("features", "best")
+    epochs: Annotated[int, Ge(1)] | None = None
+
+    def __call__(self, subject: Subject) -> Measurement:
+        from experiments.studies.adaptation_curve import measure_adaptation
+
+        return measure_adaptation(subject, self.rows, self.epochs)

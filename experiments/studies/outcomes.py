@@ -7,13 +7,23 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.studies.comparison import RATIOS, Paired, combine_verdicts, paired, verdict
+from experiments.studies.comparison import RATIOS, Paired, combine_verdicts, estimate, paired, verdict
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
 from skin.evaluation.outcomes import decodable, decode
 from skin.labels import TOUCH
 
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
+
+_HEADINGS = {
+    "same/dangerous/alarm_recall": "recall",
+    "same/dangerous/false_alarm_rate": "false alarms",
+    "train_accuracy": "training",
+    "seconds_per_epoch": "s/epoch",
+    "self_share": "self",
+    "same/direction/degrees": "degrees",
+    "same/direction/accuracy": "within 45°",
+}
 """Metrics that are no shares -> their unit."""
 
 
@@ -159,3 +169,14 @@ def _line(chosen: Mapping[str, str], trials: Sequence[Trial]) -> tuple[str, list
         if chosen.items() <= known.items():
             return f"{variant}, {condition}" if condition else variant, each
     return " ".join(chosen.values()), []
+
+
+def mean_and_error(trials: Sequence[Trial], metric: str) -> tuple[float, float]:
+    """Return the mean of a metric of trials and its standard error; of shares in per cent."""
+    return estimate(values(trials, metric), values(trials, metric, "device"), by_gesture(trials, metric))
+
+
+def heading(metric: str) -> str:
+    """Return a column's name: ``overall`` of ``same/overall/accuracy``."""
+    plain = metric.removeprefix("same/").removesuffix("/accuracy").replace("/overall", "")
+    return _HEADINGS.get(metric, plain.replace("_", " "))

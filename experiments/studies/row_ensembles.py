@@ -160,7 +160,7 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
     with store.run(f"{config.row} {simulator(config)} seed {config.seed}", tags(config) | about) as run:
         groups = ("representation", "model", "fusion", "learner", "optimizer", "trainer", "epochs")
         kept = {key: value for key, value in plain(config).items() if key not in groups}
-        describe(store, run.info.run_id, OmegaConf.create(kept), device.touches("train"))
+        describe(store, run.info.run_id, OmegaConf.create(kept), touches_hash(device.touches("train")))
         point = choose_operating_point(known, device, config.evaluation)
         report = evaluate(known, device, config.evaluation, point)
         chances = asked.chances[touches_hash(next(columns(device, config.evaluation)["same"]))]

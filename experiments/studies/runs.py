@@ -2,9 +2,9 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -23,6 +23,7 @@ from skin.config import PARENT, fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.run import SWEPT, simulator
+from skin.shard import LEFT_OUT, Shard
 from skin.source import note_reuse
 from skin.stored_run import find_run
 from skin.tracking import Store
@@ -43,15 +44,27 @@ class Planned:
     run: Run | None
 
 
-def train_study(study: Study, smoke: bool = False) -> tuple[Store, list[Planned]]:
-    """Train the missing runs of a study, and return its store and all its runs."""
+def train_study(study: Study, shard: Shard | None, smoke: bool = False) -> tuple[Store, list[Planned]]:
+    """Train the missing runs of a study, or of a shard of it.
+
+    Returns:
+        The store, and all runs of the study or the shard; only all runs together make ensembles.
+    """
     every = variants(study, smoke)
     store = Store.open(next(iter(every[0].configs.values())).tracking)
+    if shard:
+        own = shard.part(fingerprint(config) for one in every for config in one.configs.values())
+        every = [replace(one, configs=_those(one.configs, own)) for one in every]
     if study.train and any(one.run is None for one in _look(store, every)):
         for _, line in sweeps(study, smoke):
-            multirun(line)
+            multirun([*line, f"+hydra.callbacks.sweep.runs={sorted(own)}"] if shard else line)
     planned = _look(store, every)
-    return store, planned + _ensembles(study, store, planned, smoke)
+    return store, planned if shard else planned + _ensembles(study, store, planned, smoke)
+
+
+def _those(configs: Mapping[str, DictConfig], fingerprints: Collection[str]) -> dict[str, DictConfig]:
+    """Return the configurations with these fingerprints."""
+    return {seed: config for seed, config in configs.items() if fingerprint(config) in fingerprints}
 
 
 def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
@@ -93,11 +106,14 @@ def newest_finished(store: Store, config: DictConfig) -> Run | None:
     return found[0] if found else None
 
 
-def multirun(line: Sequence[str]) -> None:
-    """Train the sweep of some overrides, as ``skin train -m`` does; failed runs are reported and skipped."""
+def multirun(line: Sequence[str]) -> int:
+    """Train the sweep of some overrides, as ``skin train -m`` does, and return the exit code.
+
+    Failed runs are reported and skipped.
+    """
     sources = HydraConfig.get().runtime.config_sources
     folder = [one.path for one in sources if one.provider == "command-line"]  # of --config-dir
-    run_command(train.main, ["-m", *(["--config-dir", *folder] if folder else []), *line])
+    return run_command(train.main, ["-m", *(["--config-dir", *folder] if folder else []), *line])
 
 
 def run_command(main: Callable[[Sequence[str]], None], words: Sequence[str]) -> int:
@@ -126,7 +142,7 @@ def _another_command() -> Iterator[None]:
         yield
     finally:
         Singleton.set_state(state)
-        for name in (PARENT, SWEPT):  # of a sweep, which has ended
+        for name in (PARENT, SWEPT, LEFT_OUT):  # of a sweep, which has ended
             os.environ.pop(name, None)
         if shown is not None:
             os.environ["HYDRA_FULL_ERROR"] = shown

@@ -26,7 +26,7 @@ SMOKE = (
     "tracking.experiment=smoke",
 )
 """Overrides that shrink every run to a second; its scores are to be ignored."""
-_OWN = ("study", "smoke", "out")
+_OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")
 
 
@@ -86,6 +86,7 @@ class Study:
     differences: str | None = None
     statements: Sequence[Statement] = ()
     minutes: float | None = None
+    axis: str | None = None
 
     @classmethod
     def of(cls, config: DictConfig) -> "Study":

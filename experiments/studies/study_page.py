@@ -4,50 +4,43 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from matplotlib.figure import Figure
 from rich.console import Console
 
-from experiments.studies.comparison import RATIOS, Paired, estimate
+from experiments.studies.comparison import RATIOS, Paired
 from experiments.studies.outcomes import (
     UNITS,
     Difference,
     StatementResult,
-    by_gesture,
     conclusions,
     differences,
     group_trials,
+    heading,
+    mean_and_error,
     values,
 )
 from experiments.studies.study import Study
+from experiments.studies.study_figure import study_figure
 from experiments.studies.tables import Page, print_table
 from experiments.studies.tables import publish_page as write_page
 from experiments.studies.trials import Trial
-from skin.plot.figures import COLOURS
-
-_HEADINGS = {
-    "same/dangerous/alarm_recall": "recall",
-    "same/dangerous/false_alarm_rate": "false alarms",
-    "train_accuracy": "training",
-    "seconds_per_epoch": "s/epoch",
-    "self_share": "self",
-    "same/direction/degrees": "degrees",
-    "same/direction/accuracy": "within 45°",
-}
 
 
 def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
     """Return a line per variant: mean ± two standard errors over seeds, devices and gestures, in per cent.
 
-    Where there are conditions, each is a column of the first metric.
+    Where there are conditions, each is a column of the first metric; of a single variant, each is a line.
     """
     found = group_trials(trials)
     variants = list(dict.fromkeys(variant for variant, _ in found))
     conditions = list(dict.fromkeys(condition for _, condition in found if condition))
+    if conditions and len(variants) == 1:
+        lines = [[name, *(_cell(found[variants[0], name], one) for one in metrics)] for name in conditions]
+        return [[variants[0], *map(heading, metrics)], *lines]
     if conditions:
         head = ["variant", *conditions]
         cells = {key: _cell(each, metrics[0]) for key, each in found.items()}
         return [head, *([one, *(cells.get((one, name), "") for name in conditions)] for one in variants)]
-    head = ["variant", *map(_heading, metrics)]
+    head = ["variant", *map(heading, metrics)]
     body = []
     for (variant, _), each in found.items():
         failed = sum(not one.run for one in each)
@@ -105,45 +98,22 @@ def publish_study(
     """
     console = console or Console()
     changed = differences(study, trials)
-    further = study.metrics[1:] if any(one.condition for one in trials) else []
+    several = len({one.variant.name for one in trials}) > 1
+    further = study.metrics[1:] if several and any(one.condition for one in trials) else []
     tables = {
         "Variants": variants_table(trials, study.metrics),
-        # Where conditions take the columns, each metric has a table.
-        **({_heading(one): variants_table(trials, [one]) for one in further}),
-        f"Differences in {_heading(study.metrics[0])}": differences_table(changed, study.metrics[0]),
+        # Where conditions take the columns, each further metric has a table.
+        **({heading(one): variants_table(trials, [one]) for one in further}),
+        f"Differences in {heading(study.metrics[0])}": differences_table(changed, study.metrics[0]),
         "Statements": statements_table(conclusions(study.statements, trials)),
     }
     told = {name: each for name, each in tables.items() if len(each) > 1}
-    drawn = study_figure(trials, study.metrics[0], study.about) if any(one.run for one in trials) else None
+    drawn = study_figure(study, trials) if any(one.run for one in trials) else None
     print(title)
     for name, each in told.items():
-        if name not in map(_heading, further):
+        if name not in map(heading, further):
             print_table(each, name, console, wrapped=("statement", "measured"))
     print(*write_page(Page("", told, _csv(study, trials), drawn), title, path), sep="\n")
-
-
-def study_figure(trials: Sequence[Trial], metric: str, title: str) -> Figure:
-    """Draw a metric of each variant and condition: every trial, the mean, and two standard errors."""
-    found = {key: list(each) for key, each in group_trials(trials).items()}
-    drawn = Figure(figsize=(7, 1.2 + 0.3 * len(found)), layout="constrained")
-    axis = drawn.subplots()
-    unit = UNITS.get(metric, "%")
-    for place, each in enumerate(found.values()):
-        scale = 1 if metric in UNITS else 100
-        every = [scale * one.metrics[metric] for one in each if metric in one.metrics]
-        if not every:
-            continue
-        figures, across = values(each, metric), values(each, metric, "device")
-        mean, error = estimate(figures, across, by_gesture(each, metric))
-        axis.plot(every, [place] * len(every), "o", color=COLOURS[0], alpha=0.35, ms=4)
-        axis.errorbar(mean, place, xerr=2 * error, fmt="|", color="black", ms=10, capsize=3)
-    axis.set_yticks(range(len(found)), [", ".join(filter(None, key)) for key in found], fontsize=8)
-    axis.invert_yaxis()
-    axis.set_xlabel(
-        f"{_heading(metric)}{f', {unit}' if unit else ''}: each run, mean and two standard errors"
-    )
-    axis.set_title(title, fontsize=10)
-    return drawn
 
 
 def _csv(study: Study, trials: Sequence[Trial]) -> list[Sequence[object]]:
@@ -162,22 +132,15 @@ def _csv(study: Study, trials: Sequence[Trial]) -> list[Sequence[object]]:
     return [head, *body]
 
 
-def _heading(metric: str) -> str:
-    """Return a column's name: ``overall`` of ``same/overall/accuracy``."""
-    plain = metric.removeprefix("same/").removesuffix("/accuracy").replace("/overall", "")
-    return _HEADINGS.get(metric, plain.replace("_", " "))
-
-
 def _cell(trials: Sequence[Trial], metric: str) -> str:
     """Return the mean and two standard errors."""
     figures = values(trials, metric)
     if not figures:
         return "cannot" if any(one.cannot for one in trials) else ""
-    across, gestures = values(trials, metric, "device"), by_gesture(trials, metric)
-    mean, error = estimate(figures, across, gestures)
+    mean, error = mean_and_error(trials, metric)
     if metric in ("seconds_per_epoch", "parameters", "self_share"):
         return f"{mean:.{0 if metric == 'parameters' else 2}f}"
-    several = len(figures) > 1 or len(across) > 1 or gestures is not None
+    several = len(figures) > 1 or error > 0
     return f"{mean:.1f}" + (f" ± {2 * error:.1f}" if several else "")
 
 

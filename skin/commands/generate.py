@@ -1,14 +1,18 @@
-"""Write simulated touches to a Parquet or CSV file.
+"""Write simulated touches to a Parquet or CSV file, or as a data set of many shards.
 
     skin generate n=1000 out=touches.parquet
+    skin generate n=1000000 out=touches
 
-Prints a summary of the touches, and warns if the shape alone predicts a label.
+A folder is written with flat memory, and a command that was killed continues when it is repeated. A file also
+has the displacements under the sensors. Prints a summary of the touches, and warns if the shape alone
+predicts a label.
 """
+
+from pathlib import Path
 
 from omegaconf import DictConfig
 
 from skin.command import command
-from skin.config import fingerprint, plain
 from skin.errors import InputError
 
 
@@ -16,27 +20,23 @@ from skin.errors import InputError
 def main(config: DictConfig) -> None:
     """Draw a budget of n gestures and write readings, labels and parameters."""
     if config.out is None:
-        raise InputError("out is missing: add out=touches.parquet or out=touches.csv")
-    if not config.out.endswith((".parquet", ".csv")):
-        raise InputError(f"a recording is a .parquet or .csv file, got {config.out}: add out=touches.parquet")
-
-    from dataclasses import replace
+        raise InputError(
+            "out is missing: add out=touches.parquet or out=touches.csv, or out=touches for a folder"
+        )
+    path = Path(config.out).expanduser()
+    if path.suffix not in ("", ".parquet", ".csv"):
+        raise InputError(
+            f"touches are written to a .parquet or .csv file, or to a folder, got {config.out}: add "
+            "out=touches.parquet, or out=touches for a folder"
+        )
 
     from omegaconf import OmegaConf
 
     from skin.build import build_device
-    from skin.class_balance import report_balance
-    from skin.recording_file import write_recording
-    from skin.summary import summary_line
+    from skin.generation import generate_data_set, generate_file
 
     device = build_device(config)
-    recording = device.recording()
-    report_balance(device, recording)
     # The path of the file does not change the touches.
     source = OmegaConf.masked_copy(config, [str(key) for key in config if key != "out"])
-    about = {"config_hash": fingerprint(source), "config": plain(source)}
-    path = write_recording(replace(recording, metadata=recording.metadata | about), config.out)
-    # The metadata of a file may have any content.
-    known = device.simulation is not None
-    text = summary_line(recording.metadata["summary"]) if known else f"{len(recording)} gestures"
-    print(f"{path}: {text}")
+    generate = generate_file if path.suffix else generate_data_set
+    print(f"{path}: {generate(device, source, path)}")

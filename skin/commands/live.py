@@ -1,14 +1,17 @@
 """Show the predictions of a trained run for a skin in real time.
 
     skin live device=serial device.port=/dev/ttyACM0
+    skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
     skin live web=true
 
-run=latest names the run; web=true also serves a page. Without device= the simulator of the run is used: no
-hardware is needed. Ctrl-C stops.
+run=latest names the run, or a file of skin export, which starts faster; web=true also serves a page. Without
+device= the simulator of the run is used: no hardware is needed. Ctrl-C stops.
 """
 
 import sys
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
@@ -17,69 +20,82 @@ from skin.command import command
 from skin.config import overrides, plain
 
 if TYPE_CHECKING:
+    from skin.hardware.live.display import Display
     from skin.hardware.live.live_settings import LiveSettings
 
 
 @command("live")
 def main(config: DictConfig) -> None:
-    """Restore a finished run, open the skin, and show verdicts until the command is ended."""
+    """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
+    show(config, overrides())
+
+
+def show(config: DictConfig, given: Sequence[str]) -> None:
+    """Show the predictions of a run for a skin until the command is ended.
+
+    Args:
+        config: of the command.
+        given: settings that replace those of the run, as overrides; ``config`` has their values.
+    """
     from skin.hardware.live.live_settings import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
-
-    import torch
-
-    from skin.console import quiet
-
-    quiet()
-    torch.set_num_threads(config.tracking.threads or 1)
     try:
-        _watch(config, live)
+        _watch(config, live, given)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: "LiveSettings") -> None:
+def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> None:
     from rich.console import Console
 
-    from skin.build import build_device
-    from skin.hardware.live import engine_builder, terminal, web
     from skin.hardware.live.display import Display, DisplayInfo
     from skin.hardware.live.loop import LiveLoop
-    from skin.stored_run import apply_overrides, find_run, load_configuration
-    from skin.tracking import Store, ends_on_signal
-    from skin.trained import load_trained
+    from skin.interrupt import ends_on_signal
 
-    store, messages = Store.open(config.tracking), Console(stderr=True)
-    run = find_run(store, config.run)
-    stored, given = load_configuration(store, run, config.trust), overrides()
-    device = build_device(apply_overrides(stored, config, given))
-    # The training data stay those of the run, for any watched device.
-    trained = apply_overrides(
-        stored, config, [one for one in given if not one.startswith(("device=", "device."))]
-    )
-    messages.print(f"loading {run.info.run_name} ({run.info.run_id[:8]})", highlight=False)
-    if advice := engine_builder.simulator_warning(stored, device):
-        messages.print(advice, highlight=False)
-    of = load_trained(store, run, trained, stored)
-    engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)
-    if of.point is not None:
-        above = live.patience.above
-        messages.print(of.point.sentence() if above is None else f"alarm above {above:g}", highlight=False)
+    messages = Console(stderr=True, highlight=False)
+    if str(config.run).endswith(".onnx"):
+        from skin.hardware.live.watched import watch_model
+
+        watched = watch_model(config.run, plain(config)["device"], live, messages.print)
+    else:
+        from skin.console import quiet
+        from skin.hardware.live.trained_run import watch_run
+
+        quiet()
+        watched = watch_run(config, live, messages.print, given)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         # Opened last, because frames arrive from now on.
-        source = device.source()
+        source = watched.open()
         skin = open_.enter_context(source.skin)
-        places, span = of.positions.numpy(), of.window / of.rate
-        display = Display(DisplayInfo(run.info.run_name, source.name, places, of.device.size, live.top, span))
-        if config.web:
-            messages.print(
-                f"page: {open_.enter_context(web.serve_page(display, live.web_port))}", highlight=False
-            )
-        session = LiveLoop(skin, source.tare, engine, display)
-        open_.callback(
-            lambda: messages.print(f"{session.verdicts} verdicts, {session.line}", highlight=False)
+        display = Display(
+            DisplayInfo(watched.title, source.name, watched.positions, watched.size, live.top, watched.span)
         )
-        open_.enter_context(terminal.show_in_terminal(display, Console()))
+        for text in _views(display, config, live, open_):
+            messages.print(text)
+        session = LiveLoop(skin, source.tare, watched.engine, display)
+        open_.callback(lambda: messages.print(f"{session.verdicts} verdicts, {session.line}"))
         session.run(config.seconds)
+
+
+def _views(display: "Display", config: DictConfig, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
+    """Open what shows the verdicts; yield messages."""
+    if live.log is not None:
+        from skin.hardware.live.alarm_log import log_alarms
+
+        open_.enter_context(log_alarms(display, Path(live.log).expanduser()))
+    if config.web:
+        from skin.hardware.live.web import serve_page
+
+        yield f"page: {open_.enter_context(serve_page(display, live.web_port))}"
+    if live.verdicts is not None:
+        from skin.hardware.live.verdict_stream import stream_verdicts
+
+        yield f"verdicts: {open_.enter_context(stream_verdicts(display, live.verdicts))}"
+    if live.verdicts != "stdout":
+        from rich.console import Console
+
+        from skin.hardware.live.terminal import show_in_terminal
+
+        open_.enter_context(show_in_terminal(display, Console()))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from skin.contact._unilateral import Equilibrium
-from skin.labels import measure_gestures
+from skin.gesture_measures import measure_gestures
 from skin.touch.problem import ContactProblem
 
 # Relative tolerance of the peak. The tolerance at an end of its range, where a search fails, is tighter, so

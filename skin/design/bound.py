@@ -16,12 +16,12 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.build import build_skin
-from skin.design.fingertip import Fingertip
 from skin.design.information import Noise, Sensitivity, covariance_bound, sensitivity
 from skin.errors import InputError
 from skin.files import write
 from skin.settings import RISING, checked
 from skin.simulator.base import AbstractSimulator
+from skin.touch.fingertip import Fingertip
 
 _UNITS = {
     **dict.fromkeys(("radii", "rim", "margin"), "_m"),
@@ -68,7 +68,7 @@ class Bound:
     Args:
         forces: N.
         radii: least and largest radius of a fingertip, m.
-        rim: softness of its edge, m (:class:`skin.design.fingertip.Fingertip`).
+        rim: softness of its edge, m (:class:`skin.touch.fingertip.Fingertip`).
         frames: number of frames of a touch that are averaged.
         noise: standard deviation of a sensor's noise in a frame, N.
         gain: standard deviation of the unknown gain of a sensor, relative.

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from skin.design.fingertip import PARAMETERS, Fingertip
 from skin.simulator.base import AbstractSimulator
+from skin.touch.fingertip import PARAMETERS, Fingertip
 
 _AT_ONCE = 64  # touches; their samples then take about 50 MB with all derivatives
 
@@ -53,7 +53,7 @@ class Sensitivity:
 
     Attributes:
         readings: (B, S), N.
-        slopes: (B, S, 4), with respect to the parameters of :data:`skin.design.fingertip.PARAMETERS`.
+        slopes: (B, S, 4), with respect to the parameters of :data:`skin.touch.fingertip.PARAMETERS`.
     """
 
     readings: Tensor

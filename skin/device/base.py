@@ -9,7 +9,7 @@ from torch import Tensor
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.labels import Task
-from skin.recording import Recording, Touches
+from skin.recording import Part, Recording, Touches
 from skin.sensors import Sensors
 
 if TYPE_CHECKING:  # only their names are needed here
@@ -50,6 +50,11 @@ class AbstractDevice(ABC):
         return None
 
     @property
+    def reference(self) -> "AbstractSimulated | None":
+        """The simulated skin of the configuration, on which thresholds of ``skin live`` are tuned."""
+        return self.simulation
+
+    @property
     def wired(self) -> "AbstractWired | None":
         """This device, if it reads a skin at a port; else None."""
         return None
@@ -66,6 +71,13 @@ class AbstractDevice(ABC):
     def all_touches(self) -> Touches:
         """Return the touches that can be selected by number for plots: by default those of ``test``."""
         return self.touches("test")
+
+    def parts(self, split: Split | None = None) -> Sequence[Part] | None:
+        """Return a split, or the whole budget, as parts that are made one at a time.
+
+        None, the default: the touches fit into memory, and :meth:`touches` and :meth:`recording` return them.
+        """
+        return None
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the touches of a split, or the whole budget, with applied force and parameters.

@@ -1,28 +1,39 @@
-"""Touches from a file."""
+"""Touches from a file or a data set."""
 
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from skin.body._memory import require_memory
 from skin.body.base import AbstractBody
+from skin.data_set import DataSet
 from skin.device._blank import Blank
-from skin.device._split import split_rows
+from skin.device._split import split_rows, split_shards
 from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout
-from skin.recording import Recording, Touches
+from skin.recording import Part, Recording, Touches, concatenate
 from skin.recording_file import read_recording
 from skin.wire.open import open_skin
 from skin.wire.source import Source
 
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
+_BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated
 
 
 class Recorded(AbstractDevice):
-    """Yields the touches of a recording, split 80/10/10 by gesture; ``test`` is ``holdout``, the last part.
+    """Yields the touches of a recording or a data set, split 80/10/10 by gesture.
+
+    ``test`` is ``holdout``, the last part. A network is trained on a data set shard by shard, so that its
+    touches need not fit into memory; its validation and holdout have at most 32,768 gestures each.
 
     Args:
-        path: ``x.parquet`` or ``x.csv``.
+        path: ``x.parquet``, ``x.csv`` or the folder of a data set (:mod:`skin.data_set`).
         body: the sheet; it is compared with the file's.
         layout: positions of the sensors; they are compared with the file's.
         split_seed: seed of the split.
@@ -35,7 +46,7 @@ class Recorded(AbstractDevice):
 
     Raises:
         InputError: no file given, unreadable, too few touches, or another sheet or other sensors than the
-            configuration's.
+            configuration's. Methods raise it if touches do not fit into memory.
     """
 
     def __init__(
@@ -47,25 +58,29 @@ class Recorded(AbstractDevice):
         test: Literal["holdout", "all"] = "holdout",
     ) -> None:
         if path is None:
-            raise InputError("device=recording needs a file: add device.path=x.parquet")
-        self._recording = read_recording(path)
+            raise InputError(
+                "device=recording needs a file or a data set: add device.path=x.parquet or =FOLDER"
+            )
         if test not in ("holdout", "all"):
             raise InputError(f"device.test must be holdout or all, got {test}")
-        self._test = test
-        if len(self._recording) < 10 and test == "holdout":
+        self.path, self.split_seed, self._test = path, split_seed, test
+        folder = Path(path).expanduser()
+        self._whole = folder.suffix != "" and not folder.is_dir()
+        self._stored = _File(path) if self._whole else DataSet(path)
+        count = sum(self._stored.counts)
+        if count < 10 and test == "holdout":
             raise InputError(
-                f"{path} has {len(self._recording)} touches: 80/10/10 needs at least 10, or a "
+                f"{path} has {count} touches: 80/10/10 needs at least 10, or a "
                 "run that was trained on others and device.test=all"
             )
-        self.path, self.split_seed = path, split_seed
+        self._example = self._stored.read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
         self.sensors = layout.sensors(body)
         self._compare(body)
-        self.surface, self.task, self.size = body, self._recording.task, body.size
-        touches = self._recording.touches
-        self.rate, self.window = touches.rate, touches.readings.shape[1]
+        self.surface, self.task, self.size = body, self._example.task, body.size
+        self.rate, self.window = self._example.touches.rate, self._example.touches.readings.shape[1]
 
     def _compare(self, body: AbstractBody) -> None:
-        stored, size = self._recording.touches.positions, self._recording.size
+        stored, size = self._example.touches.positions, self._example.size
         if not np.allclose(size, body.size):
             raise InputError(
                 f"{self.path} was recorded on a skin of {size[0]:g} x {size[1]:g} m, the body is "
@@ -87,23 +102,62 @@ class Recorded(AbstractDevice):
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the touches of a split, the same in every epoch."""
-        return self.recording(split, epoch).touches
+        return self.recording(split, epoch, complete=False).touches
 
     def all_touches(self) -> Touches:
-        """Return the touches of the whole file."""
-        return self._recording.touches
+        """Return the touches of the whole file, or of the first shard."""
+        return self._stored.read(0).touches
 
     def blank(self) -> AbstractDevice:
         """Return a device that has labels, which the file may lack."""
-        return Blank.of(self.task, self.size, self._recording.touches)
+        return Blank.of(self.task, self.size, self._example.touches)
 
     def source(self) -> Source:
-        """Open the file as a stream of frames, in real time."""
-        return Source.of_newtons(self.path, open_skin(self.path, self.sensors), len(self.sensors))
+        """Open the file, or the first shard, as a stream of frames, in real time."""
+        path = str(self._stored.path(0))
+        return Source.of_newtons(path, open_skin(path, self.sensors), len(self.sensors))
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
-        """Return the recording of a split; None takes the whole file."""
+        """Return the recording of a split; None takes the whole file or data set."""
+        parts = self._parts(split, complete)
+        if self._whole:
+            return parts[0].make()
+        count = sum(part.count for part in parts)
+        require_memory(
+            2.0 * _BYTES * count * self._example.touches.readings.numel(),  # joining shards copies them
+            f"{self.path}, {count} gestures at once,",
+            "train a network, which reads shard by shard, or generate fewer gestures",
+        )
+        found = concatenate([part.make() for part in parts] or [self._example[:0]])
+        # The summary is of one shard.
+        return replace(found, metadata={name: of for name, of in found.metadata.items() if name != "summary"})
+
+    def parts(self, split: Split | None = None) -> list[Part] | None:
+        """Return the shards of a data set, or what a split has of each; None for a file."""
+        return None if self._whole else self._parts(split, complete=False)
+
+    def _parts(self, split: Split | None, complete: bool) -> list[Part]:
+        counts = self._stored.counts
         if split is None or (split == "test" and self._test == "all"):
-            return self._recording
+            return [Part(count, partial(self._stored.read, n, complete)) for n, count in enumerate(counts)]
         part: Split = "holdout" if split == "test" else split
-        return self._recording[split_rows(part, len(self._recording), self.split_seed)]
+        seed = self.split_seed
+        rows = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
+        return [Part(len(own), partial(self._rows, n, complete, own)) for n, own in rows]
+
+    def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
+        return self._stored.read(number, complete)[rows]
+
+
+class _File:
+    """A recording as the only shard of a data set; it stays in memory."""
+
+    def __init__(self, path: str) -> None:
+        self._path, self._recording = Path(path), read_recording(path)
+        self.counts = [len(self._recording)]
+
+    def path(self, number: int) -> Path:
+        return self._path
+
+    def read(self, number: int, complete: bool = True) -> Recording:
+        return self._recording

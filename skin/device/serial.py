@@ -2,8 +2,7 @@
 
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +15,13 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
-from skin.signal.calibration import read_calibration
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
 from skin.touch.gesture import GestureSettings, model_window
 from skin.wire.announcement import AnnouncementListener
-from skin.wire.conversion import UnitConversion, unit_conversion
+from skin.wire.conversion import UnitConversion
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.format_detection import Format
-from skin.wire.open import PortSettings, open_skin
 from skin.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
@@ -34,14 +31,14 @@ from skin.wire.segmentation import (
     label_plan,
     label_text,
 )
+from skin.wire.serial_source import SerialSource
 from skin.wire.skin import Skin
 from skin.wire.source import Source
 from skin.wire.tare import Tare, warm_up
 from skin.wire.text import Header
-from skin.wire.transport import open_stream
 
 _LABELS = ("announced", "prompted", "none")
-_AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
+_OF_THE_PORT = tuple(one.name for one in fields(SerialSource) if one.name not in ("sensors", "rate"))
 
 
 @dataclass(kw_only=True, eq=False)
@@ -91,23 +88,20 @@ class Serial(AbstractWired):
     def __post_init__(self) -> None:
         if self.labels not in _LABELS:
             raise InputError(f"device.labels must be one of {', '.join(_LABELS)}, got {self.labels}")
-        if self.gestures < 1 or not self.tare >= 0:
-            raise InputError(f"device.gestures={self.gestures} must be 1 or more, tare={self.tare} 0 or more")
-        if self.scale is not None and not self.scale > 0:
-            raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
+        if self.gestures < 1:
+            raise InputError(f"device.gestures={self.gestures} must be 1 or more")
         if self.labels == "none" and self.stream:
             raise InputError("labels=none finds windows with a touch: give a run trained without data.stream")
-        self._settings: dict[str, Any] = {name: getattr(self, name) for name in _AS_OPENED}
-        self._settings["limits"] = None if self.limits is None else tuple(self.limits)
-        PortSettings(**self._settings)  # checks them
         self.window, self.model_rate = model_window(self.touch)
         self.task, self.size = TOUCH_OR_NOT if self.stream else TOUCH, self.body.size
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self._known = None if self.calibration is None else read_calibration(self.calibration)
-        if self._known is not None:
-            self._known.fits(len(self.sensors))
+        self._wire = SerialSource(
+            sensors=len(self.sensors),
+            rate=self.model_rate,
+            **{name: getattr(self, name) for name in _OF_THE_PORT},
+        )
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read at the first call; labels are None if unknown."""
@@ -132,17 +126,11 @@ class Serial(AbstractWired):
 
     def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
         """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
-        if self.port is None:
-            raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
-        listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
-        return open_skin(
-            self.port, self.sensors, opener=listener, reconnect=reconnect, **self._settings
-        ), listener
+        return self._wire.open(reconnect)
 
     def source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""
-        skin, _ = self.open(reconnect=True)
-        return Source(str(self.port), skin, self.taring(skin))
+        return self._wire.source()
 
     def warm_up(self, skin: Skin) -> tuple[list[Frame], UnitConversion]:
         """Read the first frames: check the rate and take the baseline."""
@@ -156,7 +144,7 @@ class Serial(AbstractWired):
 
     def taring(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""
-        return Tare(self.conversion, self.tare, self.model_rate, lambda: skin.header)
+        return self._wire.taring(skin)
 
     def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
         """Return the conversion of values to N, given a baseline (S,) and the header of the device.
@@ -164,7 +152,7 @@ class Serial(AbstractWired):
         Raises:
             InputError: the scale is unknown.
         """
-        return unit_conversion(len(self.sensors), baseline, self.scale, self._known, header)
+        return self._wire.conversion(baseline, header)
 
     def segmenter(
         self,

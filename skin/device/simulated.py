@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -14,14 +15,15 @@ from skin.contact.base import AbstractContact
 from skin.contact.prescribed import Prescribed
 from skin.device._metadata import describe
 from skin.device._split import split_rows, split_slices
-from skin.device._threads import in_threads
+from skin.device._threads import grouped, joined
 from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
 from skin.device.base import AbstractSimulated, Split
+from skin.device.geometry import sensor_geometry
 from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.layout.base import AbstractLayout
-from skin.recording import Recording, Touches, concatenate
+from skin.recording import Part, Recording, Touches
 from skin.rng import Stream, generator
 from skin.sensors import Sensors
 from skin.settings import check_settings
@@ -56,7 +58,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
         stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
             of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
-        direction: the direction of sliding is a label too, as its cosines (``skin.labels.sliding``).
+        direction: the direction of sliding is a label too, as its cosines
+            (``skin.gesture_measures.sliding``).
         data_seed: seed of the budget.
         seed: seed of the device's constants and noise; each seed is another device.
         gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`. The rate
@@ -134,6 +137,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         randomness = generator(Stream.TRACKING, self.data_seed)
         return estimated(model, sampler, self.imperfection, len(self.sensors), randomness)
 
+    @cached_property
+    def geometry(self) -> Tensor:
+        """Where the sensors are and what they respond to, (S, G), :data:`skin.recording.GEOMETRY`."""
+        same = self.position_error == 0
+        model = self.model if same else modelled(self.simulator, self.body, self.sensors, self.model_rate)
+        return sensor_geometry(self.body, self.sensors, model)
+
     @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
@@ -155,7 +165,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def fresh_touches(self, count: int) -> Touches:
         """Return touches that belong to no split, for choosing a threshold after the training."""
-        return self._draw(False, Stream.ALARM, count, self.data_seed).touches
+        return self.draw(Stream.ALARM, count, self.data_seed)
+
+    def draw(self, stream: Stream, count: int, *key: int) -> Touches:
+        """Return touches of a stream of randomness at a key."""
+        return joined(self._batches(False, stream, count, *key)).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the same touches with the applied force and the gestures' parameters."""
@@ -168,39 +182,51 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
         if split == "test":
-            return self._keep("test", complete, Stream.TEST, self.test_gestures)
+            return self._keep("test", complete, self._batches(complete, Stream.TEST, self.test_gestures))
         if split == "train" and self.fresh:
             count = split_slices(self.gestures)["train"].stop
-            return self._draw(complete, Stream.FRESH, count, self.data_seed, epoch)
-        if self.stream:
-            return self._streams(split, complete)
-        budget = self._keep("budget", complete, Stream.BUDGET, self.gestures, self.data_seed)
-        return budget if split is None else budget[split_rows(split, self.gestures, self.data_seed)]
-
-    def _streams(self, split: Split | None, complete: bool) -> Recording:
-        """Return the windows of a split of the budget: they overlap, so no stream is split."""
-        own = split_slices(self.gestures)
+            return joined(self._batches(complete, Stream.FRESH, count, self.data_seed, epoch))
+        budget = self._keep("budget", complete, self._budget(complete))
         if split is None:
-            return concatenate([self._streams(name, complete) for name in own])
-        count = len(range(self.gestures)[own[split]])
-        return self._keep(split, complete, Stream.BUDGET, count, self.data_seed, [*own].index(split))
+            return budget
+        # Windows of a stream overlap, so each split has streams of its own.
+        if self.stream:
+            return budget[split_slices(self.gestures)[split]]
+        return budget[split_rows(split, self.gestures, self.data_seed)]
 
-    def _keep(self, name: str, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
+    def _keep(self, name: str, complete: bool, batches: Sequence[Part]) -> Recording:
         if complete:
-            return self._draw(True, stream, count, *key)
+            return joined(batches)
         if name not in self._kept:
-            self._kept[name] = self._draw(False, stream, count, *key)
+            self._kept[name] = joined(batches)
         return self._kept[name]
 
-    def _draw(self, complete: bool, stream: Stream, count: int, *key: int) -> Recording:
-        """Draw gestures or windows in batches; ``complete`` adds the displacements."""
+    def parts(self, split: Split | None = None) -> list[Part] | None:
+        """Return the budget in parts, together ``recording(complete=False)``; None for a split.
+
+        Each part is drawn on one thread, with metadata of its own.
+        """
+        return grouped(self._budget(False), lambda of: describe(self, of, None, 0)) if split is None else None
+
+    def _budget(self, complete: bool) -> list[Part]:
+        """Return the batches of the budget."""
+        draw = partial(self._batches, complete, Stream.BUDGET)
+        if not self.stream:
+            return draw(self.gestures, self.data_seed)
+        counts = [len(range(self.gestures)[rows]) for rows in split_slices(self.gestures).values()]
+        own = [draw(count, self.data_seed, number) for number, count in enumerate(counts)]
+        return [batch for split in own for batch in split]
+
+    def _batches(self, complete: bool, stream: Stream, count: int, *key: int) -> list[Part]:
+        """Return the batches of gestures or windows; ``complete`` adds the displacements."""
         cuts = [slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH)]
         if self.stream:
-            found = in_threads(lambda n: self._windows(cuts[n], complete, stream, (*key, n)), len(cuts))
-            return concatenate(found)
-        wanted = balanced(count, generator(stream, *key, 0))
-        found = in_threads(lambda n: self._batch(wanted[cuts[n]], complete, stream, (*key, 1 + n)), len(cuts))
-        return concatenate(found)
+            jobs = [partial(self._windows, cut, complete, stream, (*key, n)) for n, cut in enumerate(cuts)]
+        else:
+            wanted = balanced(count, generator(stream, *key, 0))
+            rest = complete, stream
+            jobs = [partial(self._batch, wanted[cut], *rest, (*key, 1 + n)) for n, cut in enumerate(cuts)]
+        return [Part(cut.stop - cut.start, job) for cut, job in zip(cuts, jobs, strict=True)]
 
     @torch.no_grad()
     def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
@@ -237,7 +263,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, self.model_rate, self.tracker.motion(movie))
+        motion = self.tracker.motion(movie)
+        touches = Touches(readings, valid, positions, labels, self.model_rate, motion, geometry=self.geometry)
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.

@@ -13,7 +13,8 @@ from skin.evaluation.alarm import Reached
 from skin.evaluation.metrics import metrics
 from skin.evaluation.operating_point import LABEL, OperatingPoint
 from skin.evaluation.report import Predictor
-from skin.labels import TOUCH, Measures, Thresholds
+from skin.gesture_measures import Measures
+from skin.labels import TOUCH, Thresholds
 from skin.signal.features import above_idle
 
 ALARM = "alarm"

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from skin.errors import InputError
 from skin.recording import Touches
@@ -12,6 +12,7 @@ from skin.recording import Touches
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
+    from skin.classifier import TouchClassifier
     from skin.datamodule import TouchData
 
 
@@ -47,6 +48,31 @@ class AbstractLearner(ABC):
             InputError: this learner has no encoder.
         """
         raise InputError(f"{type(self).__name__} has no encoder: give a run of a network")
+
+    def pipeline(self, positions: Tensor) -> nn.Module:
+        """Return a torch module of readings (B, T, S), N, and valid (B, T, S), bool; it gives probabilities.
+
+        Args:
+            positions: (S, 3), m.
+
+        Raises:
+            InputError: this learner is no network.
+        """
+        raise InputError(
+            f"learner {type(self).__name__} cannot be exported: give a run of learner=network, or of an "
+            "ensemble of networks"
+        )
+
+    @property
+    def network(self) -> "TouchClassifier":
+        """The trained network; what changes its weights changes the learner.
+
+        Raises:
+            InputError: this learner is no network.
+        """
+        raise InputError(
+            f"{type(self).__name__} has no network to fine-tune: give a run of a network, such as best_fresh"
+        )
 
     @abstractmethod
     def save(self, folder: Path) -> Path:

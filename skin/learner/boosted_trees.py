@@ -90,7 +90,7 @@ class BoostedTrees(AbstractLearner):
     def load(self, data: "TouchData", path: Path) -> None:
         """Grow the trees again from the file that :meth:`save` wrote; takes some seconds."""
         table = load_npz(path)
-        columns = _matrix(data.touches("train")[:1], data.task).shape[1]
+        columns = _matrix(data.example, data.task).shape[1]
         for split in ("train", "validation"):
             values, labels = table[split], table[f"{split}_labels"]
             if labels.ndim != 2 or labels.shape[1] != len(data.task):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from skin.errors import InputError
 from skin.learner.base import AbstractLearner
@@ -62,6 +62,12 @@ class Ensemble(AbstractLearner):
     def probabilities(self, touches: Touches) -> Tensor:
         """Return the mean of the members' probabilities, (B, L)."""
         return torch.stack([member.probabilities(touches) for member in self._members]).mean(dim=0)
+
+    def pipeline(self, positions: Tensor) -> nn.Module:
+        """Return the mean of the members' pipelines."""
+        from skin.learner._pipeline import Mean
+
+        return Mean([member.pipeline(positions) for member in self._members])
 
     def save(self, folder: Path) -> Path:
         """Write what each member learned to a numbered folder in ``folder/members``; return that."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from annotated_types import Ge, Le, Lt
-from torch import Tensor
+from torch import Tensor, nn
 
 from skin.config import PARENT
 from skin.error_messages import one_line
@@ -159,35 +159,43 @@ class Network(AbstractLearner):
         return self._map(touches, lambda of, frames: probabilities(of(frames), of.task))
 
     def embeddings(self, touches: Touches) -> Tensor:
-        """Return the embeddings of touches, (B, E), which are the input of the dense layers.
+        """Return the embeddings of touches, (B, E), which are the input of the dense layers."""
+        return self._map(touches, lambda of, frames: of.fusion(frames))
 
-        Accepts the same touches as :meth:`probabilities`.
+    @property
+    def network(self) -> "TouchClassifier":
+        """The trained network.
 
         Raises:
             RuntimeError: before ``fit`` or ``load``.
         """
-        return self._map(touches, lambda of, frames: of.fusion(frames))
+        if self._classifier is None:
+            raise RuntimeError("fit or load the learner first")
+        return self._classifier
+
+    def pipeline(self, positions: Tensor) -> nn.Module:
+        """Return representation and network as one module, in evaluation mode."""
+        from skin.learner._pipeline import Pipeline
+
+        if self._classifier is None or self._data is None:
+            raise RuntimeError("fit or load the learner first")
+        return Pipeline(self._data.representation_for(positions), self._classifier).cpu().eval()
 
     def _map(self, touches: Touches, function: "Callable[[TouchClassifier, Frames], Tensor]") -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""
-        if self._classifier is None or self._data is None:
-            raise RuntimeError("fit or load the learner first")
-        classifier = self._classifier.eval()
-        representation = self._data.representation_for(touches.positions.cpu()).to(classifier.device)
+        classifier = self.network.eval()
+        assert self._data is not None
         parts = []
         with torch.inference_mode():
             for start in range(0, len(touches), CHUNK):
                 part = touches[start : start + CHUNK].to(classifier.device)
-                frames = representation.show(part)
-                parts.append(function(classifier, frames).cpu())
+                parts.append(function(classifier, self._data.show(part)).cpu())
         return torch.cat(parts)
 
     def save(self, folder: Path) -> Path:
         """Write the weights to ``weights.pt`` in ``folder`` and return its path."""
-        if self._classifier is None:
-            raise RuntimeError("fit or load the learner first")
         path = Path(folder) / "weights.pt"
-        torch.save(self._classifier.state_dict(), path)
+        torch.save(self.network.state_dict(), path)
         return path
 
     def load(self, data: "TouchData", path: Path) -> None:
@@ -202,8 +210,8 @@ class Network(AbstractLearner):
         """
         from skin.classifier import TouchClassifier
 
-        frames, _ = data.frames(data.touches("train")[:1])
-        kind = data.representation_for(data.touches("train").positions).kind
+        frames, _ = data.frames(data.example)
+        kind = data.representation_for(data.example.positions).kind
         fusion = self._fusion(kind, tuple(frames.x.shape[2:]), frames.x.shape[1])
         classifier = TouchClassifier(
             fusion,

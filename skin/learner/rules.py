@@ -110,7 +110,7 @@ class Rules(AbstractLearner):
         """Load the rules that :meth:`save` wrote."""
         stored = json.loads(Path(path).read_text())
         rules = {name: Rule(**stored[name]) for name in data.task.names}
-        known = engineered_features(data.touches("train")[:1].to("cpu"))
+        known = engineered_features(data.example.to("cpu"))
         for name, rule in rules.items():
             numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
             if rule.measurement not in known or not numbers:

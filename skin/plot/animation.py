@@ -18,8 +18,8 @@ from skin.plot.figures import save_figure
 from skin.plot.plot3d import sensors_in_space, skin_in_space
 from skin.plot.surface import draw_surface
 from skin.plot.view import FORCE, Draw, Scene, clear, draw_traces, norm, places, space_and_traces
+from skin.representation._interpolation import weights
 from skin.representation._pixels import centres
-from skin.representation.interp import weights
 
 _FASTEST, _LONGEST = 25.0, 100  # frames per second, frames
 _PIXELS = 48

@@ -32,10 +32,12 @@ class AbstractRepresentation(nn.Module, ABC):
     Attributes:
         kind: kind of input that a model must accept: images, graphs or plain readings.
         windowed: whether a frame depends on the other frames of its window.
+        layout_free: whether one representation applies to touches of any layout.
     """
 
     kind: ClassVar[Literal["image", "graph", "readings"]]
     windowed: ClassVar[bool] = False
+    layout_free: ClassVar[bool] = False
 
     @abstractmethod
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:

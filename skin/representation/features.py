@@ -7,7 +7,7 @@ from torch import Tensor
 
 from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation, Frames, channels
-from skin.signal.features import engineered_features
+from skin.signal.features import feature_blocks
 
 _IDLE = 8
 
@@ -54,5 +54,5 @@ class Features(AbstractRepresentation):
         excess = (raw - idle) * valid
         views = [excess / self.scale, torch.asinh(excess / self.finest) / 2, *values.unbind(-1)[1:]]
         touches = Touches(readings, valid, self.positions, None, 1.0)
-        summary = torch.stack([value.to(raw) for value in engineered_features(touches).values()], dim=1)
+        summary = torch.cat([values.to(raw) for _, values in feature_blocks(touches)], dim=1)
         return Frames(torch.cat(views, dim=-1), None, summary.asinh())

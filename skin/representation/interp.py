@@ -6,44 +6,12 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import torch
 from annotated_types import MinLen
-from scipy.interpolate import CloughTocher2DInterpolator, LinearNDInterpolator, NearestNDInterpolator
-from scipy.spatial import QhullError
 from torch import Tensor
 
-from skin.errors import InputError
+from skin.representation._interpolation import Method, weights
 from skin.representation._pixels import Pixels, centres
 from skin.representation.base import AbstractRepresentation, Frames, channels
 from skin.settings import checked
-
-Method = Literal["nearest", "linear", "cubic"]
-
-
-def weights(points: np.ndarray, targets: np.ndarray, method: Method) -> np.ndarray:
-    """Return the matrix (P, S) that interpolates values at ``points`` (S, 2) to ``targets`` (P, 2).
-
-    Methods: nearest; linear on the Delaunay triangles; cubic after Clough and Tocher. All are linear in the
-    values, so the columns of the matrix are the images of unit readings. Outside the convex hull the nearest
-    value is used.
-
-    Raises:
-        InputError: the points do not form a triangle.
-    """
-    unit = np.eye(len(points))
-    matrix = NearestNDInterpolator(points, unit)(targets)
-    if method == "nearest":
-        return matrix
-    try:
-        if method == "linear":
-            inner = LinearNDInterpolator(points, unit)(targets)
-        else:
-            # the gradients come from an iteration: only a converged one is linear in the values
-            inner = CloughTocher2DInterpolator(points, unit, tol=1e-12, maxiter=5000)(targets)
-    except QhullError:
-        raise InputError(
-            f"representation.method={method} needs at least three sensors that are not in one line, "
-            f"got {len(points)}: set representation.method=nearest"
-        ) from None
-    return np.where(np.isnan(inner), matrix, inner)
 
 
 @checked("representation")
@@ -56,7 +24,8 @@ class Interpolation(AbstractRepresentation):
     Args:
         positions: (S, 3), m.
         size: extent (x, y) of the sheet, m; the square image covers all of it.
-        method: nearest, linear or cubic, see :func:`weights`; or several of them, each giving one channel.
+        method: nearest, linear or cubic (:func:`skin.representation._interpolation.weights`); or several of
+            them, each giving one channel.
         pixels: edge length of the image.
         scale: N; readings are divided by it.
         mask: append the interpolated mask of invalid readings, one channel per method.

@@ -1,9 +1,11 @@
 """Hand-made features of a touch that do not depend on the number or order of sensors."""
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
-from skin.labels import longest_run
+from skin.gesture_measures import longest_run
 from skin.recording import Touches
 
 LEVELS = (0.15, 0.3, 0.6, 1.0, 2.0, 3.0)  # N above idle, where the noise is NOISE
@@ -11,6 +13,10 @@ NOISE = 0.05  # N
 SHARES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7)  # of the touch's own peak
 IDLE = 0.2  # a touch rests for at least a fifth of its window
 BEST = 10  # how many sorted values are kept
+SINGULAR_VALUES = 4  # how many of them are used
+Block = tuple[list[str], Tensor]
+"""Names of K features, and their values (B, K)."""
+
 # Standard deviation of normal noise, per median distance between two frames.
 _PER_MEDIAN = 1.0484
 _BELOW = 0.8416  # standard deviations from the quantile IDLE of normal noise up to its mean
@@ -23,20 +29,30 @@ def engineered_features(touches: Touches) -> dict[str, Tensor]:
     newtons rise with the noise of the touch: by three times what exceeds ``NOISE``, so that noise alone does
     not pass them. Their names give the levels of a device with that noise.
     """
+    blocks = feature_blocks(touches)
+    return {
+        name: column
+        for names, values in blocks
+        for name, column in zip(names, values.unbind(dim=1), strict=True)
+    }
+
+
+def feature_blocks(touches: Touches) -> list[Block]:
+    """Return the features of :func:`engineered_features`, in the same order, as matrices."""
     raw, noise = _valid(touches), estimate_noise(touches)
     x = above_idle(touches, noise)
     places = touches.positions[..., :2].to(x.dtype)
     frame, peak = x.sum(dim=2), x.amax(dim=2)
     rise = 3 * (noise - NOISE).clamp(min=0)
-    return {
-        "noise": noise,
-        **_levels(x, peak, frame, noise),
-        **_sorted(raw, x, peak, frame),
-        **_changes(x, peak, frame),
-        **_sharing(x, peak, frame),
-        **_path(x, peak, places, rise),
-        **_spread(x, places, rise),
-    }
+    return [
+        (["noise"], noise[:, None]),
+        *_levels(x, peak, frame, noise),
+        *_sorted(raw, x, peak, frame),
+        *_changes(x, peak, frame),
+        _sharing(x, peak, frame),
+        *_path(x, peak, places, rise),
+        *_spread(x, places, rise),
+    ]
 
 
 def estimate_noise(touches: Touches) -> Tensor:
@@ -72,11 +88,16 @@ def _valid(touches: Touches) -> Tensor:
     return torch.where(touches.valid, touches.readings, torch.zeros(()))
 
 
-def _levels(x: Tensor, peak: Tensor, frame: Tensor, noise: Tensor) -> dict[str, Tensor]:
-    """How long and on how many sensors a touch exceeds absolute and relative levels, and noise."""
+def _frame_at(x: Tensor, index: Tensor) -> Tensor:
+    """Return one frame of each touch, (B, K), of x (B, T, K), given its index (B,)."""
+    return x.gather(1, index[:, None, None].expand(-1, 1, x.shape[2]))[:, 0]
+
+
+def _levels(x: Tensor, peak: Tensor, frame: Tensor, noise: Tensor) -> Iterable[Block]:
+    """Yield how long and on how many sensors a touch exceeds absolute and relative levels, and noise."""
     highest = x.amax(dim=1)
     top = peak.amax(dim=1, keepdim=True).clamp(min=1e-6)
-    at_peak = x[torch.arange(len(x)), frame.argmax(dim=1)]
+    at_peak = _frame_at(x, frame.argmax(dim=1))
     # All levels at once, for a window alone costs what the calls cost.
     levels, shares = (torch.tensor(values, dtype=x.dtype, device=x.device) for values in (LEVELS, SHARES))
     raised = levels + 3 * (noise[:, None] - NOISE).clamp(min=0)
@@ -104,18 +125,18 @@ def _levels(x: Tensor, peak: Tensor, frame: Tensor, noise: Tensor) -> dict[str, 
         "sensors above {} of the peak": (highest[..., None] > parts[:, None]).sum(dim=1),
         "sensors above {} of the peak at once": (at_peak[..., None] > parts[:, None]).sum(dim=1),
     }
-    return _named(absolute, LEVELS) | _named(relative, SHARES)
+    yield _named(absolute, LEVELS)
+    yield _named(relative, SHARES)
 
 
-def _named(columns: dict[str, Tensor], levels: tuple[float, ...]) -> dict[str, Tensor]:
+def _named(columns: dict[str, Tensor], levels: tuple[float, ...]) -> Block:
     """Return the columns (B, K) level by level, each under its name with the level in it."""
-    each = {name: column.unbind(dim=1) for name, column in columns.items()}
-    return {name.format(level): each[name][k] for k, level in enumerate(levels) for name in each}
+    names = [name.format(level) for level in levels for name in columns]
+    return names, torch.stack([column.float() for column in columns.values()], dim=2).flatten(1)
 
 
-def _sorted(raw: Tensor, x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
-    """Maxima and sums of sensors and frames, from the largest down."""
-    result: dict[str, Tensor] = {}
+def _sorted(raw: Tensor, x: Tensor, peak: Tensor, frame: Tensor) -> Iterable[Block]:
+    """Yield maxima and sums of sensors and frames, from the largest down."""
     columns = {
         "raw sensor maximum": raw.amax(dim=1),
         "sensor maximum": x.amax(dim=1),
@@ -124,36 +145,29 @@ def _sorted(raw: Tensor, x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Te
         "frame sum": frame,
     }
     for name, values in columns.items():
-        best = values.sort(dim=1, descending=True).values
-        best = torch.nn.functional.pad(best, (0, max(0, BEST - best.shape[1])))[:, :BEST]
-        result |= {f"{name} {rank + 1}": column for rank, column in enumerate(best.unbind(dim=1))}
-    return result
+        count = min(BEST, values.shape[1])
+        best = torch.nn.functional.pad(values.topk(count, dim=1).values, (0, BEST - count))
+        yield [f"{name} {rank + 1}" for rank in range(BEST)], best
 
 
-def _changes(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
-    """How fast the touch rises and falls, and how often the strongest sensor changes."""
-    result: dict[str, Tensor] = {}
+def _changes(x: Tensor, peak: Tensor, frame: Tensor) -> Iterable[Block]:
+    """Yield how fast the touch rises and falls, and how often the strongest sensor changes."""
     for name, values in {"sum": frame, "maximum": peak}.items():
         step = values.diff(dim=1)
-        result |= {
-            f"fastest rise of the {name}": step.amax(dim=1),
-            f"fastest fall of the {name}": step.amin(dim=1),
-            f"deviation of the {name}": values.std(dim=1),
-        }
+        names = [f"fastest rise of the {name}", f"fastest fall of the {name}", f"deviation of the {name}"]
+        yield names, torch.stack([step.amax(dim=1), step.amin(dim=1), values.std(dim=1)], dim=1)
     active = peak > 0.3 * peak.amax(dim=1, keepdim=True)
     strongest = x.argmax(dim=2)
     moved = (strongest.diff(dim=1) != 0) & active[:, 1:] & active[:, :-1]
     ever = (torch.nn.functional.one_hot(strongest, x.shape[2]) * active[..., None]).amax(dim=1)
-    return result | {
-        "changes of the strongest sensor": moved.sum(dim=1),
-        "sensors that were strongest": ever.sum(dim=1),
-    }
+    counts = torch.stack([moved.sum(dim=1), ever.sum(dim=1)], dim=1)
+    yield ["changes of the strongest sensor", "sensors that were strongest"], counts
 
 
-def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
-    """Whether all sensors follow one course over time, as they do under a touch that stands still."""
+def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> Block:
+    """Return whether all sensors follow one course over time, as they do under a touch that stands still."""
     strength = torch.linalg.svdvals(x)
-    strength = torch.nn.functional.pad(strength, (0, 4))[:, :4]
+    strength = torch.nn.functional.pad(strength, (0, SINGULAR_VALUES))[:, :SINGULAR_VALUES]
     ratio = strength / strength[:, :1].clamp(min=1e-6)
     push = x.clamp(min=0)
     time = torch.arange(x.shape[1], dtype=x.dtype)[None, :, None]
@@ -162,17 +176,19 @@ def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> dict[str, Tensor]:
     weight = total * (x.amax(dim=1) > 0.3 * peak.amax(dim=1, keepdim=True))
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
     mean = (weight * centre).sum(dim=1, keepdim=True)
-    return {
-        "singular value 1": strength[:, 0],
-        **{f"singular value {i + 1} of the first": ratio[:, i] for i in (1, 2, 3)},
-        "spread of the sensors in time": (weight * (centre - mean).square()).sum(dim=1).sqrt(),
-        "share of the strongest sensor": peak.amax(dim=1) / frame.amax(dim=1).clamp(min=1e-6),
-    }
+    spread = (weight * (centre - mean).square()).sum(dim=1, keepdim=True).sqrt()
+    share = (peak.amax(dim=1) / frame.amax(dim=1).clamp(min=1e-6))[:, None]
+    names = [
+        "singular value 1",
+        *[f"singular value {number + 1} of the first" for number in range(1, SINGULAR_VALUES)],
+        "spread of the sensors in time",
+        "share of the strongest sensor",
+    ]
+    return names, torch.cat([strength[:, :1], ratio[:, 1:], spread, share], dim=1)
 
 
-def _path(x: Tensor, peak: Tensor, places: Tensor, rise: Tensor) -> dict[str, Tensor]:
-    """How the centre of the readings moves while the touch lasts, m."""
-    result: dict[str, Tensor] = {}
+def _path(x: Tensor, peak: Tensor, places: Tensor, rise: Tensor) -> Iterable[Block]:
+    """Yield how the centre of the readings moves while the touch lasts, m."""
     active = peak > 0.25 * peak.amax(dim=1, keepdim=True)
     for power in (1, 2):
         push = (x - 0.1 - rise[:, None, None]).clamp(min=0) ** power
@@ -185,34 +201,30 @@ def _path(x: Tensor, peak: Tensor, places: Tensor, rise: Tensor) -> dict[str, Te
         low = outside.nan_to_num(torch.inf).amin(dim=1)
         first = active.to(torch.int64).argmax(dim=1)
         last = active.shape[1] - 1 - active.flip(1).to(torch.int64).argmax(dim=1)
-        rows = torch.arange(len(x))
-        ends = (centre[rows, last] - centre[rows, first]).norm(dim=1)
+        ends = (_frame_at(centre, last) - _frame_at(centre, first)).norm(dim=1)
         frames = active.sum(dim=1).clamp(min=1)
-        result |= {
-            f"path of the centre {power}": step.sum(dim=1),
-            f"mean step of the centre {power}": step.sum(dim=1) / frames,
-            f"longest step of the centre {power}": step.amax(dim=1),
-            f"reach of the centre {power}": far,
-            f"extent of the centre {power}": torch.where(active.any(dim=1), (high - low).norm(dim=1), 0),
-            f"way of the centre {power}": ends,
-            f"speed of the centre {power}": ends / frames,
+        columns = {
+            "path": step.sum(dim=1),
+            "mean step": step.sum(dim=1) / frames,
+            "longest step": step.amax(dim=1),
+            "reach": far,
+            "extent": torch.where(active.any(dim=1), (high - low).norm(dim=1), 0),
+            "way": ends,
+            "speed": ends / frames,
         }
-    return result
+        names = [f"{name} of the centre {power}" for name in columns]
+        yield names, torch.stack(list(columns.values()), dim=1)
 
 
-def _spread(x: Tensor, places: Tensor, rise: Tensor) -> dict[str, Tensor]:
-    """How wide the touch is at its strongest frame and over all, m."""
-    result: dict[str, Tensor] = {}
-    strongest = x[torch.arange(len(x)), x.sum(dim=2).argmax(dim=1)]
+def _spread(x: Tensor, places: Tensor, rise: Tensor) -> Iterable[Block]:
+    """Yield how wide the touch is at its strongest frame and over all, m."""
+    strongest = _frame_at(x, x.sum(dim=2).argmax(dim=1))
     for name, values in {"strongest frame": strongest, "maxima": x.amax(dim=1)}.items():
         weight = (values - 0.1 - rise[:, None]).clamp(min=0)
         weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-6)
-        offset = places - (weight @ places)[:, None]
+        offset = places - weight[:, None] @ places
         moments = torch.einsum("bs,bsi,bsj->bij", weight, offset, offset)
-        large, small = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1).unbind(dim=1)
-        result |= {
-            f"length of the {name}": large,
-            f"breadth of the {name}": small,
-            f"evenness of the {name}": weight.square().sum(dim=1).clamp(min=1e-6).reciprocal(),
-        }
-    return result
+        axes = torch.linalg.eigvalsh(moments).clamp(min=0).sqrt().flip(1)
+        evenness = weight.square().sum(dim=1, keepdim=True).clamp(min=1e-6).reciprocal()
+        names = [f"{measure} of the {name}" for measure in ("length", "breadth", "evenness")]
+        yield names, torch.cat([axes, evenness], dim=1)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.labels import sliding
+from skin.gesture_measures import sliding
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Movie:
             peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how many paths were
             drawn until one had the wanted labels), net_x and net_y (m, from the first place of the path to
             its last), x and y (m, that first place); area, travel, frames and pressure
-            (``skin.labels.Measures``), which make the labels; and where pressure is solved for, unconverged
-            (frames of all its draws that were not found).
+            (``skin.gesture_measures.Measures``), which make the labels; and where pressure is solved for,
+            unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
     """
@@ -61,7 +61,7 @@ class Movie:
 
     @property
     def slides(self) -> Tensor:
-        """Cosines of the sliding directions, (B, 2); see ``skin.labels.sliding``."""
+        """Cosines of the sliding directions, (B, 2); see ``skin.gesture_measures.sliding``."""
         known = self.parameters
         net = torch.stack([known["net_x"], known["net_y"]], dim=1)
         return sliding(net, known["speed"] * (known["duration"] - 1))

@@ -11,7 +11,8 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.labels import TOUCH, measure_gestures
+from skin.gesture_measures import measure_gestures
+from skin.labels import TOUCH
 from skin.touch._bodies import Fit
 from skin.touch._paths import sample_paths
 from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading

@@ -17,6 +17,26 @@ def test_writes_a_recording(run, tmp_path):
     assert len(recording.metadata["config_hash"]) >= 16
 
 
+def test_a_folder_becomes_a_data_set_to_train_on(run, tmp_path):
+    done = run(tmp_path, *NAIVE, "n=64", "out=touches", store=False)
+    assert done.returncode == 0, done.stderr
+    assert "touches: 64 gestures in 1 shards, " in done.stdout
+    train = ["device=recording", "device.path=touches", "representation=readings", "model=mlp"]
+    done = run(tmp_path, "train.py", *train, "trainer.max_epochs=2")
+    assert done.returncode == 0, done.stderr
+    assert "holdout" in done.stdout
+    shard = tmp_path / "touches" / "shards" / "00000.parquet"
+    shard.write_bytes(shard.read_bytes()[:-100])
+    for done in (
+        run(tmp_path, "train.py", *train, "trainer.max_epochs=3"),
+        run(tmp_path, *NAIVE, "n=64", "out=touches", store=False),
+    ):
+        assert done.returncode == 2
+        assert "00000.parquet is damaged" in done.stderr
+        assert "delete it, and repeat the skin generate" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
 ONE_SIZE = ("touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]")
 
 

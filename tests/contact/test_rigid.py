@@ -12,7 +12,7 @@ from skin.contact.prescribed import Prescribed
 from skin.contact.rigid import Rigid
 from skin.device._threads import in_threads
 from skin.errors import InputError
-from skin.labels import movie_labels
+from skin.gesture_measures import movie_labels
 from skin.layout.grid import Grid
 from skin.simulator.base import AbstractSimulator, Response
 from skin.simulator.naive import Naive

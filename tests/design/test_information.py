@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.design.fingertip import Fingertip
 from skin.design.information import Noise, Sensitivity, covariance_bound, sensitivity
 from skin.layout.grid import Grid
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
 from skin.simulator.solid import Solid
+from skin.touch.fingertip import Fingertip
 
 LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},

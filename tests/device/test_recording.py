@@ -1,15 +1,19 @@
 """A recording as a device: it must be of the sheet and the layout that the configuration names."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from skin.body.sheet import Sheet
+from skin.data_set import Manifest
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
 from skin.recording_file import write_recording
+from skin.recording_metadata import describe_recording
 from skin.simulator.naive import Naive
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
@@ -65,3 +69,79 @@ def test_no_file_and_too_few_touches_are_refused(simulated, tmp_path):
     few = write_recording(simulated[:9], tmp_path / "few.parquet")
     with pytest.raises(InputError, match=r"has 9 touches: 80/10/10 needs at least 10"):
         Recorded(BODY, LAYOUT, str(few))
+
+
+def data_set(simulated, folder) -> str:
+    """Write 50 touches as shards of 20, 20 and 10."""
+    source = {"seed": 0, "source_commit": "a", "source_dirty": "false", "config_hash": "1", "config": {}}
+    manifest = Manifest.of(describe_recording(simulated), [20, 20, 10], **source)
+    manifest.write(folder)
+    for number, first in enumerate(manifest.firsts):
+        shard = simulated[first : first + manifest.shards[number]]
+        shard = replace(shard, metadata={"config_hash": "1", "summary": {}})
+        write_recording(shard, manifest.path(folder, number), first)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def folder(simulated, tmp_path_factory) -> str:
+    return data_set(simulated, tmp_path_factory.mktemp("sets") / "touches")
+
+
+def test_a_data_set_is_split_by_gesture(folder, simulated):
+    device = Recorded(BODY, LAYOUT, folder)
+    parts = [device.touches(split) for split in ("train", "validation", "test")]
+    assert [len(part) for part in parts] == [40, 5, 5]
+    readings = torch.cat([part.readings for part in parts]).flatten(1)
+    assert torch.equal(readings.unique(dim=0), simulated.touches.readings.flatten(1).unique(dim=0))
+    assert (device.window, device.rate, device.task) == (30, 10.0, simulated.task)
+
+
+def test_a_data_set_is_made_in_parts(folder):
+    device = Recorded(BODY, LAYOUT, folder)
+    for split in ("train", "validation", "holdout"):
+        parts = device.parts(split)
+        made = [part.make() for part in parts]
+        assert [len(part) for part in made] == [part.count for part in parts]
+        joined = torch.cat([part.touches.readings for part in made])
+        assert torch.equal(joined, device.touches(split).readings)
+    assert len(device.parts("train")) > 1
+    assert [part.count for part in device.parts()] == [20, 20, 10]
+
+
+def test_another_split_seed_splits_a_data_set_otherwise(folder):
+    one, again, other = (Recorded(BODY, LAYOUT, folder, split_seed=s).touches("test") for s in (0, 0, 1))
+    assert torch.equal(one.readings, again.readings)
+    assert not torch.equal(one.readings, other.readings)
+
+
+def test_no_more_is_held_out_than_needed(folder, monkeypatch):
+    monkeypatch.setattr("skin.device._split.MOST_HELD_OUT", 2)
+    device = Recorded(BODY, LAYOUT, folder)
+    assert [len(device.touches(split)) for split in ("train", "validation", "holdout")] == [46, 2, 2]
+
+
+def test_all_of_a_data_set_may_be_the_test(folder, simulated):
+    device = Recorded(BODY, LAYOUT, folder, test="all")
+    assert torch.equal(device.touches("test").readings, simulated.touches.readings)
+    whole = device.recording()
+    assert torch.equal(whole.parameters["peak"], simulated.parameters["peak"])
+    assert "summary" not in whole.metadata
+
+
+def test_more_than_memory_is_refused_before_it_is_read(folder, monkeypatch):
+    device = Recorded(BODY, LAYOUT, folder)
+    monkeypatch.setattr("skin.device.recording._BYTES", 1e12)
+    with pytest.raises(InputError, match=r"touches, 40 gestures at once, needs about .* GB of memory"):
+        device.touches("train")
+
+
+def test_a_data_set_of_another_skin_is_refused(folder):
+    with pytest.raises(InputError, match=r"has 25 sensors, the layout has 16"):
+        Recorded(BODY, Grid(4, 4), folder)
+
+
+def test_a_folder_that_is_no_data_set_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "none"):
+        with pytest.raises(InputError, match=r"is no data set, because it has no manifest.json"):
+            Recorded(BODY, LAYOUT, str(path))

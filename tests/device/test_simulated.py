@@ -9,9 +9,10 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.labels import movie_labels
+from skin.gesture_measures import movie_labels
 from skin.layout.grid import Grid
 from skin.layout.scattered import Scattered
+from skin.recording import concatenate
 from skin.rng import Stream, generator
 from skin.signal.imperfection import ImperfectionSettings
 from skin.simulator.fem import PlatesAndBeams
@@ -55,6 +56,23 @@ def test_the_number_of_threads_does_not_matter(plain, monkeypatch):
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(*readings)
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_parts_are_the_budget(monkeypatch, stream):
+    monkeypatch.setattr("skin.device.simulated._BATCH", 4)
+    monkeypatch.setattr("skin.device._threads._PART", 3)
+    one = device(stream=stream)
+    whole, parts = one.recording(complete=False), one.parts()
+    assert [part.count for part in parts] == ([12] * 5 if not stream else [12, 12, 12, 12, 10, 2])
+    made = [part.make() for part in parts]
+    assert [len(part) for part in made] == [part.count for part in parts]
+    assert all(part.metadata["summary"]["gestures"] <= len(part) for part in made)
+    joined = concatenate(made)
+    assert torch.equal(joined.touches.readings, whole.touches.readings)
+    assert torch.equal(joined.touches.labels, whole.touches.labels)
+    assert torch.equal(joined.parameters["peak"], whole.parameters["peak"])
+    assert one.parts("train") is None
 
 
 def test_training_seeds_change_the_budget_and_never_the_test(plain):

@@ -7,8 +7,9 @@ from hydra.utils import instantiate
 from scipy.spatial import Delaunay
 
 from skin.errors import InputError
+from skin.representation._interpolation import weights
 from skin.representation._pixels import centres
-from skin.representation.interp import Interpolation, weights
+from skin.representation.interp import Interpolation
 
 SIZE = (0.16, 0.12)
 

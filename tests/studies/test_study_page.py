@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import pytest
 from PIL import Image
@@ -10,6 +11,7 @@ from rich.console import Console
 from experiments.studies.comparison import Paired
 from experiments.studies.outcomes import StatementResult
 from experiments.studies.study import Statement, Study, Variant
+from experiments.studies.study_figure import study_figure
 from experiments.studies.study_page import comparison_text, publish_study, variants_table
 from experiments.studies.trials import Trial
 
@@ -68,15 +70,27 @@ def test_a_line_per_variant_with_mean_and_two_standard_errors():
     assert third[:2] == ["weight=stiffness (1 failed)", "failed"]
 
 
-def test_conditions_are_columns_of_the_first_metric():
-    found = [
-        trial("a", "0", 0.8 + n / 10, condition=name, device=str(n))
-        for name in ("none", "5 dead")
+def under_conditions(name):
+    return [
+        trial(name, "0", 0.8 + n / 10, condition=condition, device=str(n))
+        for condition in ("none", "5 dead")
         for n in (0, 1)
     ]
-    assert variants_table(found, METRICS) == [
+
+
+def test_conditions_are_columns_of_the_first_metric():
+    assert variants_table([*under_conditions("a"), *under_conditions("b")], METRICS) == [
         ["variant", "none", "5 dead"],
         ["a", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["b", "85.0 ± 10.0", "85.0 ± 10.0"],
+    ]
+
+
+def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
+    assert variants_table(under_conditions("a"), METRICS[:2]) == [
+        ["a", "overall", "big"],
+        ["none", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["5 dead", "85.0 ± 10.0", "85.0 ± 10.0"],
     ]
 
 
@@ -121,3 +135,18 @@ def test_files_and_terminal_say_the_same(tmp_path):
     ]
     with Image.open(tmp_path / "study_edges.png") as picture:
         assert picture.size[0] > 500
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
+    numbers = {4: 0.9, 25: 0.97, 9: 0.95}
+    found = [
+        trial("any", "0", share, condition=f"grid {n}") if single else trial(f"grid {n}", "0", share)
+        for n, share in numbers.items()
+    ]
+    found += [trial("any" if single else "other", "0", 0.5, condition="other" if single else "")]
+    (axis,) = study_figure(replace(STUDY, axis="number of sensors"), found).axes
+    (line,) = axis.containers
+    assert line[0].get_xdata().tolist() == [4, 9, 25]
+    assert line[0].get_ydata().tolist() == pytest.approx([90, 95, 97])
+    assert (line.get_label(), axis.get_xlabel()) == ("grid", "number of sensors")

@@ -7,7 +7,8 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.labels import TOUCH_OR_NOT, movie_labels
+from skin.gesture_measures import movie_labels
+from skin.labels import TOUCH_OR_NOT
 from skin.layout.scattered import Scattered
 from skin.recording_file import read_recording, write_recording
 from skin.simulator.naive import Naive

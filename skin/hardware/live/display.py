@@ -1,6 +1,7 @@
 """State shared by the classifying loop and the views."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event, Lock
 
@@ -9,6 +10,9 @@ import numpy as np
 from skin.hardware.live.verdict import Verdict
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion
+
+Observer = Callable[[Verdict | None, str, bool], None]
+"""Takes the arguments of :meth:`Display.set_verdict`; it must return at once."""
 
 _KEPT = 8192  # frames that are kept for slow views
 
@@ -67,10 +71,12 @@ class Display:
         info: as given.
         closed: event, set at the end.
         tare: event, set by a view to request a new baseline; cleared by the live loop.
+        observers: called with each verdict, in the thread that classifies.
     """
 
     def __init__(self, info: DisplayInfo) -> None:
         self.info, self.closed, self.tare = info, Event(), Event()
+        self.observers: list[Observer] = []
         self._lock = Lock()
         sensors = len(info.positions)
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
@@ -94,6 +100,8 @@ class Display:
         with self._lock:
             self._verdict, self._trouble = verdict, trouble
             self._alarm = alarm if verdict is None else verdict.dangerous
+        for observer in self.observers:
+            observer(verdict, trouble, alarm)
 
     def set_status(self, line: str) -> None:
         """Set the text with rate, lost frames and latency."""

@@ -1,21 +1,21 @@
 """Classify a stream of frames, without input or output."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from pydantic import NonNegativeFloat, PositiveFloat
-from torch import Tensor
 
-from skin.evaluation.report import Predictor
 from skin.hardware.live.verdict import Debounce, DebounceSettings, Verdict
 from skin.labels import Task
-from skin.recording import Touches
 from skin.settings import checked
 from skin.signal.contact_detection import DRIFT, ContactDetector
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
 from skin.wire.conversion import UnitConversion
+
+Classify = Callable[[np.ndarray, np.ndarray], Sequence[float]]
+"""Readings (T, S), float32, N, and valid (T, S), bool, of a window -> the probability of each label."""
 
 
 @checked("detection")
@@ -47,11 +47,11 @@ class Engine:
     readings after the last idle readings; otherwise a constant load would look like an untouched skin.
 
     Args:
-        learner: trained.
-        task: its labels.
-        positions: (S, 3), m.
-        frames: T, frames of its window.
-        rate: of its training, Hz.
+        classify: gives the probabilities of a window.
+        task: the labels.
+        sensors: S.
+        frames: T, frames of a window.
+        rate: of the training, Hz.
         detection: settings of the contact detection.
         patience: settings of debouncing.
 
@@ -61,19 +61,19 @@ class Engine:
 
     def __init__(
         self,
-        learner: Predictor,
+        classify: Classify,
         task: Task,
-        positions: Tensor,
+        sensors: int,
         frames: int,
         rate: float,
         detection: Detection,
         patience: DebounceSettings | None = None,
     ) -> None:
-        self.window = Window(frames, rate, len(positions))
+        self.window = Window(frames, rate, sensors)
         self.task = task
-        self._learner, self._positions, self._detection = learner, positions, detection
+        self._classify, self._detection = classify, detection
         self._patience = patience or DebounceSettings()
-        self._contact = ContactDetector(len(positions), rate, detection.threshold, detection.drift)
+        self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift)
         self._held = min(max(1, round(detection.longest * rate)), max(1, frames - 2))
         self._above = 0.5 if self._patience.above is None else self._patience.above
         self._segment: int | None = None
@@ -171,7 +171,6 @@ class Engine:
         labels, since = labels if shown else {}, self._since(frame)
         return Verdict(frame.t, frame.t_host, chances, shown, labels, self.alarm, seen.gap, masked, since)
 
-    @torch.inference_mode()
     def _probabilities(self, readings: np.ndarray, valid: np.ndarray, lasted: float) -> dict[str, float]:
         """Return label -> probability of a window (T, S), N, at the end of a contact of ``lasted`` s."""
         if lasted * self.window.rate > self._held:
@@ -180,10 +179,7 @@ class Engine:
                 np.concatenate([idle[:before], now[-self._held :], idle[before + self._held :]])
                 for idle, now in zip(self._idle, (readings, valid), strict=True)
             )
-        known = torch.from_numpy(readings)[None], torch.from_numpy(valid)[None]
-        touches = Touches(*known, self._positions, None, self.window.rate)
-        answers = self._learner.probabilities(touches)[0].tolist()
-        return dict(zip(self.task.names, answers, strict=True))
+        return dict(zip(self.task.names, self._classify(readings, valid), strict=True))
 
     def _answers(self, chances: dict[str, float]) -> dict[str, bool]:
         """Return the predicted labels of this window: the likeliest one if they exclude each other."""

@@ -2,12 +2,19 @@
 
 from dataclasses import replace
 
+import numpy as np
+import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
+from skin import __version__
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.hardware.live.engine import Detection, Engine
+from skin.evaluation.report import Predictor
+from skin.exported.metadata import ModelMetadata
+from skin.hardware.live.engine import Classify, Detection, Engine
 from skin.hardware.live.verdict import DebounceSettings
+from skin.recording import Touches
 from skin.signal.contact_detection import DRIFT
 from skin.signal.contact_threshold import ContactThreshold, rise
 from skin.trained import Trained
@@ -36,26 +43,87 @@ def make_engine(
         if of.point.silent:
             raise InputError(f"{of.point.warning()}: give live.patience.above=0.5, or train another run")
         patience = replace(patience, above=of.point.threshold)
-    task = of.device.task
-    learned = touch is None and task.gate is not None
+    classify = window_classifier(of.learner, of.positions, of.rate)
+    return Engine(
+        classify,
+        of.device.task,
+        len(of.positions),
+        of.window,
+        of.rate,
+        _detection(of, touch, drift),
+        patience,
+    )
+
+
+def window_classifier(learner: Predictor, positions: Tensor, rate: float) -> Classify:
+    """Return a function of the readings and validity of one window that asks a learner.
+
+    Args:
+        learner: trained.
+        positions: (S, 3), m.
+        rate: Hz.
+    """
+
+    @torch.inference_mode()
+    def classify(readings: np.ndarray, valid: np.ndarray) -> list[float]:
+        known = torch.from_numpy(readings)[None], torch.from_numpy(valid)[None]
+        return learner.probabilities(Touches(*known, positions, None, rate))[0].tolist()
+
+    return classify
+
+
+def describe(of: Trained, run: str, title: str, touch: float | None = None) -> ModelMetadata:
+    """Return the description of a run for an exported file.
+
+    Args:
+        of: the run.
+        run: its id.
+        title: its name.
+        touch: as in :func:`make_engine`.
+
+    Raises:
+        InputError: as in :func:`make_engine`.
+    """
+    task, detection = of.device.task, _detection(of, touch)
+    return ModelMetadata(
+        run=run,
+        title=title,
+        version=__version__,
+        labels=list(task.names),
+        kind=task.kind,
+        gate=task.gate,
+        direction=task.direction,
+        rate=of.rate,
+        window=of.window,
+        positions=of.positions.tolist(),
+        size=of.device.size,
+        saturation=None if of.device.simulation is None else of.device.simulation.imperfection.clip,
+        threshold=None if of.point is None else of.point.threshold,
+        contact=detection.threshold,
+        learned=detection.learned,
+        longest=detection.longest,
+    )
+
+
+def _detection(of: Trained, touch: float | None, drift: float = 600 * DRIFT) -> Detection:
+    learned = touch is None and of.device.task.gate is not None
     least = _tuned(of.device, learned) if touch is None else touch
-    detection = Detection(least, drift / 600, learned, _longest(of))
-    return Engine(of.learner, task, of.positions, of.window, of.rate, detection, patience)
+    return Detection(least, drift / 600, learned, _longest(of))
 
 
 def _longest(of: Trained) -> float:
     """Return the longest touch that a run was trained on, s; two thirds of its window if unknown."""
-    if of.device.simulation is not None:
-        return of.device.simulation.sampler.settings.press[1]
+    if of.device.reference is not None:
+        return of.device.reference.sampler.settings.press[1]
     return of.window * 2 / 3 / of.rate
 
 
 def _tuned(device: AbstractDevice, learned: bool) -> float:
-    if device.simulation is None:
+    if device.reference is None:
         if learned:
             return _FAINT
         raise InputError("this run has no contact threshold: give live.touch=0.3 (N), or train on streams")
-    known = device.simulation.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches(
+    known = device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches(
         "validation"
     )
     assert known.labels is not None

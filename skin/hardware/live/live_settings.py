@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le
 
@@ -19,6 +19,8 @@ class LiveSettings:
         top: upper end of the colour scale, N.
         touch: contact threshold, N above the baseline; None: that of the run.
         drift: N in ten minutes that the baseline may follow without touch.
+        verdicts: where JSON lines go: ``stdout``, or a TCP port, 0: any free one; None: nowhere.
+        log: file to which alarms are appended; None: no log.
         patience: settings of debouncing.
     """
 
@@ -26,6 +28,8 @@ class LiveSettings:
     top: Annotated[float, Gt(0)]
     touch: Annotated[float, Gt(0)] | None
     drift: Annotated[float, Ge(0)]
+    verdicts: Literal["stdout"] | Annotated[int, Ge(0), Le(65535)] | None
+    log: str | None
     patience: DebounceSettings
 
     @classmethod

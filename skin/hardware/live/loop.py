@@ -19,7 +19,7 @@ _DELAYS = 2000  # verdicts for the percentile of the delay
 
 
 class LiveLoop:
-    """Classifies the frames of a skin until the recording ends, the time is over, or Ctrl-C.
+    """Classifies the frames of a skin until the recording ends, the time is over, a view closes, or Ctrl-C.
 
     Frames that arrive during a classification are added to the window without classifying each, so the
     verdict is always about the latest frame.
@@ -50,7 +50,7 @@ class LiveLoop:
             InputError: nothing can be read, the stream is too slow, or its scale is unknown.
         """
         until = np.inf if seconds is None else monotonic() + seconds
-        while monotonic() < until:
+        while monotonic() < until and not self._display.closed.is_set():
             try:
                 frames = self._skin.read(1, _PATIENCE)
             except SkinTimeout as silent:

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay
 
+from skin.representation._interpolation import weights
 from skin.representation._pixels import centres
-from skin.representation.interp import weights
 
 _FEWEST = 3
 _INWARDS = 1e-6

@@ -6,6 +6,7 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.live.engine import Detection, Engine
+from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.verdict import Debounce, DebounceSettings
 from skin.labels import TOUCH, Task
 from skin.recording import Touches
@@ -35,9 +36,11 @@ def frame(t, values, segment=0, valid=None, **more):
 
 def engine(window=5, rate=10.0, sensors=4, task=TOUCH, threshold=0.5, longest=2.0, **patience):
     detection = Detection(threshold, learned=task.gate is not None, longest=longest)
-    return Engine(
-        Loud(), task, torch.zeros(sensors, 3), window, rate, detection, DebounceSettings(**patience)
-    )
+    loud = Loud()
+    classify = window_classifier(loud, torch.zeros(sensors, 3), rate)
+    subject = Engine(classify, task, sensors, window, rate, detection, DebounceSettings(**patience))
+    subject.loud = loud
+    return subject
 
 
 def play(engine, values, rate=100.0, start=0.0, segment=0):
@@ -114,10 +117,10 @@ def test_words_carry_the_probability_of_what_is_said():
 def test_frames_that_waited_slide_through_unasked():
     subject = engine()
     play(subject, np.zeros((100, 4)))
-    asked = subject._learner.asked
+    asked = subject.loud.asked
     for number in range(20):
         subject.add(frame(1 + number / 100, [5.0] * 4))
-    assert subject._learner.asked == asked
+    assert subject.loud.asked == asked
     verdict = subject.push(frame(1.2, [0.0] * 4), PLAIN)
     assert verdict.chances["dangerous"] == 1
 
@@ -149,7 +152,7 @@ def test_an_alarm_outlives_a_restart_of_the_device_until_the_contact_ends():
 def test_an_answer_that_is_no_number_raises_the_alarm():
     subject = engine()
     play(subject, np.zeros((60, 4)))
-    subject._learner.probabilities = lambda touches: torch.full((1, 4), torch.nan)
+    subject.loud.probabilities = lambda touches: torch.full((1, 4), torch.nan)
     assert not play(subject, np.zeros((10, 4)), start=0.6)[-1].dangerous
     assert play(subject, np.full((10, 4), 1.0), start=0.7)[-1].dangerous
 
@@ -158,7 +161,7 @@ def test_an_alarm_stays_while_the_model_changes_its_mind():
     subject = engine()
     play(subject, np.zeros((60, 4)))
     play(subject, np.full((10, 4), 5.0), start=0.6)
-    subject._learner.probabilities = lambda touches: torch.zeros(1, 4)
+    subject.loud.probabilities = lambda touches: torch.zeros(1, 4)
     held = play(subject, np.full((500, 4), 1.0), start=0.7)
     assert all(verdict.dangerous for verdict in held)
     assert held[-1].contact == pytest.approx(5.1, abs=0.15)

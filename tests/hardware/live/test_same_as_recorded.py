@@ -12,6 +12,7 @@ from skin.build import build_data, build_device, build_learner
 from skin.device.serial import Serial
 from skin.hardware.live.display import Display, DisplayInfo
 from skin.hardware.live.engine import Detection, Engine
+from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.loop import LiveLoop
 from skin.hardware.record.recorder import convert_session, record_session
 from skin.labels import TOUCH
@@ -114,7 +115,9 @@ def watched(learner, device):
     skin, _ = device.open()
     positions = torch.from_numpy(device.sensors.positions).float()
     asked, found = Asked(learner), {}
-    engine = Engine(asked, TOUCH, positions, 30, 10.0, Detection(0.3))
+    engine = Engine(
+        window_classifier(asked, positions, 10.0), TOUCH, len(positions), 30, 10.0, Detection(0.3)
+    )
     info = DisplayInfo("rules", str(device.port), positions.numpy(), device.size, 4.0)
     return skin, engine, asked, info, found
 

@@ -1,0 +1,72 @@
+"""The figure of a study."""
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import cycle
+
+from matplotlib.figure import Figure
+
+from experiments.studies.outcomes import UNITS, group_trials, heading, mean_and_error
+from experiments.studies.study import Study
+from experiments.studies.trials import Trial
+from skin.plot.figures import COLOURS
+
+_NUMBERED = re.compile(r"(.+) (\d+)")
+_MARKERS = "osD^v<>pP*"
+
+
+def study_figure(study: Study, trials: Sequence[Trial]) -> Figure:
+    """Draw the first metric: lines over the numbers in the names if the study has an axis, else strips."""
+    return _lines(study, trials, study.axis) if study.axis else _strips(study, trials)
+
+
+def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
+    """Draw every trial of each variant and condition, the mean, and two standard errors."""
+    metric, found = study.metrics[0], group_trials(trials)
+    drawn = Figure(figsize=(7, 1.2 + 0.3 * len(found)), layout="constrained")
+    axis = drawn.subplots()
+    scale = 1 if metric in UNITS else 100
+    for place, each in enumerate(found.values()):
+        if every := [scale * one.metrics[metric] for one in each if metric in one.metrics]:
+            mean, error = mean_and_error(each, metric)
+            axis.plot(every, [place] * len(every), "o", color=COLOURS[0], alpha=0.35, ms=4)
+            axis.errorbar(mean, place, xerr=2 * error, fmt="|", color="black", ms=10, capsize=3)
+    axis.set_yticks(range(len(found)), [", ".join(filter(None, key)) for key in found], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel(f"{_label(metric)}: each run, mean and two standard errors")
+    axis.set_title(study.about, fontsize=10)
+    return drawn
+
+
+def _lines(study: Study, trials: Sequence[Trial], label: str) -> Figure:
+    """Draw the mean and two standard errors over the number at the end of a variant's or condition's name."""
+    metric, found = study.metrics[0], group_trials(trials)
+    single = len({variant for variant, _ in found}) == 1
+    lines: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
+    for (variant, condition), each in found.items():
+        numbered = _NUMBERED.fullmatch(condition if single else variant)
+        if numbered and any(metric in one.metrics for one in each):
+            name = numbered[1] if single else ", ".join(filter(None, (numbered[1], condition)))
+            lines[name].append((int(numbered[2]), *mean_and_error(each, metric)))
+    drawn = Figure(figsize=(7, 4.5), layout="constrained")
+    axis = drawn.subplots()
+    for (name, points), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(_MARKERS)):
+        x, y, error = zip(*sorted(points), strict=True)
+        widths = [2 * one for one in error]
+        axis.errorbar(x, y, yerr=widths, label=name, color=colour, marker=marker, ms=4, capsize=2, lw=1.2)
+    numbers = sorted({x for points in lines.values() for x, *_ in points})
+    axis.set_xscale("log")
+    axis.set_xticks(numbers, [str(x) for x in numbers])
+    axis.set_xticks([], minor=True)
+    axis.set_xlabel(label)
+    axis.set_ylabel(f"{_label(metric)}: mean and two standard errors")
+    axis.set_title(study.about, fontsize=9, wrap=True)
+    axis.legend(fontsize=8)
+    axis.grid(alpha=0.3)
+    return drawn
+
+
+def _label(metric: str) -> str:
+    unit = UNITS.get(metric, "%")
+    return f"{heading(metric)}{f', {unit}' if unit else ''}"

@@ -1,0 +1,23 @@
+"""Adapt a finished run of a network to a skin with few labelled gestures.
+
+    skin adapt run=latest device=recording device.path=session.parquet
+    skin adapt run=latest device.seed=7 profile=rough adapt.gestures=48
+
+The gestures are recorded (skin record) or simulated. body= and layout= describe the skin if it is not that of
+the run. Logs a new run, which keeps the weights if fine-tuning is not better on held-out gestures.
+"""
+
+from omegaconf import DictConfig
+
+from skin.command import command
+from skin.config import overrides
+
+
+@command("adapt")
+def main(config: DictConfig) -> None:
+    """Fine-tune a run, log the result, and print the figures before and after."""
+    from skin.adaptation import adapt
+    from skin.console import quiet
+
+    quiet()
+    adapt(config, overrides())

@@ -1,0 +1,74 @@
+"""Write the network of a finished run, from readings to probabilities, as one ONNX file.
+
+    skin export run=latest out=skin.onnx
+    skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
+
+The file is compared with the run on simulated or recorded touches first.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from annotated_types import Ge, Gt
+from omegaconf import DictConfig
+
+from skin.command import command
+from skin.config import plain
+from skin.errors import InputError
+from skin.files import results
+
+if TYPE_CHECKING:
+    from skin.recording import Touches
+    from skin.trained import Trained
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """Settings under ``export:`` (``conf/export.yaml``).
+
+    Attributes:
+        touch: contact threshold, N above the baseline; None: that of the run.
+        touches: number of touches on which the file is compared with the run.
+    """
+
+    touch: Annotated[float, Gt(0)] | None
+    touches: Annotated[int, Ge(1)]
+
+
+@command("export")
+def main(config: DictConfig) -> None:
+    """Restore a finished run, write its network, and print the path."""
+    from skin.settings import configured
+
+    settings = configured(ExportSettings, plain(config)["export"], "export")
+    path = None if config.out is None else Path(config.out).expanduser()
+    if path is not None and path.suffix != ".onnx":
+        raise InputError(f"out={config.out} must end in .onnx: as in out=skin.onnx")
+
+    from skin.console import quiet
+    from skin.exported.writer import write_model
+    from skin.hardware.live.engine_builder import describe
+    from skin.stored_run import apply_overrides, find_run, load_configuration
+    from skin.tracking import Store
+    from skin.trained import load_trained
+
+    quiet()
+    store = Store.open(config.tracking)
+    run = find_run(store, config.run)
+    stored = load_configuration(store, run, config.trust)
+    of = load_trained(store, run, apply_overrides(stored, config, []), stored)
+    module = of.learner.pipeline(of.positions)  # refused before anything is simulated
+    described = describe(of, run.info.run_id, str(run.info.run_name), settings.touch)
+    path = path or results(None) / f"{str(run.info.run_name).split()[0]}_{run.info.run_id[:8]}.onnx"
+    touches = _touches(of, settings.touches)
+    difference = write_model(module, described, touches, path)
+    print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
+
+
+def _touches(of: "Trained", count: int) -> "Touches":
+    """Return at most ``count`` touches; a run on a recording has those of its own only."""
+    if (simulation := of.device.simulation) is None:
+        return of.device.touches("test")[:count]
+    # A tenth of the gestures is the validation split.
+    return simulation.replace(gestures=10 * max(10, count)).touches("validation")[:count]

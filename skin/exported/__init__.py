@@ -1,0 +1,1 @@
+"""Trained networks as ONNX files, which need neither torch nor the run."""

@@ -1,0 +1,156 @@
+"""Verdicts as JSON lines, on standard output or to the clients of a TCP port."""
+
+import json
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from queue import Empty, Full, Queue
+from threading import Event, Lock, Thread
+from time import monotonic
+from typing import Literal
+
+from skin.errors import InputError
+from skin.hardware.live.display import Display
+from skin.hardware.live.verdict import Verdict
+from skin.hardware.live.verdict_message import verdict_message
+
+HEARTBEAT = 0.5  # s without a line after which the state is repeated
+_WAITING = 256  # lines for a slow reader; then the oldest is dropped
+_PATIENCE = 5.0  # s after which a client that reads nothing is left
+_TURN = 0.2  # s
+_HOST = "127.0.0.1"
+
+Lines = Queue[bytes | None]
+
+
+class VerdictStream:
+    """Numbers messages and hands them to readers, none of which can delay the classification.
+
+    Each verdict is a line. Without verdicts, a line is sent when the reason changes and every ``HEARTBEAT``
+    seconds, with ``stale`` true.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._number, self._readers = Lock(), 0, list[Lines]()
+        self._state: tuple[Verdict | None, str, bool] = None, "waiting for the first frame", False
+        self._sent = self._seen = monotonic()
+
+    def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
+        """Send a verdict, or a new reason for its absence."""
+        with self._lock:
+            known, self._state = self._state, (verdict, reason, alarm)
+            self._seen = monotonic()
+            if verdict is not None or known != self._state:
+                self._send("verdict" if verdict is not None else "change")
+
+    def beat(self) -> None:
+        """Repeat the state if nothing was sent for a while; a verdict of that age is stale."""
+        with self._lock:
+            if monotonic() - self._sent < HEARTBEAT:
+                return
+            verdict, reason, alarm = self._state
+            if verdict is not None and monotonic() - self._seen >= HEARTBEAT:
+                self._state = None, "no frames", verdict.dangerous
+            elif verdict is None:
+                self._state = None, reason, alarm
+            self._send("heartbeat")
+
+    def _send(self, event: str) -> None:
+        self._number, self._sent = self._number + 1, monotonic()
+        message = {"number": self._number, "event": event, **verdict_message(*self._state)}
+        line = (json.dumps(message) + "\n").encode()
+        for lines in self._readers:
+            try:
+                lines.put_nowait(line)
+            except Full:
+                with suppress(Empty):
+                    lines.get_nowait()
+                lines.put_nowait(line)
+
+    def join(self, write: Callable[[bytes], object], left: Callable[[], object]) -> Thread:
+        """Write the lines from now on in a thread; call ``left`` when they cannot be written any more."""
+        lines: Lines = Queue(_WAITING)
+
+        def run() -> None:
+            with suppress(OSError, ValueError):  # the reader is gone, or its file is closed
+                while (line := lines.get()) is not None:
+                    write(line)
+            with self._lock:
+                self._readers.remove(lines)
+            left()
+
+        thread = Thread(target=run, name="skin-verdicts", daemon=True)
+        with self._lock:
+            self._readers.append(lines)
+        thread.start()
+        return thread
+
+    def close(self) -> None:
+        """End every thread."""
+        with self._lock:
+            for lines in self._readers:
+                with suppress(Full, Empty):
+                    if lines.full():
+                        lines.get_nowait()
+                    lines.put_nowait(None)
+
+
+@contextmanager
+def stream_verdicts(display: Display, where: Literal["stdout"] | int) -> Iterator[str]:
+    """Send the verdicts of a display while the block runs; yield where to.
+
+    Args:
+        display: its ``closed`` is set when standard output is closed.
+        where: ``stdout``, or a TCP port of this machine, 0: any free one.
+
+    Raises:
+        InputError: the port is in use or not allowed.
+    """
+    stream, over = VerdictStream(), Event()
+    display.observers.append(stream.observe)
+    beats = Thread(target=_beat, args=(stream, over), name="skin-heartbeat", daemon=True)
+    beats.start()
+    try:
+        if where == "stdout":
+            thread = stream.join(_print, display.closed.set)
+            yield "standard output"
+            stream.close()
+            thread.join(1)
+        else:
+            with _server(where) as listening:
+                clients = Thread(
+                    target=_accept, args=(listening, stream, over), name="skin-clients", daemon=True
+                )
+                clients.start()
+                yield "tcp://{}:{}".format(*listening.getsockname())
+    finally:
+        over.set()
+        stream.close()
+
+
+def _print(line: bytes) -> None:
+    sys.stdout.buffer.write(line)
+    sys.stdout.buffer.flush()
+
+
+def _beat(stream: VerdictStream, over: Event) -> None:
+    while not over.wait(HEARTBEAT / 5):
+        stream.beat()
+
+
+def _server(port: int) -> socket.socket:
+    try:
+        return socket.create_server((_HOST, port))
+    except (OSError, OverflowError) as error:
+        raise InputError(f"no verdicts on port {port}: {error}; give live.verdicts=0, or another") from error
+
+
+def _accept(listening: socket.socket, stream: VerdictStream, over: Event) -> None:
+    listening.settimeout(_TURN)
+    with suppress(OSError):  # closed at the end
+        while not over.is_set():
+            with suppress(TimeoutError):
+                client, _ = listening.accept()
+                client.settimeout(_PATIENCE)
+                stream.join(client.sendall, client.close)

@@ -1,0 +1,141 @@
+"""The card of a pretrained model: what it is, how it was trained and measured, and what it is not for."""
+
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from skin.evaluation.metrics_table import format_number
+from skin.evaluation.operating_point import parse_operating_point
+from skin.evaluation.report import SHARES
+
+_SHARES = (*SHARES, "/balanced_accuracy", "/ece")  # in per cent
+_COLUMNS = (
+    "Per cent; degrees for a direction. `same`: test gestures on the device of the training. `holdout`: a "
+    "tenth of the training gestures, used for nothing else. `device_shift`: test gestures on unseen devices. "
+    "`unseen_layout`: test gestures on unseen layouts of the sensors. `accuracy` and `balanced_accuracy` are "
+    "at a probability of 0.5, `alarm_recall` and `false_alarm_rate` at the threshold of the alarm. `ece` is "
+    "the expected calibration error."
+)
+_NETWORK = ("representation", "model", "fusion")
+_LIMITS = (
+    "Do not use it to protect people, animals or property. Nothing here is a safety function.",
+    "Do not use it on a real skin before you have calibrated that skin and evaluated the model on touches "
+    "recorded with it.",
+    "Do not use it where the conditions differ from those above: its accuracy and its false-alarm rate are "
+    "unknown there.",
+    "Do not take “not dangerous” for “safe”: the alarm misses touches at the rate that the table shows.",
+)
+_EQUATION10 = (
+    "Do not use it with other mechanics than equation 10 of the report, such as those of a real skin."
+)
+_OVER_SENSORS = "Do not use it for touches between the sensors: each touch of its test presses a sensor."
+
+
+def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+    """Return the card of a model in Markdown.
+
+    Args:
+        name: of the model.
+        record: content of ``run.json`` (:mod:`skin.pretrained`).
+        config: configuration of the run, in plain containers.
+    """
+    parts = [
+        f"# {name}\n\nWritten by `skin publish`; do not edit. Use it as `run={name}`.",
+        _table("Model", _model(record, config)),
+        _table("Training", _training(record, config)),
+        _table("Conditions", _conditions(config), "Lengths in m, forces in N, pressures in Pa, times in s."),
+        _metrics(record["metrics"]),
+        *(f"{key.removeprefix('cannot_')}: {why}" for key, why in _cannot(record["tags"])),
+        _check(record["check"]),
+        "## Not for\n\n" + "\n".join(f"- {line}" for line in _limits(config)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _model(record: Mapping[str, Any], config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "licence of weights, configuration and card", record["licence"]
+    yield "parameters", f"{record['metrics']['parameters']:.0f}"
+    for group in (*(_NETWORK if "model" in config["learner"] else ()), "learner"):
+        yield group, _settings(config[group], "model", "fusion", "optimizer", "trainer", "members")
+    point = parse_operating_point(record["tags"]["operating_point"])
+    if point is not None:
+        yield "alarm", point.sentence()
+
+
+def _training(record: Mapping[str, Any], config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    tags, day = record["tags"], datetime.fromtimestamp(record["start_time"] / 1000, UTC)
+    dirty = {"true": ", with uncommitted changes", "false": ""}.get(tags["source_dirty"], ", changes unknown")
+    yield "row, seed", f"`{tags['row']}`, {tags['seed']}"
+    yield "commit", f"{tags['source_commit']}{dirty}"
+    yield "run, fingerprint", f"{record['run']}, {tags['fingerprint']}"
+    yield "date, processor", f"{day:%Y-%m-%d}, {tags['processor']}"
+    yield "data", _settings(config["data"])
+    yield "hash of the first training touches", tags["data_hash"]
+    for group in ("optimizer", "trainer") if "model" in config["learner"] else ():
+        yield group, _settings(config[group])
+
+
+def _conditions(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for group in ("body", "layout"):
+        if group in config:
+            yield group, _settings(config[group])
+    device = config["device"]
+    for part in ("simulator", "contact"):
+        if part in device:
+            yield part, _settings(device[part])
+    yield "device", _settings(device, "simulator", "contact", "touch", *config["data"])
+    if "touch" in config:
+        yield "touch", _settings(config["touch"])
+
+
+def _settings(group: Mapping[str, Any], *without: str) -> str:
+    """Return the class of a group, if it has one, and its settings; nested ones as ``outer.inner``."""
+    kept = {key: value for key, value in group.items() if key not in without}
+    name = [f"`{kept['_target_']}`"] if "_target_" in kept else []
+    return " ".join([*name, ", ".join(_flat(kept))]).strip()
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, one in value.items():
+        if isinstance(one, Mapping):
+            yield from _flat(one, f"{prefix}{key}.")
+        elif not key.startswith("_") and one is not None:
+            yield f"{prefix}{key}={str(one).replace('|', '/')}"
+
+
+def _table(title: str, rows: Iterator[tuple[str, str]], about: str = "") -> str:
+    lines = "\n".join(f"| {key} | {value} |" for key, value in rows)
+    return "\n\n".join(part for part in (f"## {title}", about, f"| | |\n|---|---|\n{lines}") if part)
+
+
+def _metrics(values: Mapping[str, float]) -> str:
+    """Return every metric of the evaluation, one column per set of touches."""
+    measured = [name for name in values if name.count("/") == 2]
+    columns = list(dict.fromkeys(name.split("/")[0] for name in measured))
+    lines = [f"## Metrics\n\n{_COLUMNS}\n\n| | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+    for row in dict.fromkeys(name.split("/", 1)[1] for name in measured):
+        unit = 100 if row.endswith(_SHARES) else 1
+        cells = (format_number(values.get(f"{column}/{row}"), unit) for column in columns)
+        lines.append(f"| {row} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cannot(tags: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    yield from ((key, why) for key, why in sorted(tags.items()) if key.startswith("cannot_"))
+
+
+def _check(check: Mapping[str, Any]) -> str:
+    counts = ", ".join(f"{label} {count}" for label, count in check["correct"].items())
+    return (
+        f"## Check\n\nOf the first {check['touches']} test gestures (`same`) the number that the model "
+        f"classified correctly: {counts}. `run.json` has each prediction. On another processor at most "
+        f"{check['tolerance']} gestures may be classified differently."
+    )
+
+
+def _limits(config: Mapping[str, Any]) -> Iterator[str]:
+    yield from _LIMITS
+    if config["device"].get("simulator", {}).get("reading") == "equation10":
+        yield _EQUATION10
+    if config.get("touch", {}).get("over_sensors"):
+        yield _OVER_SENSORS

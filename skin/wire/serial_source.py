@@ -1,0 +1,95 @@
+"""Frames from a serial port or socket, with their tare and their conversion to newtons."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from skin.errors import InputError
+from skin.signal.calibration import Calibration, read_calibration
+from skin.wire.announcement import AnnouncementListener
+from skin.wire.conversion import UnitConversion, unit_conversion
+from skin.wire.format_detection import Format
+from skin.wire.open import PortSettings, open_skin
+from skin.wire.skin import Skin
+from skin.wire.source import Source
+from skin.wire.tare import Tare
+from skin.wire.text import Header
+from skin.wire.transport import open_stream
+
+_AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
+
+
+@dataclass(kw_only=True, frozen=True)
+class SerialSource:
+    """A skin at a port. torch is not imported.
+
+    Attributes:
+        sensors: S.
+        rate: of the model, Hz.
+        port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
+        tare: duration of the tare, s.
+        scale: N per unit.
+        calibration: calibration file.
+
+    Raises:
+        InputError: an invalid setting, or a calibration of another number of sensors.
+    """
+
+    sensors: int
+    rate: float
+    port: str | None = None
+    baudrate: int = 115200
+    format: Format = "auto"
+    tare: float = 2.0
+    scale: float | None = None
+    calibration: str | None = None
+    limits: Sequence[float | None] | None = None
+    timeout: float = 10.0
+    backoff: Sequence[float] = (1.0, 10.0)
+    silence: float | None = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.tare >= 0:
+            raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")
+        if self.scale is not None and not self.scale > 0:
+            raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
+        PortSettings(**self._settings)  # checks them
+        if self._known is not None:
+            self._known.fits(self.sensors)
+
+    @property
+    def _settings(self) -> dict[str, Any]:
+        limits = None if self.limits is None else tuple(self.limits)
+        return {name: getattr(self, name) for name in _AS_OPENED} | {"limits": limits}
+
+    @cached_property
+    def _known(self) -> Calibration | None:
+        return None if self.calibration is None else read_calibration(self.calibration)
+
+    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
+        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
+        if self.port is None:
+            raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
+        listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
+        sensors = range(self.sensors)
+        return open_skin(self.port, sensors, opener=listener, reconnect=reconnect, **self._settings), listener
+
+    def source(self) -> Source:
+        """Open the port as a stream of frames; wait for an unplugged skin."""
+        skin, _ = self.open(reconnect=True)
+        return Source(str(self.port), skin, self.taring(skin))
+
+    def taring(self, skin: Skin) -> Tare:
+        """Return the tare of an open skin."""
+        return Tare(self.conversion, self.tare, self.rate, lambda: skin.header)
+
+    def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
+        """Return the conversion of values to N, given a baseline (S,) and the header of the device.
+
+        Raises:
+            InputError: the scale is unknown.
+        """
+        return unit_conversion(self.sensors, baseline, self.scale, self._known, header)

@@ -1,0 +1,201 @@
+"""`skin adapt` makes a run of another skin from few gestures, which all commands take."""
+
+import sqlite3
+from contextlib import closing, contextmanager
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
+
+from skin.recording_file import read_recording, write_recording
+
+SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
+NETWORK = ["representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual"]
+SMALL = [
+    "evaluation.devices=0",
+    "evaluation.layouts=0",
+    "evaluation.safe_gestures=64",
+]
+TEST = "device.test_gestures=160"
+QUICK = ["adapt.layers=[all]", "adapt.lr=[0.001]", "adapt.epochs=12", *SMALL]
+OTHER = ["device.gain_spread=0.3", "device.time_constant=0.4", "device.seed=3"]
+
+
+@pytest.fixture(scope="module")
+def folder(run, tmp_path_factory):
+    """A folder with a finished run of a network."""
+    folder = tmp_path_factory.mktemp("runs")
+    quick = ["data.gestures=480", "trainer.max_epochs=15", "optimizer.lr=0.003", "fusion.hidden=16"]
+    done = run(folder, "train", *NETWORK, *SKIN, *SMALL, TEST, *quick)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def session(run, folder):
+    """Gestures of a skin with other gains and a lag."""
+    done = run(folder, "generate", *SKIN, *OTHER, "n=60", "seed=5", "out=session.parquet", store=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "session.parquet"
+
+
+def query(folder, statement, *values):
+    with closing(sqlite3.connect(folder / "m.db")) as database:
+        return database.execute(statement, values).fetchall()
+
+
+def runs(folder):
+    """Return the ids of the finished runs, oldest first."""
+    found = query(folder, "select run_uuid from runs where status='FINISHED' order by start_time")
+    return [identity for (identity,) in found]
+
+
+def metrics(folder, run):
+    return dict(query(folder, "select key, value from latest_metrics where run_uuid=?", run))
+
+
+def tags(folder, run):
+    return dict(query(folder, "select key, value from tags where run_uuid=?", run))
+
+
+@pytest.fixture(scope="module")
+def adapted(run, folder):
+    """The run to adapt, the run that was made of it with simulated gestures, and what the command printed."""
+    parent = runs(folder)[-1]
+    done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", TEST, *QUICK)
+    assert done.returncode == 0, done.stderr
+    return parent, runs(folder)[-1], done.stdout
+
+
+@pytest.mark.slow
+def test_a_simulated_skin_is_adapted_to(folder, adapted):
+    parent, made, said = adapted
+    found, about = metrics(folder, made), tags(folder, made)
+    assert (about["adapted"], about["row"]) == (parent, "custom_adapted")
+    assert "device.gain_spread=0.3" in about["target"]
+    assert about["chosen"].startswith("layers=all lr=0.001 epochs=")
+    assert found["validation/overall/accuracy"] >= found["validation_before/overall/accuracy"]
+    assert found["same/overall/accuracy"] > found["before/overall/accuracy"]
+    assert f"{100 * found['same/overall/accuracy']:.1f}" in said
+    assert "fine-tuned: layers=all lr=0.001" in said
+
+
+@pytest.mark.slow
+def test_the_new_run_is_evaluated_on_its_skin_with_its_weights(run, folder, adapted):
+    _, made, _ = adapted
+    done = run(folder, "evaluate", f"run={made}")
+    assert done.returncode == 0, done.stderr
+    name = "same/overall/accuracy"
+    assert metrics(folder, runs(folder)[-1])[name] == pytest.approx(metrics(folder, made)[name], abs=1e-6)
+
+
+@pytest.mark.slow
+def test_the_new_run_is_shown_live(run, folder, adapted):
+    done = run(folder, "live", f"run={adapted[1]}", "live.touch=0.3", "seconds=2")
+    assert done.returncode == 0, done.stderr
+    assert "verdicts" in done.stderr
+
+
+@pytest.mark.slow
+def test_the_same_adaptation_is_not_repeated(run, folder, adapted):
+    parent, made, _ = adapted
+    before = runs(folder)
+    done = run(folder, "adapt", f"run={parent}", *OTHER, "adapt.gestures=48", TEST, *QUICK)
+    assert f"run {made} did this before" in done.stdout
+    assert runs(folder) == before
+
+
+@pytest.mark.slow
+def test_a_recording_is_adapted_to_and_the_rest_of_it_is_reported(run, folder, session, adapted):
+    recorded = ["device=recording", f"device.path={session}"]
+    done = run(folder, "adapt", f"run={adapted[0]}", *recorded, "adapt.gestures=48", *QUICK)
+    assert done.returncode == 0, done.stderr
+    made = runs(folder)[-1]
+    assert "same/overall/accuracy" in metrics(folder, made)
+    whole = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
+    assert whole.returncode == 0, whole.stderr
+    assert "same/overall/accuracy" not in metrics(folder, runs(folder)[-1])
+    assert "validation/overall/accuracy" in metrics(folder, runs(folder)[-1])
+    # The skin of the new run is simulated, so that it does not need the file.
+    again = run(folder, "evaluate", f"run={made}", TEST)
+    assert again.returncode == 0, again.stderr
+
+
+@pytest.mark.slow
+def test_what_is_not_better_keeps_the_weights(run, folder, adapted):
+    parent = adapted[0]
+    line = ["adapt.gestures=16", "adapt.lr=[1000]", "adapt.layers=[all]", "adapt.epochs=2", TEST, *SMALL]
+    done = run(folder, "adapt", f"run={parent}", *OTHER, *line)
+    assert done.returncode == 0, done.stderr
+    assert f"the new run keeps the weights of run {parent}" in " ".join(done.stdout.split())
+    found = metrics(folder, runs(folder)[-1])
+    assert found["same/overall/accuracy"] == found["before/overall/accuracy"]
+    assert found["validation/overall/accuracy"] == found["validation_before/overall/accuracy"]
+
+
+@pytest.fixture(scope="module")
+def bad(run, folder, session):
+    """A run of rules, and recordings without labels and with few gestures."""
+    done = run(folder, "train", "experiment=rules", *SKIN, *SMALL, TEST, "data.gestures=80")
+    assert done.returncode == 0, done.stderr
+    known = read_recording(session)
+    unknown = replace(known, touches=replace(known.touches, labels=None))
+    return {
+        "rules": runs(folder)[-1],
+        "unlabelled": write_recording(unknown, folder / "unlabelled.parquet"),
+        "few": write_recording(known[:6], folder / "few.parquet"),
+        "enough": session,
+    }
+
+
+@pytest.mark.parametrize(
+    ("row", "given", "reason"),
+    [
+        ("rules", [], "Rules has no network to fine-tune"),
+        (None, ["device=recording", "device.path={unlabelled}"], "record them with labels"),
+        (None, ["device=recording", "device.path={few}"], "6 gestures are too few"),
+        (None, ["adapt.gestures=7"], "adapt.gestures=7 must be greater than or equal to 8"),
+        (None, ["device=recording", "device.path={enough}", "adapt.gestures=61"], "use adapt.gestures=60"),
+        (None, ["adapt.rate=1"], "rate"),
+        (None, ["learner.dropout=0.5"], "learner.dropout was fixed when the run was trained"),
+    ],
+)
+@pytest.mark.slow
+def test_bad_input_ends_with_2_and_one_sentence(run, folder, adapted, bad, row, given, reason):
+    before = query(folder, "select count(*) from runs")
+    words = [one.format(**bad) for one in given]
+    done = run(folder, "adapt", f"run={bad['rules'] if row else adapted[0]}", *words, *SMALL)
+    assert (done.returncode, reason in done.stderr) == (2, True), done.stderr
+    assert "Traceback" not in done.stderr
+    assert query(folder, "select count(*) from runs") == before
+
+
+@contextmanager
+def emulated(begin, folder, seed):
+    """Run an emulator of a skin whose gains and positions nobody knows; give the settings of its port."""
+    hidden = [*OTHER, "device.position_error=0.005", "emulate.speed=10", f"emulate.seed={seed}"]
+    with begin(folder, "emulate", *SKIN, *hidden) as process:
+        port = next(process.lines())
+        yield [f"device.port={port}", "device.scale=0.0390625", "device.labels=announced"]
+
+
+@pytest.mark.slow
+def test_gestures_recorded_at_a_port_make_the_run_better_on_others(run, begin, folder, adapted):
+    for name, seed, count in (("few", 0, 48), ("others", 1, 96)):
+        with emulated(begin, folder, seed) as port:
+            done = run(
+                folder, "record", *SKIN, *port, f"out={name}.csv", f"device.gestures={count}", store=False
+            )
+        assert done.returncode == 0, done.stderr
+        assert f"{count} gestures" in done.stdout
+    recorded = ["device=recording", "device.path=few.parquet", "adapt.gestures=48"]
+    done = run(folder, "adapt", f"run={adapted[0]}", *recorded, *QUICK)
+    assert done.returncode == 0, done.stderr
+    made, accuracies = runs(folder)[-1], []
+    for one in (adapted[0], made):
+        others = ["device=recording", "device.path=others.parquet", "device.test=all"]
+        done = run(folder, "evaluate", f"run={one}", *others)
+        assert done.returncode == 0, done.stderr
+        accuracies.append(metrics(folder, runs(folder)[-1])["same/overall/accuracy"])
+    assert accuracies[1] > accuracies[0] + 0.02

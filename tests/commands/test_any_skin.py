@@ -1,0 +1,76 @@
+"""A run of drawn skins is used on a skin of its own: simulated, recorded, and at a port."""
+
+import re
+from contextlib import ExitStack
+from time import monotonic, sleep
+
+import pytest
+
+from tests.commands.test_evaluate import metrics
+
+TRAINED = [
+    "experiment=any_skin", "simulator=solid", "device.count=3", "device.test_skins=2",
+    "device.skins.length=[0.08,0.12]", "device.skins.cell=0.01", "device.skins.sensors=[4,16]",
+    "device.skins.divisions=1", "data.gestures=300", "device.test_gestures=64", "trainer.max_epochs=1",
+]  # fmt: skip
+NINE = "x_m,y_m\n" + "".join(f"{x / 100},{y / 100}\n" for y in (3, 8, 13) for x in (2, 7, 14))
+OWN = ["simulator=solid", "simulator.divisions=1", "layout=file", "layout.path=nine.csv"]
+
+
+@pytest.fixture(scope="module")
+def folder(run, tmp_path_factory):
+    """A folder with a run of drawn skins and a layout of nine sensors."""
+    folder = tmp_path_factory.mktemp("any")
+    (folder / "nine.csv").write_text(NINE)
+    done = run(folder, "train", *TRAINED)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+def test_it_is_evaluated_on_a_layout_from_a_file_and_says_what_is_new_to_it(run, folder):
+    done = run(folder, "evaluate", "device=simulated", "device.test_gestures=200", *OWN)
+    assert done.returncode == 0, done.stderr
+    assert "200 gestures" in next(folder.glob("results/evaluation_simulated_*.md")).read_text()
+    assert re.search(r"longer side 0\.16 m \(0\.08 to 0\.12 m\)", " ".join(done.stderr.split()))
+
+
+@pytest.mark.slow
+def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
+    done = run(folder, "generate", "n=200", "out=own.parquet", *OWN, store=False)
+    assert done.returncode == 0, done.stderr
+    own = ["device.path=own.parquet", "device.test=all"]
+    done = run(folder, "evaluate", "device=recording", *own, *OWN)
+    assert done.returncode == 0, done.stderr
+    assert 0 < metrics(folder)[-1]["same/overall/accuracy"] < 1
+
+
+@pytest.mark.slow
+def test_it_watches_nine_sensors_at_a_port(begin, folder):
+    link = folder / "skin"
+    with ExitStack() as both:
+        emulator = both.enter_context(begin(folder, "emulate", f"link={link}", *OWN))
+        deadline = monotonic() + 300
+        while not (scale := re.search(r"device\.scale=(\S+)\n", emulator.out)):
+            assert monotonic() < deadline, emulator.err
+            assert emulator.poll() is None, emulator.err
+            sleep(0.2)
+        reader = ["device=serial", f"device.port={link}", f"device.scale={scale[1]}"]
+        store = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"]
+        live = both.enter_context(begin(folder, "live", *reader, *OWN, *store, "seconds=8"))
+        assert live.wait() == 0, live.err
+    assert re.search(r"[1-9]\d* verdicts", live.err), live.err
+
+
+@pytest.mark.slow
+def test_it_is_adapted_to_a_skin_that_must_be_named(run, folder):
+    quick = ["adapt.gestures=8", "adapt.layers=[head]", "adapt.lr=[0.001]", "adapt.epochs=2"]
+    quick += ["evaluation.safe_gestures=64"]
+    done = run(folder, "adapt", *OWN, *quick)
+    assert done.returncode == 2, done.stderr
+    assert "was trained on many skins: name the one to adapt to" in done.stderr
+    done = run(folder, "adapt", "device=simulated", "device.test_gestures=200", *OWN, *quick)
+    assert done.returncode == 0, done.stderr
+    found = metrics(folder)[-1]
+    assert 0 < found["before/overall/accuracy"] <= 1
+    assert 0 < found["same/overall/accuracy"] <= 1

@@ -1,0 +1,74 @@
+"""`skin demo` as a person starts and ends it."""
+
+import json
+import re
+import signal
+import socket
+from contextlib import suppress
+from time import monotonic, sleep
+from urllib.request import urlopen
+
+import psutil
+import pytest
+
+PATIENCE = 240  # s, on a machine that is busy with other things
+
+
+def page_of(demo):
+    """Return the address that the command prints."""
+    deadline = monotonic() + PATIENCE
+    while monotonic() < deadline and demo.poll() is None:
+        if found := re.search(r"^page: (http://127\.0\.0\.1:\d+)$", demo.err, re.M):
+            return found[1]
+        sleep(0.1)
+    raise AssertionError(f"no page: {demo.err}")
+
+
+def pictures(page):
+    """Yield the states that a browser is sent."""
+    deadline = monotonic() + PATIENCE
+    with urlopen(f"{page}/pictures", timeout=PATIENCE) as events:
+        for line in events:
+            assert monotonic() < deadline
+            if line.startswith(b"data: "):
+                yield json.loads(line.removeprefix(b"data: "))
+
+
+def refuses(address):
+    """Return whether nothing listens at ``scheme://host:number``."""
+    host, number = address.rsplit("/", 1)[1].split(":")
+    with suppress(ConnectionRefusedError), socket.create_connection((host, int(number)), timeout=5):
+        return False
+    return True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_the_page_shows_an_emulated_skin_until_a_signal_ends_both(begin, tmp_path, number, code):
+    store = f"tracking.uri=sqlite:///{tmp_path}/m.db"
+    with begin(tmp_path, "demo", "live.web_port=0", store) as demo:
+        page = page_of(demo)
+        with urlopen(page, timeout=PATIENCE) as answer:
+            assert b"<!doctype html>" in answer.read()
+        with urlopen(f"{page}/skin.json", timeout=PATIENCE) as answer:
+            known = json.load(answer)
+        assert known["title"] == "default_skin"
+        assert len(known["positions"]) == 25
+        assert known["port"].startswith("socket://127.0.0.1:")
+        touched = next(
+            one["verdict"] for one in pictures(page) if one["verdict"] and one["verdict"]["touched"]
+        )
+        assert len(touched["words"]) == 4
+        assert not psutil.Process(demo.pid).children()
+        demo.send_signal(number)
+        assert demo.wait(PATIENCE) == code, demo.err
+    assert refuses(page)
+    assert refuses(known["port"])
+    assert "Traceback" not in demo.err
+
+
+def test_another_run_is_refused_with_a_sentence(run, tmp_path):
+    done = run(tmp_path, "demo", "run=none")
+    assert done.returncode == 2
+    assert "no finished training run none" in done.stderr
+    assert done.stderr.count("\n") == 1

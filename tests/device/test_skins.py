@@ -1,0 +1,67 @@
+"""Touches on many skins: what a batch holds, and that test skins are others."""
+
+import pytest
+import torch
+
+from skin.build import build_device
+from skin.config import validate_config
+from skin.errors import InputError
+from skin.recording import GEOMETRY
+
+SMALL = (
+    "device=skins", "device.count=2", "device.test_skins=1", "device.skins.length=[0.08,0.1]",
+    "device.skins.aspect=[1,1.2]", "device.skins.cell=0.01", "device.skins.sensors=[4,9]",
+    "device.skins.divisions=1", "data.gestures=100", "device.test_gestures=32", "device.fresh=true",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def device(configured):
+    return build_device(validate_config(configured(*SMALL)))
+
+
+def test_touches_of_skins_with_few_sensors_are_filled_up(device):
+    touches = device.touches("train", 1)
+    counts = [len(skin.sensors) for skin in device.training_skins]
+    assert touches.readings.shape == (80, 30, max(counts))
+    assert touches.positions.shape == (80, max(counts), 3)
+    assert touches.geometry.shape == (80, max(counts), len(GEOMETRY))
+    working = touches.valid.any(dim=1).sum(dim=1)
+    assert set(working.tolist()) <= {count - dead for count in counts for dead in range(count // 4 + 1)}
+    assert torch.equal(touches.geometry[..., :2], touches.positions[..., :2])
+    assert touches.labels.mean(0).tolist() == pytest.approx([0.5] * 4, abs=0.05)
+
+
+def test_an_epoch_is_new_and_repeatable_and_validation_stays(device):
+    first, second = device.touches("train", 1), device.touches("train", 2)
+    assert torch.equal(first.readings, device.touches("train", 1).readings)
+    assert not torch.equal(first.readings, second.readings)
+    assert device.touches("validation", 1) is device.touches("validation", 2)
+
+
+def test_test_skins_are_not_training_skins(device):
+    sizes = {skin.body.size for skin in device.training_skins}
+    assert not sizes & {skin.body.size for skin in device.unseen_skins}
+    assert len(device.touches("test")) == 32
+
+
+def test_a_blank_device_prepares_no_skin(configured):
+    fresh = build_device(validate_config(configured(*SMALL)))
+    blank = fresh.blank()
+    assert blank.touches("train").readings.shape == (1, 30, 25)
+    assert "training_skins" not in vars(fresh)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("device.skins.sensors=[9,4]", "must be a range"),
+        ("device.skins.layouts=[square]", "device.skins.layouts"),
+        ("device.count=0", "device.count=0"),
+        ("device.skins={plates: 0.6, naive: 0.5}", "plates + device.skins.naive must be at most 1, got 1.1"),
+    ],
+)
+def test_refuses(configured, override, words):
+    with pytest.raises(InputError) as caught:
+        build_device(validate_config(configured(*SMALL, override)))
+    assert words in str(caught.value)

@@ -1,0 +1,41 @@
+"""Small untrained networks: their weights do not matter here."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from skin.build import build_data, build_device, build_learner
+from skin.trained import Trained
+
+SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=400"]
+
+
+@pytest.fixture(scope="session")
+def untrained(configured):
+    """Return a function that builds a run of a learner without training it."""
+
+    def build(*overrides: str) -> Trained:
+        config = configured(*SMALL, *overrides)
+        device, learner = build_device(config), build_learner(config)
+        data = build_data(config, device)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            learner.build(data)
+        return Trained(device, learner, device.window, data.touches("train").positions, device.model_rate)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def exported(untrained, tmp_path_factory) -> tuple[Trained, Path]:
+    """Return the run with features, and its exported file."""
+    pytest.importorskip("onnxruntime")
+    from skin.exported.writer import write_model
+    from skin.hardware.live.engine_builder import describe
+
+    of = untrained("experiment=best_fresh")
+    path = tmp_path_factory.mktemp("exported") / "skin.onnx"
+    module = of.learner.pipeline(of.positions)
+    write_model(module, describe(of, "abc", "best_fresh naive seed 0", 0.3), of.device.touches("train"), path)
+    return of, path

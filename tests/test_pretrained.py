@@ -1,0 +1,132 @@
+"""Models that come with the package: complete, small, unaltered, and as good as their cards say."""
+
+import json
+import shutil
+import subprocess
+
+import pytest
+
+import skin
+from skin.errors import InputError
+from skin.evaluation.operating_point import LABEL
+from skin.model_card import model_card
+from skin.paths import ROOT
+from skin.pretrained import CARD, CONFIG, MODELS, RECORD, SUMS, checksums, find_pretrained, is_name
+from skin.safe_loading import load_yaml
+
+NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+
+def record_of(name):
+    return json.loads((ROOT / MODELS / name / RECORD).read_text())
+
+
+def test_there_is_a_model_of_the_default_skin():
+    assert "default_skin" in NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_is_one_small_file_of_weights_with_configuration_and_card(name):
+    folder, record = ROOT / MODELS / name, record_of(name)
+    weights = record["tags"]["learned"]
+    assert {path.name for path in folder.iterdir()} == {RECORD, CONFIG, CARD, SUMS, weights}
+    assert (folder / weights).stat().st_size <= 4e6
+    assert (folder / SUMS).read_text() == checksums(folder, weights)
+    assert find_pretrained(name).info.run_name == name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_card_is_generated_and_has_every_metric(name):
+    record, config = record_of(name), load_yaml(ROOT / MODELS / name / CONFIG)
+    card = (ROOT / MODELS / name / CARD).read_text()
+    assert card == model_card(name, record, config)
+    for metric in (metric for metric in record["metrics"] if metric.count("/") == 2):
+        assert f"| {metric.split('/', 1)[1]} | " in card, metric
+    for text in (record["licence"], record["tags"]["source_commit"], "alarm above 0.", "## Not for"):
+        assert text in card
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_names_no_folder_of_the_machine_of_its_training(name):
+    config = load_yaml(ROOT / MODELS / name / CONFIG)
+    assert not {"tracking", "trust"} & config.keys()
+    assert "process" not in record_of(name)["tags"]
+    for path in (ROOT / MODELS / name).iterdir():
+        assert b"file:/" not in path.read_bytes(), path
+        assert str(ROOT).encode() not in path.read_bytes(), path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
+    """At most a few predictions may differ: those closer to a threshold than processors round."""
+    check, trained = record_of(name)["check"], skin.load_run(name, f"sqlite:///{tmp_path}/m.db")
+    assert check["touches"] == 400
+    assert check["tolerance"] <= 2
+    touches = trained.device.touches("test")[slice(400)]
+    chances = trained.predict(touches)
+    differ = set()
+    for label, expected in check["predictions"].items():
+        place = trained.labels.index(LABEL if label == "alarm" else label)
+        found = chances[:, place] > (trained.point.threshold if label == "alarm" else 0.5)
+        differ |= {number for number, bit in enumerate(expected) if bool(found[number]) != (bit == "1")}
+        correct = int((found == (touches.labels[:, place] > 0.5)).sum())
+        assert abs(correct - check["correct"][label]) <= check["tolerance"], label
+    assert len(differ) <= check["tolerance"], differ
+
+
+@pytest.fixture
+def copied(tmp_path, monkeypatch):
+    """Return the folder of a copy in the current folder, which comes before the one of the package."""
+    folder = tmp_path / MODELS / "copy"
+    shutil.copytree(ROOT / MODELS / "default_skin", folder)
+    monkeypatch.chdir(tmp_path)
+    assert find_pretrained("copy").info.artifact_uri == folder.as_uri()
+    return folder
+
+
+@pytest.mark.parametrize("name", ["weights.pt", CONFIG, RECORD, CARD])
+def test_an_altered_file_is_refused_by_name(name, copied):
+    content = bytearray((copied / name).read_bytes())
+    place = content.index(b"0") if name == RECORD else len(content) // 2
+    content[place] = ord("1") if content[place] != ord("1") else ord("2")
+    (copied / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"^{name} in .*copy differs from {SUMS}: "):
+        find_pretrained("copy")
+
+
+@pytest.mark.parametrize("name", ["weights.pt", CONFIG, RECORD, CARD, SUMS])
+def test_a_missing_file_is_refused_by_name(name, copied):
+    (copied / name).unlink()
+    with pytest.raises(InputError, match=name):
+        find_pretrained("copy")
+
+
+def test_another_format_is_refused_before_anything_else_is_read(copied):
+    (copied / RECORD).write_text(json.dumps({"format": 2}))
+    with pytest.raises(InputError, match="has format 2 and this version reads format 1: install"):
+        find_pretrained("copy")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 1}', '{"format": 1, "tags": {"learned": 3}}'])
+def test_another_record_is_refused(text, copied):
+    (copied / RECORD).write_text(text)
+    with pytest.raises(InputError, match=r"is no (complete )?pretrained model"):
+        find_pretrained("copy")
+
+
+@pytest.mark.parametrize("name", ["", "latest", "25aa", "../models/default_skin", "Default", ".hidden"])
+def test_what_selects_a_run_or_a_path_is_no_name(name):
+    assert not is_name(name)
+    assert find_pretrained(name) is None
+
+
+def test_sha256sum_reads_the_hashes(copied):
+    if shutil.which("sha256sum") is None:
+        pytest.skip("needs sha256sum")
+    command = ["sha256sum", "--check", "--strict", SUMS]
+    done = subprocess.run(command, cwd=copied, capture_output=True, text=True, check=True)
+    assert done.stdout.count(": OK") == 4

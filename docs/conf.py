@@ -38,6 +38,8 @@ sphinx_gallery_conf = {
     "within_subsection_order": "FileNameSortKey",
     "image_scrapers": ("figure_scraper",),
     "show_memory": False,
+    "capture_repr": (),
+    "write_computation_times": False,
     "min_reported_time": 1e6,
     "download_all_examples": False,
     "show_signature": False,

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 from sphinx_gallery.scrapers import figure_rst, matplotlib_scraper
 
@@ -15,6 +16,7 @@ def scrape(block: Any, variables: dict[str, Any], gallery_conf: Mapping[str, Any
     A variable is a figure, the path of a PNG or GIF file, or a list of them.
     """
     shown, paths = variables.setdefault("shown", []), []
+    shown += map(plt.figure, plt.get_fignums())  # left to the scraper of pyplot
     for one in _pictures(variables["example_globals"]):
         if not any(one is other for other in shown):
             shown.append(one)
@@ -31,9 +33,8 @@ def scrape(block: Any, variables: dict[str, Any], gallery_conf: Mapping[str, Any
 def _pictures(variables: Mapping[str, Any]) -> Iterator[Figure | Path]:
     for value in variables.values():
         for one in value if isinstance(value, list) else [value]:
-            # Pyplot's figures have a manager, and are found by their own scraper.
-            drawn = isinstance(one, Figure) and one.canvas.manager is None
-            if drawn or (isinstance(one, Path) and one.suffix in (".png", ".gif") and one.is_file()):
+            picture = isinstance(one, Path) and one.suffix in (".png", ".gif") and one.is_file()
+            if picture or isinstance(one, Figure):
                 yield one
 
 

@@ -7,7 +7,7 @@ and safe touches. ``skin table`` draws them from the trainings of the results ta
 small model instead, so its errors are not those of the table.
 """
 
-import os
+from contextlib import chdir
 from tempfile import mkdtemp
 
 import numpy as np
@@ -16,20 +16,21 @@ import skin
 from skin.cli import main
 from skin.plot import figures
 
-os.chdir(mkdtemp())
-main(
-    [
-        "train",
-        "experiment=features",
-        "simulator=naive",
-        "data.gestures=400",
-        "device.test_gestures=400",
-        "evaluation.safe_gestures=2000",
-        "evaluation.devices=0",
-        "evaluation.layouts=0",
-    ]
-)
-run = skin.load_run("latest")
+folder = mkdtemp()
+with chdir(folder):
+    main(
+        [
+            "train",
+            "experiment=features",
+            "simulator=naive",
+            "data.gestures=400",
+            "device.test_gestures=400",
+            "evaluation.safe_gestures=2000",
+            "evaluation.devices=0",
+            "evaluation.layouts=0",
+        ]
+    )
+    run = skin.load_run("latest")
 recording = run.device.recording("test", complete=False)
 true = recording.touches.labels.numpy() > 0.5
 predicted = run.predict(recording.touches).numpy() > 0.5

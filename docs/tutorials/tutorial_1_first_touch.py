@@ -5,7 +5,7 @@ From the first touch to a verdict
 This tutorial presses a simulated skin, trains a small classifier and asks it what a touch was.
 """
 
-import os
+from contextlib import chdir
 from tempfile import mkdtemp
 
 import matplotlib.pyplot as plt
@@ -14,7 +14,7 @@ import torch
 import skin
 from skin.cli import main
 
-os.chdir(mkdtemp())  # commands store runs in the current folder
+folder = mkdtemp()  # commands store runs in the current folder, which is this one below
 
 # %%
 # A skin and a touch
@@ -50,18 +50,19 @@ axis.set(title="pressure, and readings in N at the sensors", xlabel="x, mm", yla
 # on engineered features; ``simulator=naive`` needs no mechanics. The numbers of touches are far below the
 # defaults.
 
-main(
-    [
-        "train",
-        "experiment=features",
-        "simulator=naive",
-        "data.gestures=400",
-        "device.test_gestures=200",
-        "evaluation.safe_gestures=2000",
-        "evaluation.devices=0",
-        "evaluation.layouts=0",
-    ]
-)
+with chdir(folder):
+    main(
+        [
+            "train",
+            "experiment=features",
+            "simulator=naive",
+            "data.gestures=400",
+            "device.test_gestures=200",
+            "evaluation.safe_gestures=2000",
+            "evaluation.devices=0",
+            "evaluation.layouts=0",
+        ]
+    )
 
 # %%
 # Ask for a verdict
@@ -69,7 +70,8 @@ main(
 # A trained run predicts the probability of each label for windows of readings, (touches, frames, sensors).
 # The alarm is raised above the threshold that the training chose for 2 % false alarms.
 
-run = skin.load_run("latest")
+with chdir(folder):
+    run = skin.load_run("latest")
 touches = run.device.touches("test")[:5]
 chances = run.predict(touches)
 alarms = run.point.alarm(chances[:, run.labels.index("dangerous")])

@@ -7,7 +7,6 @@ one in Python and looks at what its sensors respond to. :doc:`/your-skin` descri
 the command line.
 """
 
-import os
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -16,7 +15,7 @@ import torch
 
 import skin
 
-os.chdir(mkdtemp())
+folder = Path(mkdtemp())
 
 # %%
 # Sensors
@@ -24,7 +23,7 @@ os.chdir(mkdtemp())
 # One line per sensor, in the order of the hardware's channels: x to the right and y downwards from the upper
 # left corner, and the depth below the surface, in metres.
 
-Path("sensors.csv").write_text(
+(folder / "sensors.csv").write_text(
     """x_m,y_m,depth_m
 0.020,0.020,0.006
 0.060,0.025,0.006
@@ -43,7 +42,7 @@ Path("sensors.csv").write_text(
 gel = {"name": "my gel", "young": 40e3, "poisson": 0.49}
 layers = [{"material": gel, "thickness": 0.008}, {"material": "EcoFlex 00-30", "thickness": 0.004}]
 body = skin.Sheet(size=(0.12, 0.08), cells=(24, 16), layers=layers)
-sensors = skin.LayoutFile("sensors.csv", footprint=(0.008, 0.008)).sensors(body)
+sensors = skin.LayoutFile(folder / "sensors.csv", footprint=(0.008, 0.008)).sensors(body)
 simulator = skin.Solid(body, sensors, divisions=2)
 print(len(sensors), "sensors,", len(body.layers), "layers,", f"{1e3 * body.thickness:g} mm")
 

@@ -7,15 +7,15 @@ trains it, without a change of the package. :doc:`/contributing` has the rules, 
 groups.
 """
 
-import os
 import sys
+from contextlib import chdir
 from pathlib import Path
 from tempfile import mkdtemp
 
 from skin.cli import main
 
-os.chdir(mkdtemp())
-sys.path.insert(0, os.getcwd())  # in a shell: export PYTHONPATH=$PWD
+folder = Path(mkdtemp())
+sys.path.insert(0, str(folder))  # in a shell: export PYTHONPATH=$PWD
 
 # %%
 # The class
@@ -23,7 +23,7 @@ sys.path.insert(0, os.getcwd())  # in a shell: export PYTHONPATH=$PWD
 # A model maps a frame to an embedding of ``width`` numbers. A fusion applies it to the frames of a window,
 # and linear layers turn the result into labels. Settings are annotated parameters.
 
-Path("squared.py").write_text(
+(folder / "squared.py").write_text(
     '''
 from collections.abc import Sequence
 from typing import Annotated
@@ -55,8 +55,8 @@ class Squared(AbstractModel):
 # ------------
 # The file has the name of the option, in a folder with the name of the group.
 
-Path("conf/model").mkdir(parents=True)
-Path("conf/model/squared.yaml").write_text(
+(folder / "conf" / "model").mkdir(parents=True)
+(folder / "conf" / "model" / "squared.yaml").write_text(
     """_target_: squared.Squared
 _partial_: true
 _convert_: all
@@ -70,29 +70,7 @@ width: 32
 # ``--config-dir`` adds the folder. Every other part is chosen as usual. Ten epochs of a few touches only show
 # that it works.
 
-main(
-    [
-        "train",
-        "--config-dir",
-        "conf",
-        "representation=readings",
-        "model=squared",
-        "simulator=naive",
-        "data.gestures=400",
-        "trainer.max_epochs=10",
-        "device.test_gestures=200",
-        "evaluation.safe_gestures=2000",
-        "evaluation.devices=0",
-        "evaluation.layouts=0",
-    ]
-)
-
-# %%
-# Settings are checked
-# --------------------
-# A value outside the range of the annotation is refused before anything is computed.
-
-try:
+with chdir(folder):
     main(
         [
             "train",
@@ -100,9 +78,23 @@ try:
             "conf",
             "representation=readings",
             "model=squared",
-            "model.width=0",
             "simulator=naive",
+            "data.gestures=400",
+            "trainer.max_epochs=10",
+            "device.test_gestures=200",
+            "evaluation.safe_gestures=2000",
+            "evaluation.devices=0",
+            "evaluation.layouts=0",
         ]
     )
+
+# %%
+# Settings are checked
+# --------------------
+# A value outside the range of the annotation is refused before anything is computed.
+
+try:
+    with chdir(folder):
+        main(["train", "--config-dir", "conf", "model=squared", "model.width=0", "simulator=naive"])
 except SystemExit as stop:
     print("exit code", stop.code)

@@ -59,9 +59,8 @@ def find_target(
     own += [] if "simulator" in stored.device else ["device=simulated"]
     nominal = apply_overrides(stored, compose("adapt", own), own)
     if "test" in there.device:  # a recording, which is used as a whole
-        whole = OmegaConf.merge(there, {"device": {"test": "all"}})
-        assert isinstance(whole, DictConfig)
-        there = validate_config(whole)
+        whole = plain(there)
+        there = validate_config(OmegaConf.create(whole | {"device": whole["device"] | {"test": "all"}}))
     device, known = build_device(there), build_device(nominal)
     twin = known.reference or known
     _check(parent, device, twin)

@@ -43,12 +43,13 @@ def _lines(study: Study, trials: Sequence[Trial], label: str) -> Figure:
     """Draw the mean and two standard errors over the number at the end of a variant's or condition's name."""
     metric, found = study.metrics[0], group_trials(trials)
     single = len({variant for variant, _ in found}) == 1
-    lines: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
+    every: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
     for (variant, condition), each in found.items():
         numbered = _NUMBERED.fullmatch(condition if single else variant)
         if numbered and any(metric in one.metrics for one in each):
             name = numbered[1] if single else ", ".join(filter(None, (numbered[1], condition)))
-            lines[name].append((int(numbered[2]), *mean_and_error(each, metric)))
+            every[name].append((int(numbered[2]), *mean_and_error(each, metric)))
+    lines = {name: points for name, points in every.items() if len(points) > 1}
     drawn = Figure(figsize=(7, 4.5), layout="constrained")
     axis = drawn.subplots()
     for (name, points), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(_MARKERS)):

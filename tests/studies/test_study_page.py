@@ -144,7 +144,8 @@ def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
         trial("any", "0", share, condition=f"grid {n}") if single else trial(f"grid {n}", "0", share)
         for n, share in numbers.items()
     ]
-    found += [trial("any" if single else "other", "0", 0.5, condition="other" if single else "")]
+    for name in ("other", "equation 10"):  # no number, and a single one
+        found += [trial("any" if single else name, "0", 0.5, condition=name if single else "")]
     (axis,) = study_figure(replace(STUDY, axis="number of sensors"), found).axes
     (line,) = axis.containers
     assert line[0].get_xdata().tolist() == [4, 9, 25]

@@ -1,7 +1,8 @@
 """Accuracy of a network after fine-tuning, beside models that are trained on the same gestures."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from typing import Any
 
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf
@@ -16,7 +17,9 @@ from skin.learner.base import AbstractLearner
 from skin.settings import configured
 
 
-def measure_adaptation(subject: Subject, rows: Sequence[str], epochs: int | None) -> Measurement:
+def measure_adaptation(
+    subject: Subject, rows: Sequence[str], epochs: int | None, adapt: Mapping[str, Any]
+) -> Measurement:
     """Return the metrics ``zero_shot/…``, ``adapted/…`` and ``<row>/…`` on the test gestures of the device.
 
     The run is fine-tuned and the rows are trained on the training split of the device. The rows also use its
@@ -26,13 +29,15 @@ def measure_adaptation(subject: Subject, rows: Sequence[str], epochs: int | None
         subject: a run of a network on a simulated device.
         rows: names of experiments.
         epochs: of their trainings; None: those of the experiments.
+        adapt: settings of the fine-tuning that differ from ``conf/adapt.yaml``.
 
     Raises:
         InputError: the run is no network, or the device is not simulated.
     """
     device = subject.device.simulated("gestures to adapt to are simulated")
     composed = compose("adapt")
-    settings = configured(FineTuning, plain(composed)["adapt"] | {"seed": device.data_seed}, "adapt")
+    changes = {"seed": device.data_seed, **adapt}
+    settings = configured(FineTuning, plain(composed)["adapt"] | changes, "adapt")
     config = OmegaConf.merge(subject.config, {"data": {"augment": composed.data.augment}})
     assert isinstance(config, DictConfig)
     learner = subject.learner

@@ -3,10 +3,10 @@
 They import heavy packages when called, so that errors in their settings are reported early.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from annotated_types import Ge, Gt
 
@@ -188,12 +188,14 @@ class Adaptation:
     Args:
         rows: names of experiments.
         epochs: of their trainings; None: those of the experiments.
+        adapt: settings of the fine-tuning that differ from ``conf/adapt.yaml``.
     """
 
     rows: Sequence[str] = ("features", "best")
     epochs: Annotated[int, Ge(1)] | None = None
+    adapt: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, subject: Subject) -> Measurement:
         from experiments.studies.adaptation_curve import measure_adaptation
 
-        return measure_adaptation(subject, self.rows, self.epochs)
+        return measure_adaptation(subject, self.rows, self.epochs, self.adapt)

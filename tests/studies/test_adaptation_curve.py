@@ -27,8 +27,9 @@ def test_a_run_is_measured_before_and_after_and_is_itself_again_then(configured)
     trained = Trained(device, learner, 30, device.touches("train").positions, 10.0)
     other = device.replace(gestures=60, data_seed=1, gain_spread=0.5, time_constant=0.4, seed=2)
     subject = Subject(config, other, Finished(None, None, config, trained))
+    quick = {"layers": ["all"], "lr": [1e-3], "epochs": 15}
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        found = measure_adaptation(subject, ["rules"], None).metrics
+        found = measure_adaptation(subject, ["rules"], None, quick).metrics
     assert {f"{model}/overall/accuracy" for model in ("zero_shot", "adapted", "rules")} <= set(found)
     assert found["adapted/changed"] == 1
     assert found["adapted/overall/accuracy"] > found["zero_shot/overall/accuracy"]

@@ -190,19 +190,18 @@ def _sharing(x: Tensor, peak: Tensor, frame: Tensor) -> Block:
 def _path(x: Tensor, peak: Tensor, places: Tensor, rise: Tensor) -> Iterable[Block]:
     """Yield how the centre of the readings moves while the touch lasts, m."""
     active = peak > 0.25 * peak.amax(dim=1, keepdim=True)
+    inside, frames = active[..., None], active.sum(dim=1).clamp(min=1)
+    first = active.to(torch.int64).argmax(dim=1)
+    last = active.shape[1] - 1 - active.flip(1).to(torch.int64).argmax(dim=1)
     for power in (1, 2):
         push = (x - 0.1 - rise[:, None, None]).clamp(min=0) ** power
         centre = push @ places / push.sum(dim=2, keepdim=True).clamp(min=1e-6)
-        outside = torch.where(active[..., None], centre, torch.nan)
         step = centre.diff(dim=1).norm(dim=2) * (active[:, 1:] & active[:, :-1])
-        middle = outside.nanmean(dim=1, keepdim=True)
-        far = (outside - middle).norm(dim=2).nan_to_num(0).amax(dim=1)
-        high = outside.nan_to_num(-torch.inf).amax(dim=1)
-        low = outside.nan_to_num(torch.inf).amin(dim=1)
-        first = active.to(torch.int64).argmax(dim=1)
-        last = active.shape[1] - 1 - active.flip(1).to(torch.int64).argmax(dim=1)
+        middle = torch.where(inside, centre, 0).sum(dim=1, keepdim=True) / frames[:, None, None]
+        far = ((centre - middle).norm(dim=2) * active).amax(dim=1)
+        high = torch.where(inside, centre, -torch.inf).amax(dim=1)
+        low = torch.where(inside, centre, torch.inf).amin(dim=1)
         ends = (_frame_at(centre, last) - _frame_at(centre, first)).norm(dim=1)
-        frames = active.sum(dim=1).clamp(min=1)
         columns = {
             "path": step.sum(dim=1),
             "mean step": step.sum(dim=1) / frames,

@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from skin.config import validate_config
 from skin.error_messages import JobInputError, to_input_error
 from skin.paths import CONF
+from skin.server import check_server
 from skin.shard import left_out
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
@@ -45,7 +46,10 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             if HydraConfig.get().mode == RunMode.MULTIRUN and left_out():
                 return None
             try:
-                return task(validate_config(config))
+                checked = validate_config(config)
+                if checked.tracking is not None:
+                    check_server(checked.tracking.uri)
+                return task(checked)
             except Exception as error:
                 refused = to_input_error(error)
                 if refused is None:

@@ -3,31 +3,19 @@
 import json
 import logging
 import shutil
-import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
 from mlflow.exceptions import MlflowException, RestException
 
-_PATIENCE = 5.0  # s until a server that accepts no connection is given up
+from skin.server import PATIENCE, answers
+
 _log = logging.getLogger(__name__)
-
-
-def answers(uri: str) -> bool:
-    """Return whether the server accepts connections; waits at most 5 s for it."""
-    place = urlsplit(uri)
-    port = place.port or (443 if place.scheme == "https" else 80)
-    try:
-        socket.create_connection((place.hostname or "", port), timeout=_PATIENCE).close()
-    except OSError:
-        return False
-    return True
 
 
 class OutboxClient(MlflowClient):
@@ -112,7 +100,7 @@ class OutboxClient(MlflowClient):
 
     def _present(self) -> bool:
         """Return whether the server answers, or did in the last seconds."""
-        if time.monotonic() > self._seen + _PATIENCE:
+        if time.monotonic() > self._seen + PATIENCE:
             if not answers(self._uri):
                 return False
             self._seen = time.monotonic()

@@ -20,6 +20,7 @@ from skin.config import plain, validate_config
 from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.progress import SweepProgress, expected_seconds, format_duration
+from skin.server import check_server
 from skin.shard import LEFT_OUT, Shard
 from skin.source import note_reuse
 
@@ -115,6 +116,7 @@ class Sweep(Callback):
             self._choose(config, [""] * len(self._jobs))
             return
         settings = validate_config(_without_hydra(config)).tracking
+        check_server(settings.uri)
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 

@@ -35,7 +35,8 @@ from skin.config import Tracking
 from skin.errors import InputError
 from skin.files import whole
 from skin.interrupt import ends_on_signal
-from skin.outbox import OutboxClient, answers
+from skin.outbox import OutboxClient
+from skin.server import check_server, is_server
 from skin.source import source_tags
 
 PROCESS = "process"
@@ -72,12 +73,8 @@ class Store:
         """
         uri = settings.uri or f"sqlite:///{Path.cwd() / 'mlflow.db'}"
         artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
-        remote = uri.startswith(("http://", "https://"))
-        if remote and not answers(uri):
-            raise InputError(
-                f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "
-                "tracking.uri; without it, finished runs are not known, and nothing begins"
-            )
+        remote = is_server(uri)
+        check_server(uri)
         try:
             with _alone(uri, artifacts):
                 client = OutboxClient(uri, artifacts / "kept") if remote else MlflowClient(tracking_uri=uri)

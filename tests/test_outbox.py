@@ -12,7 +12,8 @@ from mlflow.exceptions import MlflowException, RestException
 
 from skin.config import Tracking
 from skin.errors import InputError
-from skin.outbox import OutboxClient, answers
+from skin.outbox import OutboxClient
+from skin.server import answers
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -1,6 +1,7 @@
 """A sweep counts its jobs as Hydra does, goes on after a failure, resumes, and tells what it found."""
 
 import json
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -263,3 +264,15 @@ def test_a_shard_of_nothing_is_refused(run, tmp_path, words, said):
     assert (done.returncode, done.stdout) == (2, "")
     assert said in done.stderr
     assert not (tmp_path / "m.db").exists()
+
+
+@pytest.mark.parametrize("words", [[], ["-m"]])
+def test_a_server_that_is_away_is_told_before_anything_heavy_is_imported(words):
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        uri = f"http://127.0.0.1:{closed.getsockname()[1]}"
+    given = ["train", *words, "seed=0,1" if words else "seed=0", f"tracking.uri={uri}"]
+    code = "import atexit, sys\natexit.register(lambda: print('torch' in sys.modules))\n"
+    code += f"from skin.cli import main\nmain({given})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (2, "False\n")
+    assert f"the tracking server {uri} does not answer" in done.stderr

@@ -5,10 +5,11 @@ from typing import Any
 
 import onnx
 import torch
-from onnxscript import opset20 as op
+from onnxscript import opset20
 
 from skin.signal.features import SINGULAR_VALUES
 
+op: Any = opset20  # its types leave out Python numbers, which it converts
 _DOUBLE, _FLOAT, _INT64 = 11, 1, 7  # TensorProto.DataType
 _SQUARINGS = 3, 6  # rounds, and squarings in each: the power 2^18
 _TINY = 1e-300

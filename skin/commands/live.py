@@ -49,8 +49,10 @@ def _watch(config: DictConfig, live: "LiveSettings") -> None:
 
         watched = watch_model(config.run, plain(config)["device"], live, messages.print)
     else:
+        from skin.console import quiet
         from skin.hardware.live.trained_run import watch_run
 
+        quiet()
         watched = watch_run(config, live, messages.print)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())

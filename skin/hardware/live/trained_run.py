@@ -7,7 +7,6 @@ from omegaconf import DictConfig
 
 from skin.build import build_device
 from skin.config import overrides
-from skin.console import quiet
 from skin.hardware.live import engine_builder
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched
@@ -27,7 +26,6 @@ def watch_run(config: DictConfig, live: LiveSettings, say: Callable[[str], None]
     Raises:
         InputError: there is no such run, or it cannot be loaded.
     """
-    quiet()
     torch.set_num_threads(config.tracking.threads or 1)
     store = Store.open(config.tracking)
     run = find_run(store, config.run)

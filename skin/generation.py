@@ -46,8 +46,8 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
     Raises:
         InputError: the folder has something else, or cannot be written.
     """
-    parts = device.parts()
-    if parts is None:
+    parts = list(device.parts() or [])
+    if not parts:
         whole = device.recording()
         parts = [Part(len(whole), lambda: whole)]
     source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(plain(config)))}

@@ -46,11 +46,10 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
     Raises:
         InputError: the folder has something else, or cannot be written.
     """
-    known = device.parts()
-    if known is None:
+    parts = list(device.parts() or [])
+    if not parts:
         whole = device.recording()
-        known = [Part(len(whole), lambda: whole)]
-    parts = list(known)
+        parts = [Part(len(whole), lambda: whole)]
     source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(plain(config)))}
     if not (folder / MANIFEST).is_file():
         _begin(device, parts, source, folder)

@@ -3,7 +3,6 @@
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from itertools import cycle
 
 from matplotlib.figure import Figure
 
@@ -14,11 +13,12 @@ from skin.plot.figures import COLOURS
 
 _NUMBERED = re.compile(r"(.+) (\d+)")
 _MARKERS = "osD^v<>pP*"
+_STYLES = ("-", "--", ":", "-.")
 
 
 def study_figure(study: Study, trials: Sequence[Trial]) -> Figure:
     """Draw the first metric: lines over the numbers in the names if the study has an axis, else strips."""
-    return _lines(study, trials, study.axis) if study.axis else _strips(study, trials)
+    return _lines(study, trials) if study.axis else _strips(study, trials)
 
 
 def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
@@ -39,28 +39,33 @@ def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
     return drawn
 
 
-def _lines(study: Study, trials: Sequence[Trial], label: str) -> Figure:
+def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
     """Draw the mean and two standard errors over the number at the end of a variant's or condition's name."""
     metric, found = study.metrics[0], group_trials(trials)
     single = len({variant for variant, _ in found}) == 1
-    every: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
+    every: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
     for (variant, condition), each in found.items():
         numbered = _NUMBERED.fullmatch(condition if single else variant)
         if numbered and any(metric in one.metrics for one in each):
-            name = numbered[1] if single else ", ".join(filter(None, (numbered[1], condition)))
-            every[name].append((int(numbered[2]), *mean_and_error(each, metric)))
-    lines = {name: points for name, points in every.items() if len(points) > 1}
+            key = numbered[1], "" if single else condition
+            every[key].append((int(numbered[2]), *mean_and_error(each, metric)))
+    lines = {key: points for key, points in every.items() if len(points) > 1}
+    names, conditions = (list(dict.fromkeys(key[part] for key in lines)) for part in (0, 1))
     drawn = Figure(figsize=(7, 4.5), layout="constrained")
     axis = drawn.subplots()
-    for (name, points), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(_MARKERS)):
+    for (name, condition), points in lines.items():
         x, y, error = zip(*sorted(points), strict=True)
-        widths = [2 * one for one in error]
-        axis.errorbar(x, y, yerr=widths, label=name, color=colour, marker=marker, ms=4, capsize=2, lw=1.2)
+        number, label = names.index(name), ", ".join(filter(None, (name, condition)))
+        axis.errorbar(
+            x, y, yerr=[2 * one for one in error], label=label, ms=4, capsize=2, lw=1.2,
+            color=COLOURS[number % len(COLOURS)], marker=_MARKERS[number % len(_MARKERS)],
+            linestyle=_STYLES[conditions.index(condition) % len(_STYLES)],
+        )  # fmt: skip
     numbers = sorted({x for points in lines.values() for x, *_ in points})
     axis.set_xscale("log")
     axis.set_xticks(numbers, [str(x) for x in numbers])
     axis.set_xticks([], minor=True)
-    axis.set_xlabel(label)
+    axis.set_xlabel(study.axis or "")
     axis.set_ylabel(f"{_label(metric)}: mean and two standard errors")
     axis.set_title(study.about, fontsize=9, wrap=True)
     axis.legend(fontsize=8)

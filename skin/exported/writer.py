@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from tqdm import tqdm
 
 from skin import files
 from skin.errors import InputError
@@ -93,16 +94,18 @@ def _convert(module: nn.Module, touches: Touches) -> Any:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence what the exporter says about libraries that are not needed."""
+    """Silence what the exporter says about libraries that are not needed, and start no thread of tqdm."""
     logger = logging.getLogger("torch.onnx")
-    before = logger.level
+    before, interval = logger.level, tqdm.monitor_interval
     logger.setLevel(logging.ERROR)
+    tqdm.monitor_interval = 0
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
         logger.setLevel(before)
+        tqdm.monitor_interval = interval
 
 
 def _difference(module: nn.Module, model: ExportedModel, touches: Touches) -> float:

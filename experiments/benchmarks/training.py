@@ -24,6 +24,20 @@ def measure_training(row: str, repeats: int) -> dict[str, float]:
     return {"seconds_per_epoch": ours, "ratio_to_plain": plain_seconds(row, data, repeats) / ours}
 
 
+def measure_drawn_skins(repeats: int) -> dict[str, float]:
+    """Return the median seconds per epoch of any_skin, for its number of gestures, from a fifth of them.
+
+    Twenty skins instead of 200: a batch mixes skins in the same way.
+    """
+    quiet()
+    settings = ("device.count=20", "data.gestures=8000", f"trainer.max_epochs={repeats + 1}")
+    config = training_config("simulator=solid", "experiment=any_skin", *settings)
+    learner = build_learner(config)
+    assert isinstance(learner, Network)
+    learner.fit(build_data(config, build_device(config)))
+    return {"seconds_per_epoch": 5 * learner.seconds_per_epoch}
+
+
 def plain_seconds(row: str, data: TouchData, repeats: int) -> float:
     """Return the seconds per epoch of a row's plain twin, from a few batches: its slowest takes minutes."""
     touches = data.touches("train")

@@ -66,7 +66,9 @@ def run_all(
     }
     found["generate"] = run_alone("data_sets", "measure_data_set", 16 * 4096, repeats)
     found["device"] = {"decode_core_share": decode_core_share()}
-    found["live"] = run_alone("live_latency", "measure_latency", 1000)
+    found["live"] = run_alone("live_latency", "measure_latency", 1000) | {
+        "any_skin": run_alone("live_latency", "measure_latency", 1000, "any_skin")
+    }
     found["live"]["onnx"] = run_alone("onnx_latency", "measure_onnx_latency", 1000)
     say("operator")
     found["operator"] = {
@@ -84,6 +86,8 @@ def run_all(
     for row in rows:
         say(f"training of {row}")
         found["training"][row] = training.measure_training(row, repeats)
+    say("training of any_skin")
+    found["training"]["any_skin"] = training.measure_drawn_skins(repeats)
     return found
 
 

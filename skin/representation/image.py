@@ -51,6 +51,6 @@ class Image(AbstractRepresentation):
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:
         """Return frames (B, T, C, pixels, pixels) of readings (B, T, S), N."""
         values = channels(readings, valid, self.scale, self.mask).mT @ self.average
-        image = values.new_zeros((*values.shape[:-1], self.pixels**2))
-        image[..., self.where] = values  # 8 times faster than a product with the (S, P) matrix, same gradient
+        blank = values.new_zeros((*values.shape[:-1], self.pixels**2))
+        image = blank.scatter(-1, self.where.expand_as(values), values)
         return Frames(image.unflatten(-1, (self.pixels, self.pixels)), None)

@@ -79,7 +79,7 @@ def test_a_verdict_is_timed_by_the_wall_and_by_the_core(run, tmp_path):
     done = run(tmp_path, "bench", "benchmark=live_latency", "benchmark.frames=30", store=False)
     figures = json.loads((tmp_path / "results" / "bench_live_latency.json").read_text())
     assert json.loads(done.stdout) == figures
-    assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share"}
+    assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share", "memory_mb"}
     assert 0 < figures["p50_ms"] <= figures["p99_ms"]
 
 

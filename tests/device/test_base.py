@@ -42,7 +42,7 @@ def device(request, tmp_path_factory) -> AbstractDevice:
 
 def test_other_devices_have_tests_of_their_own():
     others = {path.stem for path in (CONF / "device").glob("*.yaml")} - set(EVERYWHERE)
-    assert others == {"cost", "serial"}
+    assert others == {"cost", "serial", "skins"}
     assert all(Path(__file__).with_name(f"test_{name}.py").is_file() for name in others)
 
 

@@ -10,7 +10,7 @@ from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
 OTHERS = ["bench", "results", "study", "table", "validate"]
-NEW = ["design"]  # never was a script
+NEW = ["adapt", "demo", "design", "export", "publish"]  # never were scripts
 MOVED = ["animate", "calibrate", "compare", "emulate", "listen"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
@@ -30,9 +30,11 @@ def test_the_verbs_are_listed_without_imports():
 def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     main([verb, "--help"])
     text = capsys.readouterr().out
-    assert f"skin {verb} " in text
-    assert ("fusion" in text) == (verb in ("adapt", "train", "evaluate", "live", "compare"))
-    assert "[serial]" in text if verb in ("listen", "record") else "[simulated]" in text
+    assert f"skin {verb}" in text
+    trained = ("adapt", "compare", "demo", "evaluate", "export", "live", "train")
+    assert ("fusion" in text) == (verb in trained)
+    assert ("[serial]" in text) == (verb in ("demo", "listen", "record"))
+    assert ("[simulated]" in text) == (verb not in ("demo", "listen", "publish", "record"))
     assert "hydra" not in text
 
 

@@ -22,6 +22,7 @@ PARTS = [
     "results.parts.shifts=[]",
     "results.parts.peers=[]",
     "results.parts.sensors=[]",
+    "results.parts.any_skin=[]",
     "results.parts.design=[]",
     "results.file=runs.parquet",
     "out=docs",
@@ -93,7 +94,7 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     [
         (
             ["results.part=tables"],
-            "results.part=tables is none of all, table, peers, shifts, sensors, studies, design",
+            "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, studies, design",
         ),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.action=show"], "results.action"),

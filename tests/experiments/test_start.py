@@ -11,7 +11,9 @@ from skin.paths import ROOT
 
 HEAVY = re.compile(r"\| +(torch|mlflow|pytorch_lightning|numpy|scipy)$", re.MULTILINE)
 KEPT = {"train", "evaluate", "generate", "record", "live", "reproduce_table"}
-SCRIPTS = {path.stem: path for path in (ROOT / "experiments").glob("*.py") if path.stem != "__init__"}
+SCRIPTS = {
+    path.stem: path for path in (ROOT / "experiments").glob("*.py") if path.stem not in ("__init__", "notice")
+}
 
 
 @pytest.mark.parametrize("verb", verbs())

@@ -163,7 +163,8 @@ def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides
         build_learner(config).check(build_data(config, build_device(config)))
 
 
-LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "patience": {"label": 0.15}}
+LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "verdicts": None, "log": None,
+        "patience": {"label": 0.15}}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,8 @@ class Clock(Callback):
 
     def median(self) -> float:
         """Return the median duration of an epoch after the training, s; validation is left out."""
-        return median(json.loads(self._path.read_text()))
+        # A continued training that was complete runs no epoch: then the checkpoint alone knows.
+        return median(self._seconds or json.loads(self._path.read_text()))
 
     def on_train_epoch_start(self, *_: Any) -> None:
         """Start an epoch."""

@@ -15,7 +15,6 @@ from tempfile import mkdtemp
 from skin.cli import main
 
 folder = Path(mkdtemp())
-sys.path.insert(0, str(folder))  # in a shell: export PYTHONPATH=$PWD
 
 # %%
 # The class
@@ -70,6 +69,7 @@ width: 32
 # ``--config-dir`` adds the folder. Every other part is chosen as usual. Ten epochs of a few touches only show
 # that it works.
 
+sys.path.insert(0, str(folder))  # in a shell: export PYTHONPATH=$PWD
 with chdir(folder):
     main(
         [

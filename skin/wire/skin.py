@@ -20,6 +20,8 @@ from skin.wire.text import Header
 class Stats:
     """Statistics of the bytes received so far.
 
+    Those not listed are described in :class:`skin.signal.frame.Counters`.
+
     Attributes:
         frames: number of good frames.
         bad_frames: number of frames that could not be decoded; ``bad`` has the reasons.
@@ -27,7 +29,6 @@ class Stats:
         resyncs: number of good frames after bad ones.
         reconnects: number of reconnections.
         rate_hz: frames per second by the device's clock, Hz; 0 if unknown.
-        bytes, bad, skipped, gaps, lost, resets, weak: as in :class:`skin.signal.frame.Counters`.
         format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
         check: ``crc16``, ``xor`` or ``none``; empty likewise.
         trouble: a message about the current problem; empty if there is none.

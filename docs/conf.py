@@ -1,5 +1,6 @@
 """Configuration of the documentation site; ``make docs`` builds it."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -48,3 +49,13 @@ sphinx_gallery_conf = {
 html_theme = "furo"
 html_title = "Tactile skin"
 html_show_sphinx = False
+
+
+def link_cards(app, name, source):
+    """Replace links to the cards of the models, which are outside ``docs/``, by links to their pages here."""
+    source[0] = re.sub(r"\.\./models/(\w+)/README\.md", r"cards/\1.md", source[0])
+
+
+def setup(app):
+    """Connect the function above; Sphinx calls this."""
+    app.connect("source-read", link_cards)

@@ -11,7 +11,9 @@ PEERS := .venv-peers
 WHEEL := .venv-wheel
 # A training of a few seconds; ignore the scores.
 SMOKE := experiment=features simulator=naive data.gestures=400 device.test_gestures=200 evaluation.devices=0 evaluation.layouts=0
-TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs
+TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs $(if $(MARK),-m "$(MARK)")
+# Tests to run: all but those marked slow. Empty: all.
+MARK ?= not slow
 # Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
@@ -36,7 +38,7 @@ $(READY): pyproject.toml constraints.txt
 
 install: $(READY)  ## create .venv; run by the other targets if needed
 
-test: $(READY)  ## run the test suite; list skipped tests with the reason
+test: $(READY)  ## run the tests that are not slow, in 5 minutes; MARK=slow: the others, MARK=: all
 	$(TEST)
 
 roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several rounding settings
@@ -44,8 +46,8 @@ roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several
 		echo "== $$setting"; env $$setting $(TEST) $(or $(TESTS),$(NUMERICAL)) || failed="$$failed $$setting"; \
 	done; test -z "$$failed" || { echo "failed under$$failed"; exit 1; }
 
-slow: $(PEERS)/.ready  ## run the test suite under these settings, with the baseline libraries, a cluster and the documentation
-	$(MAKE) roundings TESTS=tests
+slow: $(PEERS)/.ready  ## run all tests under these settings, with the baseline libraries, a cluster and the documentation
+	$(MAKE) roundings TESTS=tests MARK=
 	$(MAKE) cluster
 	$(MAKE) docs
 

@@ -12,6 +12,7 @@ from skin.paths import CONF
 from skin.settings import check_settings, import_target
 
 
+@pytest.mark.slow
 def test_generation_reports_rates_and_its_own_memory():
     # 400 MB in this process must not count in the one that is measured.
     ballast = bytearray(400_000_000)
@@ -23,6 +24,7 @@ def test_generation_reports_rates_and_its_own_memory():
     assert len(ballast) == 400_000_000
 
 
+@pytest.mark.slow
 def test_a_data_set_is_measured_beside_drawing_alone():
     figures = run_alone("data_sets", "measure_data_set", 64, 1)
     assert set(figures) == {
@@ -55,6 +57,7 @@ def test_the_table_refuses_bad_arguments(run, tmp_path):
     assert "table.seeds=0 must be greater" in done.stderr
 
 
+@pytest.mark.slow
 def test_building_starts_cold_each_time(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
     figures = run_alone("building", "measure_building", "fem", 1)

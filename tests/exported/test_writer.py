@@ -21,6 +21,7 @@ def difference(of, path, readings, valid):
     return float(np.abs(found - expected.numpy()).max())
 
 
+@pytest.mark.slow
 def test_a_thousand_touches_have_the_probabilities_of_torch(exported):
     of, path = exported
     touches = of.device.replace(gestures=10_000).touches("validation")

@@ -80,6 +80,7 @@ def skin():
         thread.join(PATIENCE)
 
 
+@pytest.mark.slow
 def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
     words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
     words += ["seconds=15", "live.log=alarms.jsonl"]

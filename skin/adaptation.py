@@ -58,7 +58,10 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
     load_learner(store, parent, learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     touches, others = choose_gestures(target.device, settings)
-    point = load_operating_point(parent, learner, stored, target.config.evaluation)
+    if "skins" in stored.device:  # the threshold of the run holds for drawn skins together
+        point = choose_operating_point(learner, target.twin, target.config.evaluation)
+    else:
+        point = load_operating_point(parent, learner, stored, target.config.evaluation)
     values = {} if others is None else _before(learner, others, point)
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
     with store.run(name, identity, parent.info.run_id) as run:

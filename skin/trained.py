@@ -1,5 +1,6 @@
 """A finished training run that predicts, for scripts and for ``skin live``."""
 
+import logging
 import warnings
 from dataclasses import dataclass
 
@@ -10,13 +11,15 @@ from torch import Tensor
 from skin.build import build_data, build_device, build_learner, build_skin
 from skin.config import Tracking, plain, validate_config
 from skin.device.base import AbstractDevice
-from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.settings import configured
 from skin.skin_distribution import SkinDistribution
 from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,36 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
     data = build_data(config, device.blank())
     load_learner(store, run, learner, data)
     known = data.example
-    point = load_operating_point(run, learner, stored, config.evaluation)
+    point = choose_for_skin(learner, stored, config) or load_operating_point(
+        run, learner, stored, config.evaluation
+    )
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
+
+
+def choose_for_skin(
+    learner: AbstractLearner, stored: DictConfig, config: DictConfig
+) -> OperatingPoint | None:
+    """Return an operating point for the skin of a device, for a run that was trained on drawn skins.
+
+    Safe touches are more easily mistaken on some skins than on others, so the threshold that was chosen over
+    all of them has another false-alarm rate on each. This one is chosen on fresh gestures on the skin, each
+    measured by a device that is drawn as in training. None if the run was trained on one skin, or if the
+    device has drawn skins too.
+
+    Args:
+        learner: of the run, trained.
+        stored: its configuration.
+        config: its configuration with the device to use.
+    """
+    if "skins" not in stored.device or "skins" in config.device:
+        return None
+    whole, here = plain(stored), plain(config)
+    for group in ("body", "layout", "simulator"):
+        whole[group] = whole["device"][group] = here[group]
+    device = build_device(OmegaConf.create(whole)).reference
+    assert device is not None
+    _log.info("choosing the threshold of the alarm on simulated touches of this skin")
+    return choose_operating_point(learner, device, config.evaluation)
 
 
 def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:

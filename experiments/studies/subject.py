@@ -71,10 +71,12 @@ class Subject:
         return self.of.trained.learner
 
     def point(self) -> "OperatingPoint":
-        """Return where the run raises the alarm."""
+        """Return where the run raises the alarm on this device."""
         from skin.evaluation.operating_point import OperatingPoint
+        from skin.trained import choose_for_skin
 
-        return self.of.trained.point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
+        point = choose_for_skin(self.learner, self.of.stored, self.config) or self.of.trained.point
+        return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """A finished run for a live view."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from omegaconf import DictConfig
@@ -11,7 +12,7 @@ from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched
 from skin.stored_run import apply_overrides, find_run, load_configuration
 from skin.tracking import Store
-from skin.trained import load_trained
+from skin.trained import choose_for_skin, load_trained
 
 
 def watch_run(
@@ -32,7 +33,8 @@ def watch_run(
     store = Store.open(config.tracking)
     run = find_run(store, config.run)
     stored = load_configuration(store, run, config.trust)
-    device = build_device(apply_overrides(stored, config, given))
+    watched = apply_overrides(stored, config, given)
+    device = build_device(watched)
     # The training data stay those of the run, for any watched device.
     trained = apply_overrides(
         stored, config, [one for one in given if not one.startswith(("device=", "device."))]
@@ -42,6 +44,8 @@ def watch_run(
     if advice := engine_builder.simulator_warning(stored, device):
         say(advice)
     of = load_trained(store, run, trained, stored)
+    if point := choose_for_skin(of.learner, stored, watched):
+        of = replace(of, point=point)
     engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)
     if of.point is not None:
         above = live.patience.above

@@ -129,10 +129,9 @@ class TouchData(pl.LightningDataModule):
         Raises:
             InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
         """
-        if self._known is not None and self._known[1].layout_free:
+        if self._known is not None and self._layout_free:
             return self._known[1]
-        make: Any = getattr(self._make, "func", self._make)
-        if positions.ndim != 2 and not make.layout_free:
+        if positions.ndim != 2 and not self._layout_free:
             raise InputError(
                 "representations are built for one layout, got positions per frame: give one position "
                 "(x, y, z) per sensor, and how far it moves as Touches.motion"
@@ -150,14 +149,19 @@ class TouchData(pl.LightningDataModule):
         """Return the frames of touches, on the touches' device."""
         place = touches.readings.device
         representation = self.representation_for(touches.positions.cpu()).to(place)
-        if representation.layout_free and touches.geometry is None and self._geometry is not None:
-            touches = replace(touches, geometry=self._configured_geometry.to(place))
+        if touches.geometry is None and self.geometry is not None:
+            touches = replace(touches, geometry=self.geometry.to(place))
         return representation.show(touches)
 
     @cached_property
-    def _configured_geometry(self) -> Tensor:
-        assert self._geometry is not None
-        return self._geometry()
+    def geometry(self) -> Tensor | None:
+        """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
+        return self._geometry() if self._layout_free and self._geometry is not None else None
+
+    @property
+    def _layout_free(self) -> bool:
+        make: Any = getattr(self._make, "func", self._make)
+        return bool(make.layout_free)
 
     def train_dataloader(self) -> "_Batches":
         """Return the batches of the training split, in another order each epoch."""

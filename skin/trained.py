@@ -90,28 +90,26 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
     data = build_data(config, device.blank())
     load_learner(store, run, learner, data)
     known = data.example
-    point = choose_for_skin(learner, stored, config) or load_operating_point(
-        run, learner, stored, config.evaluation
-    )
+    point = None if "skins" in config.device else choose_for_skin(learner, stored, config)
+    point = point or load_operating_point(run, learner, stored, config.evaluation)
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
 
 
 def choose_for_skin(
     learner: AbstractLearner, stored: DictConfig, config: DictConfig
 ) -> OperatingPoint | None:
-    """Return an operating point for the skin of a device, for a run that was trained on drawn skins.
+    """Return an operating point for the skin of a configuration, for a run that was trained on drawn skins.
 
     Safe touches are more easily mistaken on some skins than on others, so the threshold that was chosen over
     all of them has another false-alarm rate on each. This one is chosen on fresh gestures on the skin, each
-    measured by a device that is drawn as in training. None if the run was trained on one skin, or if the
-    device has drawn skins too.
+    measured by a device that is drawn as in training. None if the run was trained on one skin.
 
     Args:
         learner: of the run, trained.
         stored: its configuration.
-        config: its configuration with the device to use.
+        config: its configuration with the skin to use.
     """
-    if "skins" not in stored.device or "skins" in config.device:
+    if "skins" not in stored.device:
         return None
     whole, here = plain(stored), plain(config)
     for group in ("body", "layout", "simulator"):

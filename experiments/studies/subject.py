@@ -75,8 +75,11 @@ class Subject:
         from skin.evaluation.operating_point import OperatingPoint
         from skin.trained import choose_for_skin
 
-        point = choose_for_skin(self.learner, self.of.stored, self.config) or self.of.trained.point
-        return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
+        drawn = "skins" in self.config.device
+        point = None if drawn else choose_for_skin(self.learner, self.of.stored, self.config)
+        return (
+            point or self.of.trained.point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
+        )
 
 
 @dataclass(frozen=True)

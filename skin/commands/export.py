@@ -1,13 +1,14 @@
 """Write the network of a finished run, from readings to probabilities, as one ONNX file.
 
     skin export run=latest out=skin.onnx
+    skin export run=any_skin body=arm layout.path=sensors.csv
     skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
 
 The file is compared with the run on simulated or recorded touches first.
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +16,7 @@ from annotated_types import Ge, Gt
 from omegaconf import DictConfig
 
 from skin.command import command
-from skin.config import plain
+from skin.config import overrides, plain
 from skin.errors import InputError
 from skin.files import results
 
@@ -52,13 +53,16 @@ def main(config: DictConfig) -> None:
     from skin.hardware.live.engine_builder import describe, simulator_warning
     from skin.stored_run import apply_overrides, find_run, load_configuration
     from skin.tracking import Store
-    from skin.trained import load_trained
+    from skin.trained import choose_for_skin, load_trained
 
     quiet()
     store = Store.open(config.tracking)
     run = find_run(store, config.run)
     stored = load_configuration(store, run, config.trust)
-    of = load_trained(store, run, apply_overrides(stored, config, []), stored)
+    whole = apply_overrides(stored, config, overrides())
+    of = load_trained(store, run, whole, stored)
+    if point := choose_for_skin(of.learner, stored, whole):
+        of = replace(of, point=point)
     module = of.learner.pipeline(of.positions)  # refused before anything is simulated
     if advice := simulator_warning(stored):
         print(advice, file=sys.stderr)
@@ -71,7 +75,7 @@ def main(config: DictConfig) -> None:
 
 def _touches(of: "Trained", count: int) -> "Touches":
     """Return at most ``count`` touches; a run on a recording has those of its own only."""
-    if (simulation := of.device.simulation) is None:
+    if (simulation := of.device.reference) is None:
         return of.device.touches("test")[:count]
     # A tenth of the gestures is the validation split.
     return simulation.replace(gestures=10 * max(10, count)).touches("validation")[:count]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from skin.recording import Touches
 from skin.representation.base import AbstractRepresentation
 
 if TYPE_CHECKING:
@@ -13,11 +14,29 @@ if TYPE_CHECKING:
 
 
 class Pipeline(nn.Module):
-    """The representation of one layout and a classifier."""
+    """The representation of one layout and a classifier.
 
-    def __init__(self, representation: AbstractRepresentation, classifier: "TouchClassifier") -> None:
+    Args:
+        representation: of the layout.
+        classifier: trained.
+        positions: (S, 3), m.
+        geometry: (S, G) of the sensors (:data:`skin.recording.GEOMETRY`); None if not needed.
+    """
+
+    positions: Tensor
+    geometry: Tensor | None
+
+    def __init__(
+        self,
+        representation: AbstractRepresentation,
+        classifier: "TouchClassifier",
+        positions: Tensor,
+        geometry: Tensor | None,
+    ) -> None:
         super().__init__()
         self.representation, self.task = representation, classifier.task
+        self.register_buffer("positions", positions)
+        self.register_buffer("geometry", geometry)
         # Not the LightningModule itself, whose properties need a trainer.
         self.fusion, self.summary, self.head = classifier.fusion, classifier.summary, classifier.head
 
@@ -25,7 +44,8 @@ class Pipeline(nn.Module):
         """Return probabilities (B, L) of readings (B, T, S), N, and valid (B, T, S), bool."""
         from skin.classifier import probabilities
 
-        frames = self.representation(readings, valid)
+        touches = Touches(readings, valid, self.positions, None, 1.0, geometry=self.geometry)
+        frames = self.representation.show(touches)
         embedding = self.fusion(frames)
         if self.summary is not None:
             embedding = torch.cat([embedding, self.summary(frames.summary)], dim=1)

@@ -179,7 +179,9 @@ class Network(AbstractLearner):
 
         if self._classifier is None or self._data is None:
             raise RuntimeError("fit or load the learner first")
-        return Pipeline(self._data.representation_for(positions), self._classifier).cpu().eval()
+        data = self._data
+        pipeline = Pipeline(data.representation_for(positions), self._classifier, positions, data.geometry)
+        return pipeline.cpu().eval()
 
     def _map(self, touches: Touches, function: "Callable[[TouchClassifier, Frames], Tensor]") -> Tensor:
         """Return a function of the classifier and frames, (B, ...), computed in chunks."""

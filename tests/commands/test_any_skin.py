@@ -80,6 +80,16 @@ def test_it_watches_nine_sensors_at_a_port(begin, folder):
 
 
 @pytest.mark.slow
+def test_it_is_exported_for_a_layout_from_a_file(run, folder):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    done = run(folder, "export", "out=nine.onnx", "export.touches=100", *OWN)
+    assert done.returncode == 0, done.stderr
+    model = onnxruntime.InferenceSession(folder / "nine.onnx")
+    shapes = {one.name: one.shape[1:] for one in [*model.get_inputs(), *model.get_outputs()]}
+    assert shapes == {"readings": [30, 9], "valid": [30, 9], "probabilities": [4]}
+
+
+@pytest.mark.slow
 def test_it_is_adapted_to_a_skin_that_must_be_named(run, folder):
     quick = ["adapt.gestures=8", "adapt.layers=[head]", "adapt.lr=[0.001]", "adapt.epochs=2"]
     quick += ["evaluation.safe_gestures=64"]

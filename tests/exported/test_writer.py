@@ -90,16 +90,10 @@ def test_a_file_that_differs_is_not_written(exported, tmp_path):
     of, _ = exported
 
     class Drifting(torch.nn.Module):
-        """Gives another answer at each call outside of an export."""
-
-        def __init__(self):
-            super().__init__()
-            self.calls = 0
+        """Gives another answer in an export."""
 
         def forward(self, readings, valid):
-            if not torch.compiler.is_exporting():
-                self.calls += 1
-            return readings.mean(dim=1)[:, :4].sigmoid() + self.calls
+            return readings.mean(dim=1)[:, :4].sigmoid() + torch.compiler.is_exporting()
 
     described = describe(of, "abc", "row", 0.3)
     with pytest.raises(InputError, match="would differ from the network by 1"):

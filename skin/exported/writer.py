@@ -20,7 +20,7 @@ from skin.exported.model import ExportedModel
 from skin.recording import Touches
 
 TOLERANCE = 1e-5
-"""Largest difference of a probability from that of torch. Twice the rounding error of torch is allowed, too."""
+"""Largest difference of a probability from that of torch, unless rounding makes a larger one in torch."""
 
 _OPSET = 20
 

@@ -26,7 +26,8 @@ class Accuracy:
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
-        task, point = subject.device.task, subject.of.trained.point
+        task = subject.device.task
+        point = subject.point() if subject.of.trained.point else None
         try:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example

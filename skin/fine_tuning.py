@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice, product
 from typing import Annotated, Literal
 
@@ -23,6 +24,7 @@ LEAST = 8
 
 _CLIP = 1.0  # largest norm of the gradient
 _CHUNK = 64  # gestures at a time when predicting
+_CLEAR = 2.0  # standard errors
 
 Layers = Literal["head", "all"]
 
@@ -63,15 +65,18 @@ class Trial:
     Attributes:
         layers, lr: the choice.
         losses: held-out loss before the training and after each epoch.
-        epochs: number of epochs with the lowest loss; 0: the original network.
-        logits: (B, L), held-out, after that number of epochs.
+        logits: (E, B, L), held-out, before the training and after each epoch.
     """
 
     layers: Layers
     lr: float
     losses: list[float]
-    epochs: int
     logits: Tensor
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs with the lowest loss; 0: the original network."""
+        return _lowest(self.losses)
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,8 @@ class Adaptation:
         trials: all choices.
         chosen: the one with the lowest held-out loss.
         before: probabilities (B, L) of the gestures from the original network.
-        after: probabilities (B, L) of each gesture from a network that was not trained on it, with the
-            chosen settings.
+        after: probabilities (B, L) of each gesture from a network that was not trained on it, with settings
+            that were not chosen on it.
         better: whether ``after`` is better than ``before``. If not, the network is not changed.
     """
 
@@ -110,8 +115,9 @@ def fine_tune(
     the fold is measured after each epoch. The choice and the number of epochs with the lowest mean loss are
     then used to train on all gestures.
 
-    The network is changed only if its held-out loss decreases by more than the standard error of the
-    decrease, and its held-out accuracy does not decrease.
+    The lowest of many losses is too low by chance. So the result is judged on each fold with the choice that
+    has the lowest loss on the other folds. The network is changed only if this loss is lower than that of
+    the original network by more than two standard errors of the difference, and the accuracy is not lower.
 
     Args:
         network: trained.
@@ -128,13 +134,14 @@ def fine_tune(
         torch.manual_seed(settings.seed)
         first = problem.logits(network.eval(), touches)
         trials = [problem.attempt(first, *choice) for choice in product(settings.layers, settings.lr)]
-        chosen = min(trials, key=lambda trial: trial.losses[trial.epochs])
-        before, after = (probabilities(logits, network.task) for logits in (first, chosen.logits))
-        better = chosen.epochs > 0 and _is_better(network, first, chosen.logits, labels)
+        chosen = min(trials, key=lambda trial: min(trial.losses))
+        last = problem.judged(trials)
+        before, after = (probabilities(logits, network.task) for logits in (first, last))
+        better = chosen.epochs > 0 and _is_better(network, first, last, labels)
         if better:
             steps = problem.epochs(touches, chosen.layers, chosen.lr, settings.folds)
-            last = next(islice(steps, chosen.epochs - 1, None))
-            network.load_state_dict(last.state_dict())
+            trained = next(islice(steps, chosen.epochs - 1, None))
+            network.load_state_dict(trained.state_dict())
     return Adaptation(trials, chosen, before, after, better)
 
 
@@ -165,6 +172,11 @@ class _Problem:
     touches: Touches
     settings: FineTuning
 
+    @cached_property
+    def folds(self) -> Tensor:
+        """The fold of each gesture, (B,)."""
+        return split_folds(self.touches.known_labels, self.settings.folds, self.settings.seed)
+
     def attempt(self, first: Tensor, layers: Layers, lr: float) -> Trial:
         """Train on all folds but one, for each, epoch by epoch, until the held-out loss rises.
 
@@ -174,23 +186,29 @@ class _Problem:
             lr: learning rate.
         """
         settings, touches, labels = self.settings, self.touches, self.touches.known_labels
-        folds = split_folds(labels, settings.folds, settings.seed)
-        held = [(folds == fold).nonzero().flatten() for fold in range(settings.folds)]
-        rest = [(folds != fold).nonzero().flatten() for fold in range(settings.folds)]
+        rest = [(self.folds != fold).nonzero().flatten() for fold in range(settings.folds)]
         runs = [self.epochs(touches[rows], layers, lr, fold) for fold, rows in enumerate(rest)]
-        losses, best, epochs = [float(self.network.loss(first, labels))], first, 0
-        for epoch in range(1, settings.epochs + 1):
-            logits = torch.empty_like(first)
-            for rows, run in zip(held, runs, strict=True):
-                logits[rows] = self.logits(next(run), touches[rows])
-            losses.append(float(self.network.loss(logits, labels)))
-            if losses[-1] < losses[epochs]:
-                best, epochs = logits, epoch
-            elif epoch - epochs >= settings.patience:
-                break
-        said = f"layers={layers} lr={lr:g}: held-out loss {losses[0]:.4f} before, {losses[epochs]:.4f} after"
-        print(f"{said} {epochs} epochs", file=sys.stderr, flush=True)
-        return Trial(layers, lr, losses, epochs, best)
+        losses, logits = [float(self.network.loss(first, labels))], [first]
+        while len(losses) <= settings.epochs and len(losses) - _lowest(losses) <= settings.patience:
+            found = torch.empty_like(first)
+            for fold, run in enumerate(runs):
+                rows = (self.folds == fold).nonzero().flatten()
+                found[rows] = self.logits(next(run), touches[rows])
+            losses.append(float(self.network.loss(found, labels)))
+            logits.append(found)
+        said = f"layers={layers} lr={lr:g}: held-out loss {losses[0]:.4f} before, {min(losses):.4f} after"
+        print(f"{said} {_lowest(losses)} epochs", file=sys.stderr, flush=True)
+        return Trial(layers, lr, losses, torch.stack(logits))
+
+    def judged(self, trials: Sequence[Trial]) -> Tensor:
+        """Return the logits (B, L) of each fold, of the choice with the lowest loss on the other folds."""
+        labels, found = self.touches.known_labels, torch.empty_like(trials[0].logits[0])
+        candidates = torch.cat([trial.logits for trial in trials])
+        for fold in range(self.settings.folds):
+            held = self.folds == fold
+            losses = [float(self.network.loss(logits[~held], labels[~held])) for logits in candidates]
+            found[held] = candidates[_lowest(losses)][held]
+        return found
 
     def epochs(self, touches: Touches, layers: Layers, lr: float, number: int) -> Iterator[TouchClassifier]:
         """Yield a copy of the network after each epoch; ``number`` selects the order of the gestures."""
@@ -226,8 +244,13 @@ def _train_mode(network: nn.Module) -> None:
             module.eval()
 
 
+def _lowest(losses: Sequence[float]) -> int:
+    """Return the place of the lowest loss, the first of equal ones."""
+    return min(range(len(losses)), key=losses.__getitem__)
+
+
 def _is_better(network: TouchClassifier, first: Tensor, last: Tensor, labels: Tensor) -> bool:
-    """Return whether the held-out loss is lower by more than a standard error, and accuracy is not lower."""
+    """Return whether the loss is lower by more than two standard errors, and the accuracy is not lower."""
     one, other = (
         torch.stack(
             [network.loss(logits[row : row + 1], labels[row : row + 1]) for row in range(len(labels))]
@@ -240,4 +263,4 @@ def _is_better(network: TouchClassifier, first: Tensor, last: Tensor, labels: Te
         metrics(probabilities(logits, network.task), labels, network.task)["overall/accuracy"]
         for logits in (first, last)
     )
-    return bool(gain.mean() > error) and after >= before
+    return bool(gain.mean() > _CLEAR * error) and after >= before

@@ -1,6 +1,5 @@
 """A finished training run that predicts, for scripts and for ``skin live``."""
 
-import logging
 import warnings
 from dataclasses import dataclass
 
@@ -18,8 +17,6 @@ from skin.settings import configured
 from skin.skin_distribution import SkinDistribution
 from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,6 @@ def choose_for_skin(
         whole[group] = whole["device"][group] = here[group]
     device = build_device(OmegaConf.create(whole)).reference
     assert device is not None
-    _log.info("choosing the threshold of the alarm on simulated touches of this skin")
     return choose_operating_point(learner, device, config.evaluation)
 
 

@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from skin.build import build_learner
 from skin.datamodule import TouchData
 from skin.errors import InputError
-from skin.fine_tuning import FineTuning, fine_tune, split_folds
+from skin.fine_tuning import FineTuning, Trial, _Problem, fine_tune, split_folds
 
 SMALL = FineTuning(layers=["all"], lr=[3e-3], epochs=15, patience=5)
 
@@ -74,6 +74,20 @@ def test_what_is_not_better_leaves_the_network_as_it_was(trained, network):
     assert not found.better
     assert found.choice == ""
     assert equal(network.state_dict(), before)
+
+
+def test_a_fold_is_judged_by_the_choice_of_the_others(trained, network):
+    """Lowest of all is a candidate that is right on one fold only; that fold must not count for it."""
+    _, data = trained
+    touches = data.touches("validation")
+    problem = _Problem(network, data, touches, SMALL)
+    right, held = 8 * (touches.known_labels - 0.5), (problem.folds == 0)[:, None]
+    first = torch.where(held, -right, right)
+    lucky = torch.where(held, right, 0.9 * right)
+    losses = [float(network.loss(logits, touches.known_labels)) for logits in (first, lucky)]
+    assert losses[1] < losses[0]
+    judged = problem.judged([Trial("all", 1e-3, losses, torch.stack([first, lucky]))])
+    assert torch.equal(judged, torch.where(held, first, lucky))
 
 
 def test_gestures_are_held_out_of_what_predicts_them(trained, network):

@@ -44,6 +44,8 @@ def watch_run(
     if advice := engine_builder.simulator_warning(stored, device):
         say(advice)
     of = load_trained(store, run, trained, stored)
+    if "skins" in stored.device:
+        say("choosing the threshold of the alarm on simulated touches of this skin")
     if point := choose_for_skin(of.learner, stored, watched):
         of = replace(of, point=point)
     engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)

@@ -16,21 +16,12 @@ from skin.design.sweep import Step
 from skin.plot.figures import COLOURS, MARKS, save_figure
 from skin.sensors import Sensors
 
+_WIDE = ("radius, mm", "reach, mm")  # columns without room in the table of a sweep
+
 
 def print_bounds(found: Sequence[Findings]) -> None:
     """Print one line per force; the reach is the receptive radius."""
-    names = ("force, N", "blind, %", "place, mm", "90 %, mm", "radius, mm", "force, %", "reach, mm")
-    table = Table(*names, title="Bounds of a fingertip (median over touches)")
-    for one in found:
-        lengths = one.place_m, one.place_90_m, one.radius_m
-        table.add_row(
-            f"{one.force_N:g}",
-            f"{100 * one.blind_share:.1f}",
-            *(f"{1e3 * length:.2f}" for length in lengths),
-            f"{100 * one.force_relative:.1f}",
-            f"{1e3 * one.receptive_radius_m:.1f}",
-        )
-    Console().print(table)
+    _print([_cells(one) for one in found])
 
 
 def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tensor], path: Path) -> Path:
@@ -67,30 +58,16 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
 
 def print_sweep(steps: Sequence[Step]) -> None:
     """Print one line per step and force."""
-    names = (
-        "thickness, mm",
-        "sensors",
-        "pitch, mm",
-        "force, N",
-        "blind, %",
-        "place, mm",
-        "90 %, mm",
-        "force, %",
-    )
-    table = Table(*names, title="Bounds of a fingertip (median over touches)")
+    rows = []
     for step in steps:
-        for one in step.findings:
-            table.add_row(
-                f"{1e3 * step.thickness:g}",
-                f"{step.grid[0]} x {step.grid[1]}",
-                f"{1e3 * step.pitch:.0f}",
-                f"{one.force_N:g}",
-                f"{100 * one.blind_share:.1f}",
-                f"{1e3 * one.place_m:.2f}",
-                f"{1e3 * one.place_90_m:.2f}",
-                f"{100 * one.force_relative:.1f}",
-            )
-    Console().print(table)
+        about = {
+            "thickness, mm": f"{1e3 * step.thickness:g}",
+            "sensors": f"{step.grid[0]} x {step.grid[1]}",
+            "pitch, mm": f"{1e3 * step.pitch:.0f}",
+        }
+        cells = (_cells(one) for one in step.findings)
+        rows += [about | {name: text for name, text in each.items() if name not in _WIDE} for each in cells]
+    _print(rows)
 
 
 def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
@@ -119,3 +96,23 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
     axes[0].set_ylabel("bound of the place, mm")
     axes[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return save_figure(figure, path)
+
+
+def _cells(one: Findings) -> dict[str, str]:
+    """Return name and text of each column of a table."""
+    return {
+        "force, N": f"{one.force_N:g}",
+        "blind, %": f"{100 * one.blind_share:.1f}",
+        "place, mm": f"{1e3 * one.place_m:.2f}",
+        "90 %, mm": f"{1e3 * one.place_90_m:.2f}",
+        "radius, mm": f"{1e3 * one.radius_m:.2f}",
+        "force, %": f"{100 * one.force_relative:.1f}",
+        "reach, mm": f"{1e3 * one.receptive_radius_m:.1f}",
+    }
+
+
+def _print(rows: Sequence[dict[str, str]]) -> None:
+    table = Table(*rows[0], title="Bounds of a fingertip (median over touches)")
+    for row in rows:
+        table.add_row(*row.values())
+    Console().print(table)

@@ -21,7 +21,6 @@ from skin.touch.gesture import GestureSettings, model_window
 from skin.wire.announcement import AnnouncementListener
 from skin.wire.conversion import UnitConversion
 from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.format_detection import Format
 from skin.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
@@ -31,18 +30,18 @@ from skin.wire.segmentation import (
     label_plan,
     label_text,
 )
-from skin.wire.serial_source import SerialSource
+from skin.wire.serial_source import SerialSettings, SerialSource
 from skin.wire.skin import Skin
 from skin.wire.source import Source
 from skin.wire.tare import Tare, warm_up
 from skin.wire.text import Header
 
 _LABELS = ("announced", "prompted", "none")
-_OF_THE_PORT = tuple(one.name for one in fields(SerialSource) if one.name not in ("sensors", "rate"))
+_OF_THE_PORT = tuple(one.name for one in fields(SerialSettings))
 
 
 @dataclass(kw_only=True, eq=False)
-class Serial(AbstractWired):
+class Serial(SerialSettings, AbstractWired):
     """Yields gestures on a real or emulated skin; its only split is ``test``.
 
     Readings are in N above the baseline, which is taken from resampled values, because the maximum of noise
@@ -51,14 +50,11 @@ class Serial(AbstractWired):
     Args:
         body: the sheet of the model.
         layout: positions of its sensors; the device must send as many values.
-        port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
+        port, baudrate, tare, ...: as in :class:`skin.wire.serial_source.SerialSettings`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: number of gestures.
         seed: of the order of prompts.
-        tare: duration of the tare, s.
         trigger: force above which a window begins with ``labels=none``, N.
-        scale: N per unit.
-        calibration: calibration file.
         touch: rate and window of the model (``conf/touch.yaml``).
         stream: add the label ``touch``.
 
@@ -68,20 +64,10 @@ class Serial(AbstractWired):
 
     body: AbstractBody
     layout: AbstractLayout
-    port: str | None = None
-    baudrate: int = 115200
-    format: Format = "auto"
     labels: str = "announced"
     gestures: int = 16
     seed: int = 0
-    tare: float = 2.0
     trigger: float = 0.3
-    scale: float | None = None
-    calibration: str | None = None
-    limits: Sequence[float | None] | None = None
-    timeout: float = 10.0
-    backoff: Sequence[float] = (1.0, 10.0)
-    silence: float | None = 5.0
     touch: Mapping[str, Any] | GestureSettings | None = None
     stream: bool = False
 

@@ -22,24 +22,17 @@ from skin.wire.transport import open_stream
 _AS_OPENED = ("baudrate", "format", "timeout", "backoff", "silence")
 
 
-@dataclass(kw_only=True, frozen=True)
-class SerialSource:
-    """A skin at a port. torch is not imported.
+@dataclass(kw_only=True, eq=False)
+class SerialSettings:
+    """How to read a skin at a port.
 
     Attributes:
-        sensors: S.
-        rate: of the model, Hz.
         port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
         tare: duration of the tare, s.
         scale: N per unit.
         calibration: calibration file.
-
-    Raises:
-        InputError: an invalid setting, or a calibration of another number of sensors.
     """
 
-    sensors: int
-    rate: float
     port: str | None = None
     baudrate: int = 115200
     format: Format = "auto"
@@ -50,6 +43,23 @@ class SerialSource:
     timeout: float = 10.0
     backoff: Sequence[float] = (1.0, 10.0)
     silence: float | None = 5.0
+
+
+@dataclass(kw_only=True, eq=False)
+class SerialSource(SerialSettings):
+    """A skin at a port. torch is not imported.
+
+    Attributes:
+        sensors: S.
+        rate: of the model, Hz.
+        port, baudrate, ...: as in :class:`SerialSettings`.
+
+    Raises:
+        InputError: an invalid setting, or a calibration of another number of sensors.
+    """
+
+    sensors: int
+    rate: float
 
     def __post_init__(self) -> None:
         if not self.tare >= 0:

@@ -22,20 +22,39 @@ def study_figure(study: Study, trials: Sequence[Trial]) -> Figure:
 
 
 def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
-    """Draw every trial of each variant and condition, the mean, and two standard errors."""
+    """Draw every trial of each variant and condition, the mean, and two standard errors.
+
+    Conditions have a line each, or share the line of their variant if there are several of both.
+    """
     metric, found = study.metrics[0], group_trials(trials)
-    drawn = Figure(figsize=(7, 1.2 + 0.3 * len(found)), layout="constrained")
+    variants, conditions = (list(dict.fromkeys(key[part] for key in found)) for part in (0, 1))
+    shared = len(variants) > 1 and len(conditions) > 1
+    lines = variants if shared else [", ".join(filter(None, key)) for key in found]
+    height = 0.1 * max(len(conditions), 3) if shared else 0.3
+    drawn = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
     axis = drawn.subplots()
-    scale = 1 if metric in UNITS else 100
-    for place, each in enumerate(found.values()):
-        if every := [scale * one.metrics[metric] for one in each if metric in one.metrics]:
-            mean, error = mean_and_error(each, metric)
-            axis.plot(every, [place] * len(every), "o", color=COLOURS[0], alpha=0.35, ms=4)
-            axis.errorbar(mean, place, xerr=2 * error, fmt="|", color="black", ms=10, capsize=3)
-    axis.set_yticks(range(len(found)), [", ".join(filter(None, key)) for key in found], fontsize=8)
-    axis.invert_yaxis()
+    scale, labelled = 1 if metric in UNITS else 100, set[str]()
+    for number, ((variant, condition), each) in enumerate(found.items()):
+        if not (every := [scale * one.metrics[metric] for one in each if metric in one.metrics]):
+            continue
+        style = conditions.index(condition) if shared else 0
+        apart = 0.8 * ((style + 0.5) / len(conditions) - 0.5) if shared else 0.0
+        place = (variants.index(variant) if shared else number) + apart
+        colour, marker = COLOURS[style % len(COLOURS)], _MARKERS[style % len(_MARKERS)]
+        mean, error = mean_and_error(each, metric)
+        axis.plot(every, [place] * len(every), marker, color=colour, alpha=0.35, ms=4)
+        ends = colour if shared else "black"
+        label = condition or "no condition" if shared and condition not in labelled else None
+        labelled.add(condition)
+        axis.errorbar(mean, place, xerr=2 * error, fmt=marker if shared else "|", color=ends, label=label,
+                      ms=4 if shared else 10, capsize=2)  # fmt: skip
+    axis.set_yticks(range(len(lines)), lines, fontsize=8)
+    axis.set_ylim(len(lines) - 0.5, -0.5)
     axis.set_xlabel(f"{_label(metric)}: each run, mean and two standard errors")
-    axis.set_title(study.about, fontsize=10)
+    axis.set_title(study.about, fontsize=9, wrap=True)
+    if shared:
+        drawn.legend(loc="outside right center", fontsize=7)
+        axis.grid(axis="y", alpha=0.2)
     return drawn
 
 

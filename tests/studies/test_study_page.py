@@ -151,3 +151,11 @@ def test_an_axis_draws_lines_over_the_numbers_in_the_names(single):
     assert line[0].get_xdata().tolist() == [4, 9, 25]
     assert line[0].get_ydata().tolist() == pytest.approx([90, 95, 97])
     assert (line.get_label(), axis.get_xlabel()) == ("grid", "number of sensors")
+
+
+def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend():
+    found = [trial(name, "0", 0.9, condition=at) for name in ("one", "other") for at in ("", "rough")]
+    drawn = study_figure(STUDY, found)
+    (axis,), (legend,) = drawn.axes, drawn.legends
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["one", "other"]
+    assert [text.get_text() for text in legend.get_texts()] == ["no condition", "rough"]

@@ -11,9 +11,9 @@ PEERS := .venv-peers
 WHEEL := .venv-wheel
 # A training of a few seconds; ignore the scores.
 SMOKE := experiment=features simulator=naive data.gestures=400 device.test_gestures=200 evaluation.devices=0 evaluation.layouts=0
-TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs $(if $(MARK),-m "$(MARK)")
-# Tests to run: all but those marked slow. Empty: all.
+# Marked tests to run. Empty: all.
 MARK ?= not slow
+TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs $(if $(MARK),-m "$(MARK)")
 # Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell

@@ -25,7 +25,7 @@ def test_a_run_is_measured_before_and_after_and_is_itself_again_then(configured)
     learner.fit(build_data(config, device))
     before = deepcopy(learner.network.state_dict())
     trained = Trained(device, learner, 30, device.touches("train").positions, 10.0)
-    other = device.replace(gestures=60, data_seed=1, gain_spread=0.5, time_constant=0.4, seed=2)
+    other = device.replace(gestures=300, data_seed=1, gain_spread=0.5, time_constant=0.4, seed=2)
     subject = Subject(config, other, Finished(None, None, config, trained))
     quick = {"layers": ["all"], "lr": [1e-3], "epochs": 15}
     with initialize_config_dir(str(CONF), version_base="1.3"):

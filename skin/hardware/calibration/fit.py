@@ -61,7 +61,10 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     gains = [gain for n in answering if (gain := channels[n].gain)]
     typical = float(np.median(gains)) if gains else 0.0
     if not gains:
-        raise InputError("no channel responds to a press: check layout, indenter and the session's clock")
+        raise InputError(
+            "no channel responds to a press below its limit: check layout, indenter, the forces and the "
+            "session's clock"
+        )
     for number in answering:
         if (channels[number].gain or 0.0) < _DEAD * typical:
             channels[number].broken = "dead"
@@ -127,7 +130,9 @@ def _answer(
 ) -> None:
     """Fit gain and clip on the loading branch, hysteresis on the unloading branch."""
     measured = _rest_taken(bench, number, channel)
-    there = used & np.isfinite(measured) & (bench.true[:, number] > 0)
+    true = np.where(used, bench.true[:, number], 0.0)
+    # In a solid, every press reaches every sensor a little; such readings are noise.
+    there = np.isfinite(measured) & (true > _PRESSED * true.max())
     up = there & bench.loading
     if up.sum() < 10:
         return

@@ -16,6 +16,7 @@ from skin.layout.grid import Grid
 from skin.signal.calibration import Calibration, write_calibration
 from skin.signal.imperfection import Imperfection
 from skin.simulator.fem import PlatesAndBeams
+from skin.simulator.solid import Solid
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
@@ -57,6 +58,14 @@ def test_hidden_constants_are_found(known):
     np.testing.assert_allclose(values["hysteresis"], hidden["hysteresis"], rtol=0.1, atol=0.004)
     np.testing.assert_allclose(values["quantum"], hidden["quantum"], rtol=1e-3)
     np.testing.assert_allclose(values["clip"], 10, rtol=0.01)
+
+
+def test_gains_are_found_on_a_solid_where_each_press_reaches_every_sensor():
+    body = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
+    skin = Simulated(body=body, layout=Grid(4, 4), simulator=Solid, gain_spread=0.3)
+    found = fit_calibration(session_of(skin)).values()
+    np.testing.assert_allclose(found["gain"], skin.constants.gain.numpy(), rtol=0.02)
+    np.testing.assert_allclose(found["clip"], 10, rtol=0.01)
 
 
 def test_held_out_presses_are_simulated_down_to_the_noise(known):

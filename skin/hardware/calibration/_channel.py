@@ -7,8 +7,8 @@ import numpy as np
 from scipy.stats import theilslopes
 
 _BLOCKS = 200
-_POINTS = 400
 _MAD = 1.4826
+_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def clip_and_gain(true: np.ndarray, measured: np.ndarray, noise: float) -> tuple
     """Return the slope of measured over true readings, its standard error, and the plateau or None.
 
     Args:
-        true: (n,), loading frames.
+        true: (n,), above 0, loading frames.
         measured: (n,), without offset.
         noise: of a frame.
     """
@@ -115,9 +115,17 @@ def clip_and_gain(true: np.ndarray, measured: np.ndarray, noise: float) -> tuple
 
 
 def _slope(true: np.ndarray, measured: np.ndarray) -> tuple[float, float]:
-    """Return the Theil-Sen slope and its standard error; NaN and infinity with too few readings."""
-    if len(true) < 3 or np.ptp(true) == 0:
+    """Return the slope of the line through 0 with the least absolute error, and its standard error.
+
+    It is the median of the ratios, weighted with ``true`` > 0. A line with an intercept would be fitted to
+    the differences between presses with one force, which are due to their places. NaN and infinity with
+    fewer than 3 readings.
+    """
+    if len(true) < 3:
         return math.nan, math.inf
-    some = np.unique(np.linspace(0, len(true) - 1, _POINTS).astype(int))
-    slope, _, low, high = theilslopes(measured[some], true[some])
-    return float(slope), float(high - low) / (2 * 1.96)
+    ratios = measured / true
+    order = np.argsort(ratios)
+    weight = np.cumsum(true[order])
+    slope = float(ratios[order][np.searchsorted(weight, weight[-1] / 2)])
+    spread = _MAD * float(np.median(np.abs(measured - slope * true)))
+    return slope, _MEDIAN * spread / math.sqrt(float((true**2).sum()))

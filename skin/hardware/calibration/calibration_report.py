@@ -1,5 +1,6 @@
 """Print the result of a calibration."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from rich.table import Table
 from skin.hardware.calibration.held_out import HeldOutErrors
 from skin.signal.calibration import QUANTITIES, Calibration
 
+_TOO_FAR = 0.25  # error of a held-out force; positions off by 2 mm cause less
 _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 
@@ -42,3 +44,11 @@ def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     if len(outcome.force):
         off = np.abs(outcome.force - 1)
         print(f"force of these presses from readings: off by {np.median(off):.1%}, at most {off.max():.1%}")
+        if off.max() > _TOO_FAR:
+            warnings.warn(
+                f"the force of a held-out press is off by {off.max():.0%}: sensors are probably not where "
+                "the layout says, and then their gains are wrong, and some may be called dead; measure "
+                "their positions",
+                UserWarning,
+                stacklevel=2,
+            )

@@ -60,3 +60,13 @@ def test_gain_and_plateau(limit):
     assert gain == pytest.approx(1.3, rel=0.01)
     assert error < 0.02
     assert found == (None if limit is None else pytest.approx(limit, abs=0.01))
+
+
+def test_the_gain_is_found_from_two_presses_with_one_force_each_below_the_limit():
+    """Off the layout by a millimetre, the stronger press may be the weaker one in the simulation."""
+    true = np.repeat([4.81, 4.62, 47.0], 2000)
+    measured = np.minimum(np.repeat([4.89, 4.94, 47.0], 2000), 10.0) + noise(6, 0.05)
+    gain, error, limit = clip_and_gain(true, measured, 0.05)
+    assert 4.89 / 4.81 <= gain <= 4.94 / 4.62
+    assert error < 0.01
+    assert limit == pytest.approx(10, rel=0.01)

@@ -8,6 +8,7 @@ from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench_data import BenchData, build_bench_data
+from skin.hardware.calibration.calibration_report import print_calibration
 from skin.hardware.calibration.fit import fit_calibration
 from skin.hardware.calibration.gauge import Gauge, per_newton
 from skin.hardware.calibration.held_out import estimate_force, evaluate_held_out
@@ -60,12 +61,22 @@ def test_hidden_constants_are_found(known):
     np.testing.assert_allclose(values["clip"], 10, rtol=0.01)
 
 
-def test_gains_are_found_on_a_solid_where_each_press_reaches_every_sensor():
+def solid(**hidden) -> Simulated:
     body = Sheet([0.16, 0.16], [16, 16], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
-    skin = Simulated(body=body, layout=Grid(4, 4), simulator=Solid, gain_spread=0.3)
+    return Simulated(body=body, layout=Grid(4, 4), simulator=Solid, **hidden)
+
+
+def test_gains_are_found_on_a_solid_where_each_press_reaches_every_sensor():
+    skin = solid(gain_spread=0.3)
     found = fit_calibration(session_of(skin)).values()
     np.testing.assert_allclose(found["gain"], skin.constants.gain.numpy(), rtol=0.02)
     np.testing.assert_allclose(found["clip"], 10, rtol=0.01)
+
+
+def test_gains_are_not_trusted_where_sensors_are_not_where_the_layout_says():
+    bench = session_of(solid(position_error=0.008))
+    with pytest.warns(UserWarning, match="not where the layout says"):
+        print_calibration(fit_calibration(bench), evaluate_held_out(bench, 0.25))
 
 
 def test_held_out_presses_are_simulated_down_to_the_noise(known):

@@ -98,6 +98,8 @@ def decay(time: np.ndarray, values: np.ndarray, floor: float) -> tuple[float, fl
 def clip_and_gain(true: np.ndarray, measured: np.ndarray, noise: float) -> tuple[float, float, float | None]:
     """Return the slope of measured over true readings, its standard error, and the plateau or None.
 
+    The slope is NaN if fewer than three readings are below the plateau.
+
     Args:
         true: (n,), above 0, loading frames.
         measured: (n,), without offset.
@@ -105,9 +107,14 @@ def clip_and_gain(true: np.ndarray, measured: np.ndarray, noise: float) -> tuple
     """
     top = true >= 0.9 * true.max()
     level = float(np.median(measured[top]))
-    slope, _ = _slope(true[measured < 0.7 * level], measured[measured < 0.7 * level])
+    if level <= 5 * noise:
+        return *_slope(true, measured), None
+    low = measured < min(0.9 * level, level - 5 * noise)
+    slope, error = _slope(true[low], measured[low])
     margin = max(2 * noise, 0.02 * level)
-    if not slope * np.median(true[top]) > level + margin:
+    if math.isnan(slope):
+        return slope, error, level
+    if slope * np.median(true[top]) <= level + margin:
         return *_slope(true, measured), None
     level = float(np.median(measured[slope * true > level + margin]))
     below = slope * true < level - margin

@@ -66,7 +66,8 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
             "session's clock"
         )
     for number in answering:
-        if (channels[number].gain or 0.0) < _DEAD * typical:
+        gain = channels[number].gain
+        if gain is not None and gain < _DEAD * typical:
             channels[number].broken = "dead"
     return _calibration(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
 
@@ -137,6 +138,8 @@ def _answer(
     if up.sum() < 10:
         return
     gain, channel.error, channel.clip = _channel.clip_and_gain(lagged[up], measured[up], channel.idle.noise)
+    if np.isnan(gain):  # every reading is at the limit
+        return
     # A slope within its error may be noise.
     channel.gain = gain if gain > _SURE * channel.error else 0.0
     limit = np.inf if channel.clip is None else 0.9 * channel.clip

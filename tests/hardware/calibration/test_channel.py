@@ -70,3 +70,17 @@ def test_the_gain_is_found_from_two_presses_with_one_force_each_below_the_limit(
     assert 4.89 / 4.81 <= gain <= 4.94 / 4.62
     assert error < 0.01
     assert limit == pytest.approx(10, rel=0.01)
+
+
+def test_a_channel_at_its_limit_has_no_gain():
+    true = np.repeat([20.0, 30.0, 40.0], 2000)
+    gain, _, limit = clip_and_gain(true, 10.0 + noise(7, 0.05), 0.05)
+    assert np.isnan(gain)
+    assert limit == pytest.approx(10, rel=0.01)
+
+
+def test_a_limit_is_found_where_only_the_first_step_is_below_it():
+    true = np.repeat([4.8, 9.6, 47.0], 2000)
+    gain, _, limit = clip_and_gain(true, np.minimum(1.6 * true, 10.0) + noise(8, 0.05), 0.05)
+    assert gain == pytest.approx(1.6, rel=0.01)
+    assert limit == pytest.approx(10, rel=0.01)

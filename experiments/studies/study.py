@@ -127,17 +127,14 @@ def as_overrides(settings: Mapping[str, Any]) -> list[str]:
 
 def sweeps(study: Study, smoke: bool = False) -> Iterator[tuple[Mapping[str, Any], list[str]]]:
     """Yield each sweep that trains a study's variants: its own settings, and all of its overrides."""
-    last = [
-        *as_overrides(study.common),
-        f"seed={_text(study.seeds)}",
-        *(SMOKE if smoke else ()),
-        *passed_overrides(),
-    ]
+    last = [f"seed={_text(study.seeds)}", *(SMOKE if smoke else ()), *passed_overrides()]
     rows = {} if study.rows is None else {"experiment": study.rows}
     fixed = {_key(one) for one in last}
     for block in study.trainings:
         own = {key: value for key, value in (block | rows).items() if key not in fixed}
-        yield own, [*as_overrides({key: value for key, value in own.items() if key != "name"}), *last]
+        settings = {key: value for key, value in own.items() if key != "name"}
+        shared = {key: value for key, value in study.common.items() if key not in own}
+        yield own, [*as_overrides(settings), *as_overrides(shared), *last]
 
 
 def variants(study: Study, smoke: bool = False) -> list[Variant]:

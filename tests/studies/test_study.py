@@ -15,6 +15,7 @@ from skin.paths import CONF
 NAMES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
+SENSORS = "study=sensors_other", "study.seeds=[0]"
 OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "self_share", "same/any/disagreement"}
 
 
@@ -103,6 +104,13 @@ def test_settings_of_the_command_line_hold_for_every_variant(composed):
         config = one.configs["0"]
         assert (config.device.noise, config.trainer.max_epochs) == (0.2, 3)
         assert (config.evaluation.devices, config.tracking.experiment) == (0, "studies")
+
+
+def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
+    simulators = {one.name: one.configs["0"].simulator for one in composed(*SENSORS)[1]}
+    assert simulators["fem grid 9"]._target_ != simulators["arm grid 9"]._target_
+    given = composed(*SENSORS, "simulator=naive")[1]
+    assert len({one.configs["0"].simulator._target_ for one in given}) == 1
 
 
 def test_one_row_is_a_list_of_one(composed):

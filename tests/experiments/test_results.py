@@ -94,7 +94,8 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     [
         (
             ["results.part=tables"],
-            "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, studies, design",
+            "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, adapt, studies, "
+            "design",
         ),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.action=show"], "results.action"),

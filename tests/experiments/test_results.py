@@ -23,6 +23,7 @@ PARTS = [
     "results.parts.peers=[]",
     "results.parts.sensors=[]",
     "results.parts.any_skin=[]",
+    "results.parts.adapt=[]",
     "results.parts.design=[]",
     "results.file=runs.parquet",
     "out=docs",

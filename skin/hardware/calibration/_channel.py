@@ -107,7 +107,7 @@ def clip_and_gain(true: np.ndarray, measured: np.ndarray, noise: float) -> tuple
     """
     top = true >= 0.9 * true.max()
     level = float(np.median(measured[top]))
-    if level <= 5 * noise:
+    if level <= 5 * noise:  # it does not respond, which is no plateau
         return *_slope(true, measured), None
     low = measured < min(0.9 * level, level - 5 * noise)
     slope, error = _slope(true[low], measured[low])

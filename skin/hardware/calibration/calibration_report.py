@@ -36,7 +36,7 @@ def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     broken = {number for group in calibration.broken.values() for number in group}
     unknown = [n for n, gain in enumerate(calibration.sensors["gain"]) if gain is None and n not in broken]
     if unknown:
-        print(f"not pressed, so of median gain: sensors {', '.join(map(str, unknown))}")
+        print(f"not pressed, or at the limit, so of median gain: sensors {', '.join(map(str, unknown))}")
     print(
         f"RMSE on {len(outcome.held_out)} held-out presses: simulated {outcome.simulated:.4f} N, with tare "
         f"{outcome.tared:.4f} N, calibrated {outcome.calibrated:.4f} N"

@@ -134,7 +134,7 @@ def _answer(
     true = np.where(used, bench.true[:, number], 0.0)
     # In a solid, every press reaches every sensor a little; such readings are noise.
     there = np.isfinite(measured) & (true > _PRESSED * true.max())
-    up = there & bench.loading
+    up = there & bench.loading & (lagged > 0)
     if up.sum() < 10:
         return
     gain, channel.error, channel.clip = _channel.clip_and_gain(lagged[up], measured[up], channel.idle.noise)

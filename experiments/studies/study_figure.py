@@ -4,6 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.studies.outcomes import UNITS, group_trials, heading, mean_and_error
@@ -59,7 +60,10 @@ def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
 
 
 def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
-    """Draw the mean and two standard errors over the number at the end of a variant's or condition's name."""
+    """Draw the mean and two standard errors over the number at the end of a variant's or condition's name.
+
+    Names of several words before the number, as "arm grid 9", get a panel for each beginning.
+    """
     metric, found = study.metrics[0], group_trials(trials)
     single = len({variant for variant, _ in found}) == 1
     every: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
@@ -69,9 +73,21 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
             key = numbered[1], "" if single else condition
             every[key].append((int(numbered[2]), *mean_and_error(each, metric)))
     lines = {key: points for key, points in every.items() if len(points) > 1}
+    panels = list(dict.fromkeys(name.rpartition(" ")[0] for name, _ in lines)) or [""]
+    drawn = Figure(figsize=(7 if len(panels) == 1 else 4 * len(panels), 4.5), layout="constrained")
+    for panel, axis in zip(panels, drawn.subplots(ncols=len(panels), squeeze=False)[0], strict=True):
+        _panel(axis, {(name.rpartition(" ")[2], condition): points
+                      for (name, condition), points in lines.items() if name.rpartition(" ")[0] == panel})  # fmt: skip
+        axis.set_title(panel, fontsize=9)
+        axis.set_xlabel(study.axis or "")
+    drawn.axes[0].set_ylabel(f"{_label(metric)}: mean and two standard errors")
+    drawn.suptitle(study.about, fontsize=9, wrap=True)
+    return drawn
+
+
+def _panel(axis: Axes, lines: dict[tuple[str, str], list[tuple[int, float, float]]]) -> None:
+    """Draw a line per name and condition: the name gives the colour and the marker, the condition the style."""
     names, conditions = (list(dict.fromkeys(key[part] for key in lines)) for part in (0, 1))
-    drawn = Figure(figsize=(7, 4.5), layout="constrained")
-    axis = drawn.subplots()
     for (name, condition), points in lines.items():
         x, y, error = zip(*sorted(points), strict=True)
         number, label = names.index(name), ", ".join(filter(None, (name, condition)))
@@ -82,14 +98,10 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
         )  # fmt: skip
     numbers = sorted({x for points in lines.values() for x, *_ in points})
     axis.set_xscale("log")
-    axis.set_xticks(numbers, [str(x) for x in numbers])
+    axis.set_xticks(numbers, [str(x) for x in numbers], fontsize=7)
     axis.set_xticks([], minor=True)
-    axis.set_xlabel(study.axis or "")
-    axis.set_ylabel(f"{_label(metric)}: mean and two standard errors")
-    axis.set_title(study.about, fontsize=9, wrap=True)
     axis.legend(fontsize=8)
     axis.grid(alpha=0.3)
-    return drawn
 
 
 def _label(metric: str) -> str:

@@ -76,8 +76,8 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
     panels = list(dict.fromkeys(name.rpartition(" ")[0] for name, _ in lines)) or [""]
     drawn = Figure(figsize=(7 if len(panels) == 1 else 4 * len(panels), 4.5), layout="constrained")
     for panel, axis in zip(panels, drawn.subplots(ncols=len(panels), squeeze=False)[0], strict=True):
-        _panel(axis, {(name.rpartition(" ")[2], condition): points
-                      for (name, condition), points in lines.items() if name.rpartition(" ")[0] == panel})  # fmt: skip
+        named = {(name.rpartition(" "), condition): points for (name, condition), points in lines.items()}
+        _panel(axis, {(parts[2], key): points for (parts, key), points in named.items() if parts[0] == panel})
         axis.set_title(panel, fontsize=9)
         axis.set_xlabel(study.axis or "")
     drawn.axes[0].set_ylabel(f"{_label(metric)}: mean and two standard errors")
@@ -86,7 +86,7 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
 
 
 def _panel(axis: Axes, lines: dict[tuple[str, str], list[tuple[int, float, float]]]) -> None:
-    """Draw a line per name and condition: the name gives the colour and the marker, the condition the style."""
+    """Draw a line per name and condition; the name gives colour and marker, the condition the style."""
     names, conditions = (list(dict.fromkeys(key[part] for key in lines)) for part in (0, 1))
     for (name, condition), points in lines.items():
         x, y, error = zip(*sorted(points), strict=True)

@@ -177,6 +177,16 @@ class TouchSampler:
         given_up = pressed.hopeless.reshape(-1, ahead).any(axis=1) & ~chosen
         return chosen, given_up, movie[torch.from_numpy(first[chosen])]
 
+    @torch.no_grad()
+    def render(self, gestures: Draws, wanted: np.ndarray) -> Movie:
+        """Return the movie of drawn gestures with the labels that it has, which may not be the wanted ones.
+
+        Args:
+            gestures: the draws of ``draw_gestures`` and ``draw_paths``, (B, ...), faster if sorted by scale.
+            wanted: (B, 4), bool, the labels they were drawn for.
+        """
+        return self._press(gestures | {"draws": np.ones(len(wanted))}, wanted)[0]
+
     def _press(self, gestures: Draws, wanted: np.ndarray) -> tuple[Movie, ContactResult]:
         """Return the movie of gestures (B,) with its labels."""
         settings = self.settings

@@ -90,6 +90,15 @@ class Shapes:
             result[mine] = np.interp(np.sqrt(area[mine]), roots[number], scales[number])
         return result
 
+    def area(self, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        """Return the share of the sheet (B,) that shapes cover at a scale, m (inverse of :meth:`scale`)."""
+        scales, roots = self._calibration
+        result = np.empty(len(shape))
+        for number in np.unique(shape):
+            mine = shape == number
+            result[mine] = np.interp(scale[mine], scales[number], roots[number]) ** 2
+        return result
+
     def whole_scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which whole shapes cover as much as a share of the sheet."""
         large = self._large

@@ -97,6 +97,7 @@ def test_scale_gives_the_wanted_contact_area():
     measured = (frames > 0.02 * frames.amax(1, keepdim=True)).double().mean(1).numpy()
     assert abs(measured - area).max() < 16 / 1024  # cells
     assert abs(measured - area).mean() < 3 / 1024
+    assert shapes.area(shape, shapes.scale(shape, area)) == pytest.approx(area, rel=1e-9)
 
 
 def test_a_shape_too_small_for_the_mesh_still_presses():

@@ -33,7 +33,7 @@ def accuracies(study: str, column: str, name: str) -> dict[int, float]:
 
 models = {
     "any_skin, not trained for the layout": ("any_skin", "condition", "{}", "o"),
-    "best_fresh": ("any_skin_fresh", "variant", "{}", "s"),
+    "best_fresh": ("sensors_networks", "variant", "best_fresh {}", "s"),
     "trees (features)": ("sensors", "variant", "{}", "^"),
 }
 figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")

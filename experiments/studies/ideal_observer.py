@@ -125,21 +125,34 @@ class Samples:
             moves: Metropolis-Hastings moves of each sample in each step.
             rounds: steps at the end, over which the labels are averaged.
         """
-        while len(active := np.flatnonzero(self._share < 1)):
-            for touch in active:
-                share = next_share(self._fit[touch], self._share[touch], _EFFECTIVE * self._count)
-                kept = self._resampled((share - self._share[touch]) * self._fit[touch])
-                for each in (*self._state.values(), self._log, self._labels, self._fit):
-                    each[touch] = each[touch][kept]
-                self._share[touch] = share
-            for _ in range(moves):
-                self._move(active)
-        total = np.zeros(self._labels[:, 0].shape)
-        for _ in range(rounds):
-            for _ in range(moves):
-                self._move(np.arange(len(total)))
-            total += self._labels.mean(axis=1)
+        from rich.console import Console
+        from rich.progress import Progress
+
+        console, total = Console(stderr=True), np.zeros(self._labels[:, 0].shape)
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as shown:
+            tempering = shown.add_task("tempering", total=-np.log(self._share).sum())
+            averaging = shown.add_task("averaging", total=rounds)
+            while len(active := np.flatnonzero(self._share < 1)):
+                before = np.log(self._share).sum()
+                self._temper(active)
+                for _ in range(moves):
+                    self._move(active)
+                shown.advance(tempering, np.log(self._share).sum() - before)
+            for _ in range(rounds):
+                for _ in range(moves):
+                    self._move(np.arange(len(total)))
+                total += self._labels.mean(axis=1)
+                shown.advance(averaging)
         return total / rounds
+
+    def _temper(self, touches: np.ndarray) -> None:
+        """Let more of the log-likelihood count, as much as leaves enough samples effective."""
+        for touch in touches:
+            share = next_share(self._fit[touch], self._share[touch], _EFFECTIVE * self._count)
+            kept = self._resampled((share - self._share[touch]) * self._fit[touch])
+            for each in (*self._state.values(), self._log, self._labels, self._fit):
+                each[touch] = each[touch][kept]
+            self._share[touch] = share
 
     def _resampled(self, log: np.ndarray) -> np.ndarray:
         """Return the numbers of K samples, drawn with log weights (N,), systematically."""

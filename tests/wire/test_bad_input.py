@@ -11,9 +11,11 @@ import pytest
 
 from skin.body.sheet import Sheet
 from skin.device.serial import Serial
+from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import LiveLoop
 from skin.hardware.record.recorder import record_session
 from skin.hardware.record.session_reader import read_session
+from skin.labels import TOUCH
 from skin.layout.grid import Grid
 from skin.wire.open import open_skin
 from skin.wire.tare import Tare
@@ -52,6 +54,15 @@ def test_time_that_goes_backwards_is_a_new_start(plug):
     assert [(frame.segment, frame.after) for frame in frames[4:]] == [(0, ""), (1, "reset"), (1, "")]
 
 
+@pytest.mark.parametrize(("rate", "said"), [(10, ""), (20, " (short taps read low below 50 Hz)"), (50, "")])
+def test_a_rate_that_misses_the_peaks_of_taps_stands_in_the_status_line(plug, rate, said):
+    values = np.random.default_rng(0).integers(400, 600, (60, 6))
+    with open_skin(plug.port, range(6)) as skin:
+        plug.send(*(encode_line(row.tolist(), n, 1_000_000 // rate * n) for n, row in enumerate(values)))
+        skin.read(60, timeout=PATIENT)
+        assert LiveLoop(skin, Tare(None, 0.0, 10.0), engine(), None).line == f"{rate}.0 Hz{said}"
+
+
 def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
     rng = np.random.default_rng(0)
     values = rng.integers(400, 600, (800, 6))
@@ -62,9 +73,14 @@ def test_channels_that_mean_nothing_stand_in_the_status_line(plug):
         plug.send(encode_header(Header(n=6, bits=10)))
         plug.send(*(encode_line(row.tolist(), n, 10_000 * n) for n, row in enumerate(values)))
         frames = skin.read(800, timeout=PATIENT)
-        line = LiveLoop(skin, Tare(None, 0.0, 10.0), None, None).line
+        line = LiveLoop(skin, Tare(None, 0.0, 10.0), engine(), None).line
     assert frames[-1].valid.tolist() == [True, False, False, True, True, True]
     assert "sensor 1 dead, sensor 2 stuck, sensor 3 saturated" in line
+
+
+def engine():
+    """Return an engine at 10 Hz that has nothing to say."""
+    return Engine(lambda readings, valid: [0.0] * len(TOUCH.names), TOUCH, 6, 30, 10.0, Detection(0.3))
 
 
 def sent(cable, stop, first=0):

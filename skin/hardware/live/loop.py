@@ -15,6 +15,7 @@ from skin.wire.tare import Tare
 _PATIENCE = 0.3  # s without frames after which the verdict is removed
 _AT_ONCE = 1024  # frames
 _STATUS = 0.5  # s between two updates of the status
+_ENOUGH = 5  # frames for each one of the model: with two, a tap of one frame reads half its peak
 _DELAYS = 2000  # verdicts for the percentile of the delay
 
 
@@ -106,6 +107,13 @@ class LiveLoop:
             self._display.set_status(self.line)
 
     @property
+    def _rate(self) -> str:
+        """Text with the rate of the device, and what it misses."""
+        rate, model = self._skin.stats.rate_hz, self._engine.window.rate
+        slow = f" (short taps read low below {_ENOUGH * model:g} Hz)"
+        return f"{rate:.1f} Hz" + slow * (1.05 * model < rate < 0.95 * _ENOUGH * model)
+
+    @property
     def line(self) -> str:
         """Text with rate, lost frames, broken sensors and delay."""
         stats = self._skin.stats
@@ -121,7 +129,7 @@ class LiveLoop:
         ]
         parts = [
             self._tare.status if self._tare.conversion is not None else "",
-            f"{stats.rate_hz:.1f} Hz",
+            self._rate,
             *(f"{count} {name}" for name, count in counts.items() if count),
             *faulty[:3],
             f"and {len(faulty) - 3} more" if len(faulty) > 3 else "",

@@ -84,20 +84,12 @@ class Shapes:
         Parts beyond the sheet do not count.
         """
         scales, roots = self._calibration
-        result = np.empty(len(shape))
-        for number in np.unique(shape):
-            mine = shape == number
-            result[mine] = np.interp(np.sqrt(area[mine]), roots[number], scales[number])
-        return result
+        return _interpolated(shape, np.sqrt(area), roots, scales)
 
     def area(self, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """Return the share of the sheet (B,) that shapes cover at a scale, m (inverse of :meth:`scale`)."""
         scales, roots = self._calibration
-        result = np.empty(len(shape))
-        for number in np.unique(shape):
-            mine = shape == number
-            result[mine] = np.interp(scale[mine], scales[number], roots[number]) ** 2
-        return result
+        return _interpolated(shape, scale, scales, roots) ** 2
 
     def whole_scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which whole shapes cover as much as a share of the sheet."""
@@ -252,3 +244,12 @@ class Shapes:
         upper, lower = samples.chunk(2, dim=2)
         left, right = (upper + lower).chunk(2, dim=3)
         return left + right
+
+
+def _interpolated(shape: np.ndarray, at: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the values (B,) at places (B,), between the known ones (N, K) of each shape."""
+    result = np.empty(len(shape))
+    for number in np.unique(shape):
+        mine = shape == number
+        result[mine] = np.interp(at[mine], known[number], values[number])
+    return result

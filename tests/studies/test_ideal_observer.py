@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from experiments.studies.gesture_prior import GesturePrior
-from experiments.studies.ideal_observer import IdealObserver, Samples, next_share
+from experiments.studies.ideal_observer import IdealObserver
+from experiments.studies.posterior_samples import Samples, next_share
 from skin.build import build_device
 from skin.errors import InputError
 

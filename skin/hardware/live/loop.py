@@ -15,7 +15,7 @@ from skin.wire.tare import Tare
 _PATIENCE = 0.3  # s without frames after which the verdict is removed
 _AT_ONCE = 1024  # frames
 _STATUS = 0.5  # s between two updates of the status
-_ENOUGH = 5  # frames for each one of the model: with two, a tap of one frame reads half its peak
+_ENOUGH = 10  # frames for each one of the model: with n, a tap of one frame reads 1/n too low at worst
 _DELAYS = 2000  # verdicts for the percentile of the delay
 
 

@@ -12,7 +12,7 @@ from skin.signal.resampling import resample
 _QUANTILES = 20000
 
 
-def between_frames(force: Tensor, model_rate: float, rate: float) -> Tensor:
+def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndarray | float = 0.5) -> Tensor:
     """Return true readings (B, F, S), N, at the rate of a device.
 
     A frame of the model is the force in the middle of its interval. Between two frames in contact the force
@@ -23,20 +23,24 @@ def between_frames(force: Tensor, model_rate: float, rate: float) -> Tensor:
     Args:
         force: (B, T, S), true readings at the model's rate, N; a frame without contact is 0.
         model_rate: Hz.
-        rate: of the device, Hz; at the model's rate, the frames are returned as they are.
+        rate: of the device, Hz.
+        phase: when the device reads, (B,) or one for all: share of its interval, from 0 to 1.
     """
-    frames = round(force.shape[1] * rate / model_rate)
-    place = (np.arange(frames) + 0.5) * model_rate / rate
-    now = np.minimum(place.astype(int), force.shape[1] - 1)
+    batch, window, _ = force.shape
+    frames = round(window * rate / model_rate)
+    read = np.arange(frames) + np.reshape(phase, (-1, 1))
+    place = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
+    now = np.minimum(place.astype(int), window - 1)
     offset = place - now - 0.5  # from the middle of the interval, in intervals
     other = now + np.sign(offset).astype(int)
     padded = torch.nn.functional.pad(force, (0, 0, 1, 1))
     touched = (padded != 0).any(dim=2, keepdim=True)
-    share = torch.from_numpy(np.abs(offset)).to(force)[:, None]
-    here, there = padded[:, now + 1], padded[:, other + 1]
+    share = torch.from_numpy(np.abs(offset)).to(force)[..., None]
+    row = np.arange(batch)[:, None]
+    here, there = padded[row, now + 1], padded[row, other + 1]
     # Towards a frame without contact the force is 0 at the edge, which is half an interval away.
-    share = torch.where(touched[:, other + 1], share, 2 * share)
-    return torch.where(touched[:, now + 1], torch.lerp(here, there, share), 0.0)
+    share = torch.where(touched[row, other + 1], share, 2 * share)
+    return torch.where(touched[row, now + 1], torch.lerp(here, there, share), 0.0)
 
 
 def measure(
@@ -49,22 +53,23 @@ def measure(
     """Return what a device measures, at the rate of a model.
 
     Imperfections apply at the rate of the device. The maximum over each interval of the model is kept, as for
-    a real device (:func:`skin.signal.resampling.resample`). A device that is slower by up to 5 % gives one
-    frame to each interval.
+    a real device (:func:`skin.signal.resampling.resample`). A faster device reads each gesture, or each
+    stream, at a random phase of its interval, since no touch waits for the device. One at the model's rate,
+    or slower by up to 5 %, gives the frames of the model.
 
     Args:
         imperfection: of the device, with its rate.
         constants: of the device.
         force: (B, T, S), true readings, N, at the model's rate.
         model_rate: Hz.
-        noise: source of the noise.
+        noise: source of the noise and of the phases.
 
     Returns:
         readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
     """
     if imperfection.rate <= model_rate:
         return imperfection.apply(force, constants, noise)
-    fine = between_frames(force, model_rate, imperfection.rate)
+    fine = between_frames(force, model_rate, imperfection.rate, noise.random(len(force)))
     readings, valid, saturated = imperfection.apply(fine, constants, noise)
     return _reduced(readings, valid, saturated, (imperfection.rate, model_rate), force.shape[1])
 

@@ -205,13 +205,15 @@ def test_the_rate_of_the_device_changes_no_gesture(plain):
 
 
 @pytest.mark.parametrize("changes", [{}, {"stream": True}, {"randomise": True, "stream": True}])
-def test_a_perfect_device_has_the_frames_of_the_model_at_any_rate(changes):
+def test_a_perfect_device_has_nearly_the_frames_of_the_model_at_any_rate(changes):
+    """At three readings in an interval, one is within a sixth of it from the middle, which is a frame."""
     found = [device(**PERFECT, rate=rate, **changes).recording("test") for rate in (10.0, 30.0)]
     slow, fast = (one.touches.readings for one in found)
-    assert (fast >= slow).all(), "the middle of an interval is a frame of the model"
+    assert (fast >= 2 / 3 * slow - 1e-6).all(), "from the middle to the edge the force falls to 0 at most"
     assert (fast[found[0].force == 0] == 0).all(), "no touch becomes longer"
     if not changes:  # a window of a stream may begin or end between two frames
-        assert torch.equal(fast.amax((1, 2)), slow.amax((1, 2)))
+        assert (fast.amax((1, 2)) <= slow.amax((1, 2))).all(), "a safe touch stays safe"
+        assert (fast.amax((1, 2)) < slow.amax((1, 2))).any(), "and a short one reads low"
 
 
 @pytest.mark.parametrize("tare", [False, True])

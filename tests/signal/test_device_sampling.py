@@ -38,6 +38,30 @@ def test_between_two_frames_the_force_changes_linearly():
     torch.testing.assert_close(fine[22:28], expected)
 
 
+@pytest.mark.parametrize("rate", [20.0, 40.0, 50.0, 500.0])
+def test_a_device_reads_a_short_tap_at_any_phase(rate):
+    """A reading is up to half its interval from the peak, towards which the force rises in half a frame."""
+    tap = torch.zeros(4000, 3, 1)
+    tap[:, 1] = 1.0
+    ideal = Imperfection(rate=rate, gain_spread=0.0, offset=0.0, noise=0.0)
+    constants = ideal.constants(1, np.random.default_rng(0))
+    highest = measure(ideal, constants, tap, 10.0, np.random.default_rng(1))[0].amax(dim=(1, 2)).numpy()
+    loss = 10 / rate  # the largest
+    assert 1 - loss <= highest.min() < 1 - 0.99 * loss
+    assert 1 - 0.01 * loss < highest.max() <= 1.0
+    error = 5 * loss / np.sqrt(12 * len(highest))
+    assert highest.mean() == pytest.approx(1 - loss / 2, abs=error)
+
+
+@pytest.mark.parametrize("rate", [12.3, 37.0])
+@pytest.mark.parametrize("phase", [0.0, 0.5, 0.999])
+def test_between_frames_never_exceeds_them(rate, phase):
+    force = touches().roll(3, dims=1)  # a press until the last frame
+    fine = between_frames(force, 10.0, rate, phase)
+    assert (fine >= 0).all()
+    assert (fine <= force.amax(dim=1, keepdim=True)).all()
+
+
 @pytest.mark.parametrize("rate", [20.0, 50.0, 100.0, 1000.0])
 def test_a_touch_begins_and_ends_at_the_edges_of_its_frames(rate):
     fine = between_frames(touches(), 10.0, rate)
@@ -55,8 +79,9 @@ def test_a_simulated_device_reads_like_a_real_one(rate):
     device = Imperfection(rate=rate, dead=1, **ROUGH)
     constants = device.constants(3, np.random.default_rng(0))
     readings, valid, saturated = measure(device, constants, touches(), 10.0, np.random.default_rng(1))
-    fine = between_frames(touches(), 10.0, rate)
-    values, works, limited = (one.numpy() for one in device.apply(fine, constants, np.random.default_rng(1)))
+    noise = np.random.default_rng(1)
+    fine = touches() if rate == 10.0 else between_frames(touches(), 10.0, rate, noise.random(2))
+    values, works, limited = (one.numpy() for one in device.apply(fine, constants, noise))
     for gesture in range(2):
         window = Window(12, 10.0, 3)
         for number, row in enumerate(values[gesture]):

@@ -6,7 +6,8 @@
     skin study study=margins study.run=latest
 
 A study is a file of conf/study. It trains the runs that are missing, with the budget in that file; rerun to
-resume. Writes study_<name>.md, .csv and .png into out=.
+resume. Writes study_<name>.md, .csv and .png into out=. A measure of single runs, such as margins, writes
+files for each, and of several runs study_<name>.csv with all values.
 """
 
 import sys
@@ -44,7 +45,7 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
     from rich.progress import track
 
     from experiments.studies.runs import find_runs, train_study
-    from experiments.studies.study_page import publish_study
+    from experiments.studies.study_page import publish_files, publish_study
     from experiments.studies.trials import run_trials
     from skin.shard import Shard
     from skin.tracking import Store
@@ -71,6 +72,8 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
         title = smoke + ", ".join([f"{study.name}: {study.about}", *(SMOKE if smoke else ()), *settings])
         publish_study(study, title, found, folder / f"study_{study.name}")
+    else:
+        publish_files(study, found, folder / f"study_{study.name}.csv")
     if any(one.run is None for one in planned):
         sys.exit(1)
 

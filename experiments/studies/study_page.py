@@ -20,9 +20,10 @@ from experiments.studies.outcomes import (
 )
 from experiments.studies.study import Study
 from experiments.studies.study_figure import study_figure
-from experiments.studies.tables import Page, print_table
+from experiments.studies.tables import Page, csv_text, print_table, read_csv
 from experiments.studies.tables import publish_page as write_page
 from experiments.studies.trials import Trial
+from skin.files import write
 
 
 def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
@@ -116,20 +117,40 @@ def publish_study(
     print(*write_page(Page("", told, _csv(study, trials), drawn), title, path), sep="\n")
 
 
+def publish_files(study: Study, trials: Sequence[Trial], path: Path) -> None:
+    """Write the CSV files that a measure wrote for several runs as one, each line behind its trial.
+
+    Args:
+        study: whose trials they are.
+        trials: all of them.
+        path: of the file.
+    """
+    head = [*_names(study), "run"]
+    found = [(one, file) for one in trials for file in one.files if file.suffix == ".csv"]
+    tables = [(_trial(one, head), read_csv(file)) for one, file in found]
+    if len(tables) > 1:
+        lines = [[*before, *line] for before, (_, *body) in tables for line in body]
+        print(write(csv_text([[*head, *tables[0][1][0]], *lines]), path))
+
+
 def _csv(study: Study, trials: Sequence[Trial]) -> list[Sequence[object]]:
     """Return a line per finished trial."""
-    names = ["variant", "seed", *(["condition", "device"] if study.conditions else [])]
-    head = [*names, "run", *study.metrics]
+    head = [*_names(study), "run"]
     body = [
-        [
-            *(one.variant.name if name == "variant" else getattr(one, name) for name in names),
-            one.run,
-            *(one.metrics.get(metric, "") for metric in study.metrics),
-        ]
+        [*_trial(one, head), *(one.metrics.get(metric, "") for metric in study.metrics)]
         for one in trials
         if one.run
     ]
-    return [head, *body]
+    return [[*head, *study.metrics], *body]
+
+
+def _names(study: Study) -> list[str]:
+    """Return what tells the trials of a study apart."""
+    return ["variant", "seed", *(["condition", "device"] if study.conditions else [])]
+
+
+def _trial(trial: Trial, names: Sequence[str]) -> list[str]:
+    return [trial.variant.name if name == "variant" else getattr(trial, name) for name in names]
 
 
 def _cell(trials: Sequence[Trial], metric: str) -> str:

@@ -52,6 +52,12 @@ def csv_text(table: Iterable[Sequence[object]]) -> str:
     return buffer.getvalue()
 
 
+def read_csv(path: Path) -> list[list[str]]:
+    """Return a CSV file as a table."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))
+
+
 def markdown(table: Table, title: str) -> str:
     """Return a table as Markdown, below its title."""
     lines = ["| " + " | ".join(line) + " |" for line in table]

@@ -146,7 +146,8 @@ class _Run:
         tags = {"evaluated": self.run.data.tags["fingerprint"], "study": key}
         known = self.store.find("FINISHED", **tags) if self.config.tracking.resume else []
         if not known:
-            known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags, bool(line))]
+            changed = any(not one.startswith("tracking.") for one in line)
+            known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags, changed)]
         note_reuse(known[0])
         return known[0]
 

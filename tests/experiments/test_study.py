@@ -153,7 +153,7 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
 
 @pytest.mark.slow
 def test_verdicts_are_sorted_by_margins(run, trained):
-    few = ["study.rows=[rules]", "simulator=naive", "out=margins"]
+    few = ["study.rows=[rules,temporal_graph]", "simulator=naive", "out=margins"]
     done = run(trained, "study", "study=margins", "study.measure.gestures=400", *few)
     assert done.returncode == 0, done.stderr
     said = done.stdout.splitlines()
@@ -171,6 +171,10 @@ def test_verdicts_are_sorted_by_margins(run, trained):
     assert "## Alarm above 0." in path.with_suffix(".md").read_text()
     with Image.open(path.with_suffix(".png")) as picture:
         assert picture.size[0] > 800
+    joined, head = lines(trained / "margins" / "study_margins.csv"), list(lines(path)[0])
+    assert {one["variant"].split()[0] for one in joined} == {"rules", "temporal_graph"}
+    own = [one for one in joined if one["variant"].startswith("rules")]
+    assert [{name: one[name] for name in head} for one in own] == lines(path)
 
 
 @pytest.mark.slow

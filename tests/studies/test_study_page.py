@@ -12,7 +12,7 @@ from experiments.studies.comparison import Paired
 from experiments.studies.outcomes import StatementResult
 from experiments.studies.study import Statement, Study, Variant
 from experiments.studies.study_figure import study_figure
-from experiments.studies.study_page import comparison_text, publish_study, variants_table
+from experiments.studies.study_page import comparison_text, publish_files, publish_study, variants_table
 from experiments.studies.trials import Trial
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
@@ -170,3 +170,24 @@ def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend
     (axis,), (legend,) = drawn.axes, drawn.legends
     assert [text.get_text() for text in axis.get_yticklabels()] == ["one", "other"]
     assert [text.get_text() for text in legend.get_texts()] == ["no condition", "rough"]
+
+
+def test_files_of_several_runs_become_one(tmp_path, capsys):
+    files = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for number, file in enumerate(files):
+        file.write_text(f'course,alarms\n"hold, 1 s",{number}\n')
+        file.with_suffix(".md").touch()
+    trials = [
+        replace(trial("a", str(n), None), run=f"run{n}", files=[file.with_suffix(".md"), file])
+        for n, file in enumerate(files)
+    ]
+    path = tmp_path / "study_edges.csv"
+    publish_files(STUDY, trials[:1], path)
+    assert not path.exists(), "one file needs no other"
+    publish_files(STUDY, trials, path)
+    assert path.read_text().splitlines() == [
+        "variant,seed,run,course,alarms",
+        'a,0,run0,"hold, 1 s",0',
+        'a,1,run1,"hold, 1 s",1',
+    ]
+    assert capsys.readouterr().out == f"{path}\n"

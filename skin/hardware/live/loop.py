@@ -111,7 +111,7 @@ class LiveLoop:
         """Text with the rate of the device, and what it misses."""
         rate, model = self._skin.stats.rate_hz, self._engine.window.rate
         slow = f" (short taps read low below {_ENOUGH * model:g} Hz)"
-        return f"{rate:.1f} Hz" + slow * (1.05 * model < rate < 0.95 * _ENOUGH * model)
+        return f"{rate:.1f} Hz" + slow * (0 < rate < 0.95 * _ENOUGH * model)
 
     @property
     def line(self) -> str:

@@ -35,7 +35,7 @@ _LIMITS = """
 ## Limits
 
 - **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
-  [results](results.md#limitations).
+  [limitations](limitations.md).
 - **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Material under a
   wide object must move sideways. Elements that are as long as the skin is thick restrict this motion, most
   of all beside the edge of the object: see `mesh` for the default mesh, a finer one and coarser ones.

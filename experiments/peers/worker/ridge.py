@@ -23,24 +23,27 @@ def normal_equations(
     width, labels = validation.shape[1], held.shape[1]
     count, gram, cross = 0, np.zeros((width, width)), np.zeros((width, labels))
     total, mean = np.zeros(labels), np.zeros(width)
+    # Features may vary little around a large mean, so products are of what is left, in double precision.
+    centre = validation.mean(axis=0, dtype=float)
     for table, truth in parts:
-        # float32 is precise enough for the products of one part, and not for their sum over all parts.
-        gram += table.T @ table
-        cross += table.T.astype(float) @ truth
-        count, total, mean = count + len(table), total + truth.sum(0), mean + table.sum(0, dtype=float)
+        left = table - centre
+        gram += left.T @ left
+        cross += left.T @ truth
+        count, total, mean = count + len(table), total + truth.sum(0), mean + left.sum(0)
     total, mean = total / count, mean / count
     gram -= count * np.outer(mean, mean)
     cross -= count * np.outer(mean, total)
+    held_out = validation - (centre + mean).astype(np.float32)
     best, least = np.zeros_like(cross), np.full(len(total), np.inf)
     diagonal = np.einsum("ii->i", gram)
     plain = diagonal.copy()
     for alpha in STRENGTHS:
         diagonal[:] = plain + alpha
         weights = solve(gram, cross, assume_a="pos")
-        errors = np.square(validation @ weights.astype(np.float32) + total - mean @ weights - held).mean(0)
+        errors = np.square(held_out @ weights.astype(np.float32) + total - held).mean(0)
         better = errors < least
         best[:, better], least[better] = weights[:, better], errors[better]
-    return best, total - mean @ best
+    return best, total - (centre + mean) @ best
 
 
 def platt(score: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

@@ -63,3 +63,17 @@ def test_normal_equations_give_the_ridge_with_the_least_validation_error():
         assert weights[:, label] == pytest.approx(best.coef_, abs=1e-3)
         assert bias[label] == pytest.approx(best.intercept_, abs=1e-2)
     assert len(chosen) == 2
+
+
+def test_features_that_hardly_vary_and_depend_on_each_other_are_fitted():
+    """Shares near 1, divided by their standard deviation, as MiniRocket's features are."""
+    random = np.random.default_rng(0)
+    hidden = random.standard_normal((4000, 20))
+    x = (300 + hidden @ random.standard_normal((20, 200))).astype(np.float32)
+    y = hidden[:, :2] + 0.1 * random.standard_normal((4000, 2))
+    train, held = slice(0, 3000), slice(3000, 4000)
+    weights, bias = normal_equations(iter([(x[train], y[train])]), x[held], y[held])
+    errors = np.square(x[held].astype(float) @ weights + bias - y[held]).mean(0)
+    fits = [Ridge(alpha).fit(x[train].astype(float), y[train]) for alpha in STRENGTHS]
+    least = np.min([np.square(fit.predict(x[held].astype(float)) - y[held]).mean(0) for fit in fits], axis=0)
+    assert errors == pytest.approx(least, rel=1e-3)

@@ -63,6 +63,7 @@ class Results:
 
     action: Literal["publish", "import", "export", "check"]
     part: str
+    optional: Sequence[str]
     budget: Literal["full", "smoke"]
     file: str
     jobs: Annotated[int, Ge(1)]
@@ -78,10 +79,13 @@ class Results:
                 check_settings(Step, dict(step), f"results.parts.{name}[{number}]")
         if self.part not in ("all", *self.parts):
             raise InputError(f"results.part={self.part} is none of all, {', '.join(self.parts)}")
+        if unknown := set(self.optional) - set(self.parts):
+            raise InputError(f"results.optional={[*self.optional]}: there is no part {', '.join(unknown)}")
 
     def steps(self) -> list[Step]:
-        """Return the commands of the chosen part, or of all."""
-        chosen = self.parts if self.part == "all" else [self.part]
+        """Return the commands of the chosen part, or of all that are not optional."""
+        every = [name for name in self.parts if name not in self.optional]
+        chosen = every if self.part == "all" else [self.part]
         return [Step(**step) for name in chosen for step in self.parts[name]]
 
 

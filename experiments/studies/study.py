@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen
 from hydra import compose
@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from skin.config import overrides, plain, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
-from skin.settings import check_settings
+from skin.settings import check_settings, configured
 from skin.sweep import sweep_jobs
 
 SMOKE = (
@@ -30,6 +30,10 @@ _OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")
 
 
+Claim = Literal["greater", "less", "alike", "no better", "at most", "about", "ratio"]
+"""What a statement says of two figures (:func:`experiments.studies.comparison.verdict`)."""
+
+
 @dataclass(frozen=True)
 class Statement:
     """A sentence that runs can test; ``conf/study.yaml`` explains the fields."""
@@ -38,7 +42,7 @@ class Statement:
     says: str
     one: Mapping[str, str]
     metric: str
-    claim: str
+    claim: Claim
     section: str = ""
     others: Sequence[Mapping[str, str]] = ()
     level: float | None = None
@@ -83,7 +87,7 @@ class Study:
     numbered: Sequence[str] = ()
     measure: Any = None
     metrics: Sequence[str] = ()
-    differences: str | None = None
+    differences: Claim | None = None
     statements: Sequence[Statement] = ()
     minutes: float | None = None
     axis: str | None = None
@@ -102,13 +106,17 @@ class Study:
         settings = plain(config)["study"]
         settings["name"] = settings["name"] or name
         check_settings(cls, settings, "study")
+        statements = [
+            configured(Statement, one, f"study.statements[{number}]")
+            for number, one in enumerate(settings["statements"])
+        ]
         if settings["measure"]:
             part = settings["measure"]
             check_settings(get_object(part["_target_"]), part, "study.measure")
             settings["measure"] = instantiate(part)
         if isinstance(settings["rows"], str) and settings["rows"] != "all":
             settings["rows"] = [settings["rows"]]
-        return cls(**settings | {"statements": [Statement(**one) for one in settings["statements"]]})
+        return cls(**settings | {"statements": statements})
 
 
 def passed_overrides() -> list[str]:

@@ -64,7 +64,13 @@ def test_finished_runs_are_found_and_judged(run, folder):
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [((), "which study"), (["study=pooling"], "graph_pooling"), (["study=norm", "study.seeds=[]"], "seeds")],
+    [
+        ((), "which study"),
+        (["study=pooling"], "graph_pooling"),
+        (["study=norm", "study.seeds=[]"], "seeds"),
+        (["study=norm", "study.statements.0.claim=fewer"], "study.statements[0].claim=fewer must be"),
+        (["study=norm", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
+    ],
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, tmp_path):
     code = (

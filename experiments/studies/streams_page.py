@@ -25,7 +25,7 @@ def streams_summary(found: WindowReport) -> str:
     if found.bins:
         ends = found.bins[0], found.bins[-1]
         told = (
-            f"{100 * fmean(one.accuracy.values()):.1f} % at share {one.name} (always the commoner answer: "
+            f"{100 * one.overall:.1f} % at share {one.name} (always the commoner answer: "
             f"{100 * fmean(one.majority.values()):.1f} %)"
             for one in ends
         )

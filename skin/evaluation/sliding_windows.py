@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -39,6 +40,11 @@ class Bin:
     accuracy: dict[str, float]
     majority: dict[str, float]
 
+    @property
+    def overall(self) -> float:
+        """Accuracy averaged over the labels."""
+        return fmean(self.accuracy.values())
+
 
 @dataclass(frozen=True)
 class WindowReport:
@@ -73,6 +79,7 @@ class WindowReport:
         }
         for one in self.bins:
             values |= {f"share/{one.name}/{name}/accuracy": value for name, value in one.accuracy.items()}
+            values[f"share/{one.name}/overall/accuracy"] = one.overall
         for gate, counts in self.gates.items():
             values[f"gate/{gate}/accuracy"] = float(counts.diag().sum() / counts.sum())
         for gate, alarms in self.alarms.items():

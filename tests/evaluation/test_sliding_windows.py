@@ -74,6 +74,14 @@ def test_who_knows_the_labels_is_right_about_everything(knew):
     assert all(0 <= value <= 1 for name, value in found.metrics().items() if "accuracy" in name)
 
 
+def test_the_overall_accuracy_is_the_mean_over_labels(streamed):
+    found = evaluate_windows(AlwaysDangerous(TOUCH_OR_NOT), streamed, ONLY_ALARMS, POINT)
+    logged = found.metrics()
+    labels = [logged[f"share/whole/{name}/accuracy"] for name in ("big", "dynamic", "press", "dangerous")]
+    assert min(labels) < max(labels)
+    assert logged["share/whole/overall/accuracy"] == pytest.approx(sum(labels) / 4)
+
+
 def test_every_test_window_with_touch_is_in_one_bin(streamed, knew):
     found = knew
     recording = streamed.recording("test")

@@ -16,7 +16,11 @@ NAMES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
 SENSORS = "study=sensors_other", "study.seeds=[0]"
-OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "self_share", "same/any/disagreement"}
+SHARES = ("0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "whole")
+STREAMS = {f"share/{share}/overall/accuracy" for share in SHARES} | {
+    f"gate/{gate}/accuracy" for gate in ("threshold", "learned")
+}
+OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "self_share", "same/any/disagreement"} | STREAMS
 
 
 @pytest.fixture(scope="module")

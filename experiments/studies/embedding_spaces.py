@@ -136,7 +136,7 @@ def _compare(
     word = verdict(claim, difference, by=0.02)
     if difference is None:
         return word, f"{group[0].name} has one layout only ({word})"
-    spread = f" ± {100 * difference.error:.1f}" if difference.seeds > 1 else ""
+    spread = f" ± {200 * difference.error:.1f}" if difference.seeds > 1 else ""
     return word, f"{group[0].name} {100 * difference.mean:+.1f}{spread} points ({word})"
 
 

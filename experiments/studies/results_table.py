@@ -68,7 +68,7 @@ class Cell:
         known = decode(np.stack(self.outcomes), metric, TOUCH) if self.outcomes else None
         if not by_seed or (known is None and len(by_seed) < 2):
             return ""
-        return f"{estimate(by_seed, {}, None if known is None else known.mean(axis=0))[1]:.4f}"
+        return f"{estimate(by_seed, {}, None if known is None else known.mean(axis=0))[1]:.6f}"
 
     def shift(self, column: str, label: str) -> str:
         """Return the mean over seeds on other devices or layouts; ``cannot`` where the row takes none."""
@@ -174,7 +174,7 @@ def _metric(column: str, label: str) -> str:
     return f"{column}/{ALARM.get(label, f'{label}/accuracy')}"
 
 
-def _number(values: Sequence[float], digits: int = 4) -> str:
+def _number(values: Sequence[float], digits: int = 6) -> str:
     return f"{fmean(values):.{digits}f}" if values else ""
 
 

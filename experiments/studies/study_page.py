@@ -51,7 +51,7 @@ def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list
 
 
 def differences_table(found: Sequence[Difference], metric: str) -> list[list[str]]:
-    """Return a line per difference; none without."""
+    """Return a line per difference, ± two standard errors; none without."""
     head = ["variant", "condition", "difference", "n", "verdict"]
     unit = UNITS.get(metric, "points")
     return [
@@ -78,7 +78,7 @@ def statements_table(outcomes: Sequence[StatementResult]) -> list[list[str]]:
 
 
 def comparison_text(outcome: StatementResult) -> str:
-    """Return every comparison of a statement: the mean over paired seeds ± its standard error."""
+    """Return every comparison of a statement: the mean over paired seeds ± two standard errors."""
     said, several = outcome.statement, len(outcome.compared) > 1
     unit = "times" if said.claim in RATIOS else UNITS.get(said.metric, "points")
     figures: Mapping[str, str] = {name: _figure(found, unit) for name, found in outcome.compared.items()}
@@ -169,5 +169,5 @@ def _figure(found: Paired | None, unit: str) -> str:
     if found is None:
         return "no paired runs"
     sign, digits = ("" if unit == "times" else "+"), (2 if unit == "s" else 1)
-    error = "" if math.isinf(found.error) else f" ± {found.error:.{digits}f}"
+    error = "" if math.isinf(found.error) else f" ± {2 * found.error:.{digits}f}"
     return f"{found.mean:{sign}.{digits}f}{error} {unit}".rstrip()

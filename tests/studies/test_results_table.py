@@ -52,7 +52,7 @@ def lines():
 def test_ours_is_mean_and_standard_error_over_seeds(lines):
     line = lines["temporal_graph", "overall"]
     # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt(2), by sqrt(2)
-    assert (line["ours"], line["ours_error"], line["device_shift"]) == ("0.8500", "0.0500", "0.6000")
+    assert (line["ours"], line["ours_error"], line["device_shift"]) == ("0.850000", "0.050000", "0.600000")
 
 
 def test_the_error_is_also_one_over_gestures():
@@ -61,13 +61,18 @@ def test_the_error_is_also_one_over_gestures():
     cell = Cell("rules", "fem", (run(0.875), run(0.875)), 0, (codes, codes))
     (line, *_) = result_rows([cell], {})
     # a standard deviation of 0.125 sqrt(100 / 99) over gestures, by sqrt(100)
-    assert (line["ours"], line["ours_error"]) == ("0.8750", "0.0126")
+    assert (line["ours"], line["ours_error"]) == ("0.875000", "0.012563")
     assert display_rows(result_rows([cell], {}))[1][2] == "87.5 ± 2.5"
+
+
+def test_a_number_is_rounded_once():
+    cell = Cell("features", "fem", (run(0.96846), run(0.96846)), 0)
+    assert display_rows(result_rows([cell], {}))[1][2] == "96.8 ± 0.0"
 
 
 def test_one_seed_has_no_deviation():
     (line, *_) = result_rows([Cell("rules", "fem", (run(0.8),), 0)], {})
-    assert (line["ours"], line["ours_error"], line["report"]) == ("0.8000", "", "")
+    assert (line["ours"], line["ours_error"], line["report"]) == ("0.800000", "", "")
 
 
 def test_the_reports_number_stands_where_it_has_one(lines):
@@ -90,12 +95,12 @@ def test_a_row_that_takes_no_other_layout_says_so():
     fixed = run(0.8, 0.7)
     fixed.data.tags["cannot_unseen_layout"] = "readings are of 25 sensors in this order"
     (line, *_) = result_rows([Cell("mlp", "fem", (fixed,), 0)], {})
-    assert (line["device_shift"], line["unseen_layout"]) == ("0.7000", "cannot")
+    assert (line["device_shift"], line["unseen_layout"]) == ("0.700000", "cannot")
 
 
 def test_the_alarm_has_its_recall_and_its_false_alarms_side_by_side(lines):
-    assert lines["temporal_graph", "dangerous_recall"]["ours"] == "0.5000"
-    assert lines["temporal_graph", "false_alarms"]["ours"] == "0.0210"
+    assert lines["temporal_graph", "dangerous_recall"]["ours"] == "0.500000"
+    assert lines["temporal_graph", "false_alarms"]["ours"] == "0.021000"
     head, first, _ = display_rows(list(lines.values()))
     place = head.index("recall")
     assert head[place + 1] == "false alarms"

@@ -97,16 +97,16 @@ def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
 @pytest.mark.parametrize(
     ("fields", "compared", "text"),
     [
-        ({}, {"a": Paired(12.345, 0.678, 3)}, "+12.3 ± 0.7 points"),
+        ({}, {"a": Paired(12.345, 0.678, 3)}, "+12.3 ± 1.4 points"),
         (
             {},
             {"a": Paired(-1.0, 0.5, 3), "b": Paired(2.0, 0.5, 3)},
-            "-1.0 ± 0.5 points (a); +2.0 ± 0.5 points (b)",
+            "-1.0 ± 1.0 points (a); +2.0 ± 1.0 points (b)",
         ),
         ({}, {"a": Paired(1.0, float("inf"), 1)}, "+1.0 points"),
         ({}, {"a": None}, "no paired runs"),
-        ({"metric": "seconds_per_epoch", "claim": "less"}, {"a": Paired(-0.12, 0.01, 3)}, "-0.12 ± 0.01 s"),
-        ({"metric": "seconds_per_epoch", "claim": "ratio"}, {"a": Paired(4.44, 0.1, 3)}, "4.4 ± 0.1 times"),
+        ({"metric": "seconds_per_epoch", "claim": "less"}, {"a": Paired(-0.12, 0.01, 3)}, "-0.12 ± 0.02 s"),
+        ({"metric": "seconds_per_epoch", "claim": "ratio"}, {"a": Paired(4.44, 0.1, 3)}, "4.4 ± 0.2 times"),
     ],
 )
 def test_what_was_measured_has_its_unit(fields, compared, text):

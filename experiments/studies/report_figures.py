@@ -9,6 +9,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from experiments.studies.comparison import paired
 from experiments.studies.results_table import Cell
 from experiments.studies.runs import load_outcomes
 from experiments.studies.tables import csv_text
@@ -35,7 +36,7 @@ def draw_runs(
 ) -> list[Path]:
     """Draw figures 7 and 8 of each simulator from the outcomes of all runs of each row.
 
-    Figure 7 shows the rows of ``_SHOWN``; a CSV file beside it has the figures of all.
+    Figure 7 shows the rows of ``_SHOWN``. CSV files beside the figures have the numbers of all rows.
 
     Args:
         cells: the runs.
@@ -53,7 +54,9 @@ def draw_runs(
         speeds = device.recording("test", complete=False).parameters["speed"].numpy() * device.model_rate
         matrices = {row: _confusion(each) for row, each in codes.items()}
         drawn = figures.confusions(matrices, ("safe", "dangerous"))
-        paths.append(figures.save_figure(drawn, folder / f"figure08_confusion_{simulator}.png"))
+        path = folder / f"figure08_confusion_{simulator}"
+        paths.append(figures.save_figure(drawn, path.with_suffix(".png")))
+        paths.append(write(csv_text(confusion_rows(codes)), path.with_suffix(".csv")))
         wrong = {row: 1 - decode(each, "big/accuracy", TOUCH).mean(axis=0) for row, each in codes.items()}
         courses = {row: figures.misclassified_shares(speeds, each, _SPEEDS) for row, each in wrong.items()}
         shown = {row: courses[row] for row in _SHOWN if row in courses} or courses
@@ -76,6 +79,26 @@ def _confusion(codes: np.ndarray) -> np.ndarray:
     true = ~np.isnan(decode(codes, "dangerous/alarm_recall", TOUCH))
     said = np.where(right, true, ~true)
     return np.array([[np.sum((true == row) & (said == column)) for column in (0, 1)] for row in (0, 1)])
+
+
+def confusion_rows(codes: Mapping[str, np.ndarray]) -> list[list[str]]:
+    """Return the two kinds of errors of ``dangerous`` of each row, their difference, and its standard error.
+
+    Args:
+        codes: row -> outcomes of its runs, (N, B).
+    """
+    lines = [["row", "safe_called_dangerous", "dangerous_called_safe", "difference", "error"]]
+    for row, each in codes.items():
+        wrong = decode(each, "dangerous/accuracy", TOUCH) < 0.5
+        dangerous = ~np.isnan(decode(each[0], "dangerous/alarm_recall", TOUCH))
+        kinds = wrong[:, ~dangerous], wrong[:, dangerous]
+        one, other = ({str(run): float(share.mean()) for run, share in enumerate(kind)} for kind in kinds)
+        over = kinds[0].mean(axis=0), kinds[1].mean(axis=0)
+        found = paired(one, other, gestures=over)
+        assert found is not None
+        numbers = (over[0].mean(), over[1].mean(), found.mean, found.error)
+        lines.append([row, *(f"{number:.4f}" for number in numbers)])
+    return lines
 
 
 def _courses(courses: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[list[str]]:

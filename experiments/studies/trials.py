@@ -145,6 +145,8 @@ class _Run:
         # Not the id of the run, which another database does not have.
         tags = {"evaluated": self.run.data.tags["fingerprint"], "study": key}
         known = self.store.find("FINISHED", **tags) if self.config.tracking.resume else []
+        # A trial that began before the training ended is of an earlier training of this configuration.
+        known = [one for one in known if one.info.start_time >= self.run.info.end_time]
         if not known:
             changed = any(not one.startswith("tracking.") for one in line)
             known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags, changed)]

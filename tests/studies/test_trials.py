@@ -1,10 +1,19 @@
 """Conditions of a study and their devices."""
 
+import functools
+import time
+
 import pytest
 
+from experiments.studies import trials
 from experiments.studies.study import Study
-from experiments.studies.trials import numbered_settings
+from experiments.studies.trials import _Run, numbered_settings
+from skin.config import fingerprint
 from skin.errors import InputError
+from skin.tracking import Store
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
 
 
 def study(**settings):
@@ -31,3 +40,47 @@ def test_numbered_settings_are_the_number_of_the_device():
 def test_lists_of_different_lengths_are_refused():
     with pytest.raises(InputError, match="one length"):
         list(numbered_settings(study(devices=3, numbered=["device.seed"]), {"layout.seed": [1, 2]}))
+
+
+@pytest.fixture
+def measured(configured, tmp_path, monkeypatch):
+    """Return a function that finishes a training anew and returns the number of measurements since then."""
+    config = configured("experiment=rules", f"tracking.uri=sqlite:///{tmp_path}/m.db")
+    store, count = Store.open(config.tracking), []
+
+    def measure(self, what, own, name, tags, changed):
+        count.append(name)
+        with store.run(name, tags) as run:
+            pass
+        return store.client.get_run(run.info.run_id)
+
+    monkeypatch.setattr(_Run, "_measure", measure)
+    compose = functools.partial(configured, "experiment=rules")
+    monkeypatch.setattr(trials, "compose", lambda name, words: compose(*words))
+
+    def train():
+        with store.run("rules", {"fingerprint": fingerprint(config)}) as run:
+            pass
+        own = _Run(store, store.client.get_run(run.info.run_id), config)
+        own.stored = config
+
+        def trial():
+            own.measured(study(), [], ["device.dead=1"])
+            return len(count)
+
+        return trial
+
+    return train
+
+
+def test_a_trial_is_measured_once_for_a_training(measured):
+    trial = measured()
+    assert [trial(), trial()] == [1, 1]
+
+
+def test_a_trial_of_an_earlier_training_is_not_reused(measured):
+    """The same configuration trained again by other code may give other weights."""
+    assert measured()() == 1
+    time.sleep(0.01)  # MLflow counts milliseconds
+    again = measured()
+    assert [again(), again()] == [2, 2]

@@ -168,6 +168,6 @@ def _cell(trials: Sequence[Trial], metric: str) -> str:
 def _figure(found: Paired | None, unit: str) -> str:
     if found is None:
         return "no paired runs"
-    sign, digits = ("" if unit == "times" else "+"), (2 if unit == "s" else 1)
+    sign, digits = ("" if unit == "times" else "+"), (2 if unit in ("s", "times") else 1)
     error = "" if math.isinf(found.error) else f" ± {2 * found.error:.{digits}f}"
     return f"{found.mean:{sign}.{digits}f}{error} {unit}".rstrip()

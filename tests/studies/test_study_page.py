@@ -106,7 +106,7 @@ def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
         ({}, {"a": Paired(1.0, float("inf"), 1)}, "+1.0 points"),
         ({}, {"a": None}, "no paired runs"),
         ({"metric": "seconds_per_epoch", "claim": "less"}, {"a": Paired(-0.12, 0.01, 3)}, "-0.12 ± 0.02 s"),
-        ({"metric": "seconds_per_epoch", "claim": "ratio"}, {"a": Paired(4.44, 0.1, 3)}, "4.4 ± 0.2 times"),
+        ({"metric": "seconds_per_epoch", "claim": "ratio"}, {"a": Paired(4.44, 0.1, 3)}, "4.44 ± 0.20 times"),
     ],
 )
 def test_what_was_measured_has_its_unit(fields, compared, text):

@@ -132,6 +132,8 @@ def misclassified(
 ) -> Figure:
     """Draw the share of gestures whose label is wrong against the speed of the slide (report, figure 7).
 
+    Bars are two standard errors.
+
     Args:
         courses: row -> shares and standard errors (:func:`misclassified_shares`).
         label: which label.
@@ -144,7 +146,7 @@ def misclassified(
     styles = product(MARKS, COLOURS)
     for (row, (shares, errors)), (mark, colour) in zip(courses.items(), styles, strict=False):
         axis.errorbar(
-            middles * 1e3, shares, errors, marker=mark, markersize=4, capsize=2, color=colour, label=row
+            middles * 1e3, shares, 2 * errors, marker=mark, markersize=4, capsize=2, color=colour, label=row
         )
     axis.set(xlabel="speed, mm/s (0: static)", ylabel=f"share with “{label}” wrong")
     axis.set_ylim(bottom=0)

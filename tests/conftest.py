@@ -36,6 +36,7 @@ from skin.device.base import AbstractDevice
 from skin.labels import TOUCH
 from skin.paths import ROOT
 from skin.recording import Touches
+from tests.starter import copying
 
 CONF = ROOT / "conf"
 PATIENCE = 600  # s: machines are busy at times
@@ -57,6 +58,34 @@ def shared(tmp_path_factory) -> Path:
     """Return the folder that all processes of one run of the tests share."""
     base = tmp_path_factory.getbasetemp()
     return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def empty_database(shared) -> Callable[[], Path]:
+    """Return a function that returns an empty database, which takes MLflow seconds to make.
+
+    It does not exist if its disk is full, as some tests let it be.
+    """
+    path = shared / "empty.db"
+
+    def made() -> Path:
+        with FileLock(f"{path}.lock"):
+            if not path.exists():
+                create = f"import mlflow; mlflow.MlflowClient('sqlite:///{path}.new').search_experiments()"
+                if not subprocess.run([sys.executable, "-c", create], capture_output=True).returncode:
+                    path.with_name("empty.db.new").rename(path)
+        return path
+
+    return made
+
+
+@pytest.fixture(scope="session", autouse=True)
+def stores_are_copied(empty_database):
+    """Let new stores begin as copies of an empty database."""
+    with pytest.MonkeyPatch.context() as patch:
+        if tracking := sys.modules.get("skin.tracking"):  # else no test opens a store
+            patch.setattr(tracking.Store, "open", copying(empty_database))
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -192,13 +221,18 @@ class Command:
 
 
 @pytest.fixture(scope="session")
-def starter(shared) -> Iterator[TextIO]:
+def starter(shared, empty_database) -> Iterator[TextIO]:
     """Connect to the process that forks commands for all who run tests, started once: tests/starter.py."""
     named, process = shared / "starter", None
     with FileLock(f"{named}.lock"):
         if not named.exists() or not (connection := connected(named.read_text())):
             folder = mkdtemp(prefix="skin-")  # a socket's path must be short
-            command = [sys.executable, str(Path(__file__).with_name("starter.py")), folder]
+            command = [
+                sys.executable,
+                str(Path(__file__).with_name("starter.py")),
+                folder,
+                str(empty_database()),
+            ]
             process = subprocess.Popen(command, stdout=subprocess.PIPE)
             process.stdout.readline()
             named.write_text(folder)

@@ -2,8 +2,8 @@
 
 Processes that run tests connect to a socket. A line is a job, and its process's number the answer; or it asks
 for the exit code of such a process. A job has a process of its own, with its own folder, environment, files
-and end, as one that a shell starts; only imports are shared, and the empty database that MLflow takes seconds
-to make. It ends when nobody is connected any more.
+and end, as one that a shell starts; only imports are shared, and an empty database. It ends when nobody is
+connected any more.
 """
 
 import atexit
@@ -16,12 +16,13 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from select import select
 from typing import Any, TextIO
 
-__all__ = ["main"]
+__all__ = ["copying", "main"]
 
 WARM = (
     "alembic.command",
@@ -39,7 +40,9 @@ def main() -> None:
     """Run jobs until nobody is connected; returns in every fork, too, which then runs its script."""
     folder = Path(sys.argv[1])
     made = _warm()
-    _share_database(folder / "empty.db")
+    from skin.tracking import Store
+
+    Store.open = copying(lambda: Path(sys.argv[2]))  # type: ignore[method-assign, assignment]
     assert threading.active_count() == 1, "a fork keeps one thread"
     gc.freeze()  # else every fork would copy what it never changes
     server = socket.socket(socket.AF_UNIX)
@@ -87,25 +90,22 @@ def _warm() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if before.get(name) != value}
 
 
-def _share_database(empty: Path) -> None:
-    """Let a store that does not exist yet begin as a copy of an empty one."""
-    from mlflow import MlflowClient
-
+def copying(empty: Callable[[], Path]) -> Callable[[Any], Any]:
+    """Return ``Store.open``, but a store that does not exist yet begins as a copy of an empty database."""
     from skin.tracking import Store
 
-    if (child := os.fork()) == 0:  # which takes its connections with it
-        MlflowClient(f"sqlite:///{empty}").search_experiments()
-        os._exit(0)
-    os.waitpid(child, 0)
     as_it_is = Store.open
 
     def opened(settings: Any) -> Store:
         path = Path((settings.uri or "").removeprefix("sqlite:///"))
-        if settings.uri and empty.exists() and path.parent.is_dir() and not path.exists():
-            shutil.copy(empty, path)
+        if settings.uri and path.parent.is_dir() and not path.exists() and empty().exists():
+            try:
+                shutil.copy(empty(), path)
+            except OSError:  # such as a full disk, of which the store tells
+                path.unlink()
         return as_it_is(settings)
 
-    Store.open = opened  # type: ignore[method-assign, assignment]
+    return opened
 
 
 def _become(job: dict[str, Any], made: dict[str, str]) -> None:

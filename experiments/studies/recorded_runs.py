@@ -168,8 +168,9 @@ def _record(store: Store, experiment: str, run: Run) -> Record:
 
 
 def _files(store: Store, run: Run) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of each file of a run that is recorded."""
-    names = [one.path for one in store.client.list_artifacts(run.info.run_id) if not one.is_dir]
+    """Yield name and content of each file of a run that is recorded: no pictures, which do not compress."""
+    every = store.client.list_artifacts(run.info.run_id)
+    names = [one.path for one in every if not one.is_dir and Path(one.path).suffix != ".png"]
     with TemporaryDirectory() as folder:
         for name in names if "study" in run.data.tags else sorted({*names} & {*_KEPT}):
             path = Path(store.client.download_artifacts(run.info.run_id, name, folder))

@@ -97,6 +97,16 @@ def test_export_of_imported_runs_is_the_same_file(made_up, tmp_path):
     assert again.read_bytes() == made_up.read_bytes()
 
 
+def test_pictures_are_not_recorded(made_up, tmp_path):
+    (tmp_path / "seeds.csv").write_text(f"row,run\nx,{'a' * 16}\n")
+    page = {"files": {"page.csv": b"1", "page.png": b"2"}}
+    write_records([record("a" * 16), record("a" * 16, study="b") | page], made_up)
+    import_runs(at(tmp_path), made_up)
+    again = tmp_path / "again.parquet"
+    assert export_runs(at(tmp_path), again, tmp_path) == 2
+    assert {name for one in read_records(again) for name in one["files"]} == {"outcomes.npy", "page.csv"}
+
+
 @pytest.mark.parametrize("content", [b"", b"no table"])
 def test_another_file_is_refused(tmp_path, content):
     path = tmp_path / "runs.parquet"

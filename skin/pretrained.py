@@ -94,7 +94,7 @@ def _run(name: str, folder: Path, record: dict[str, Any]) -> Run:
         user_id="",
         status=RunStatus.to_string(RunStatus.FINISHED),
         start_time=record["start_time"],
-        end_time=None,
+        end_time=record["start_time"],  # a record does not say when the training ended
         lifecycle_stage=LifecycleStage.ACTIVE,
         artifact_uri=folder.resolve().as_uri(),
         run_name=name,

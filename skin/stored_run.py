@@ -142,15 +142,19 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
     return validate_config(whole)
 
 
+class MissingWeightsError(InputError):
+    """A run cannot be used because it was imported: only its results were."""
+
+
 def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -> None:
     """Load the weights of a run into a learner.
 
     Raises:
-        InputError: the weights do not fit the touches, such as another window with early fusion, or the run
-            has none because it was imported.
+        InputError: the weights do not fit the touches, such as another window with early fusion.
+        MissingWeightsError: the run has none.
     """
     if source := run.data.tags.get(RECORDED):
-        raise InputError(
+        raise MissingWeightsError(
             f"run {run.info.run_id} ({run.info.run_name}) was imported from {source} without its weights: "
             "tracking.recorded=false trains it again"
         )

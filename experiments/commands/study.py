@@ -7,7 +7,8 @@
 
 A study is a file of conf/study. It trains the runs that are missing, with the budget in that file; rerun to
 resume. Writes study_<name>.md, .csv and .png into out=. A measure of single runs, such as margins, writes
-files for each, and of several runs study_<name>.csv with all values.
+files for each, and of several runs study_<name>.csv with all values. study.rows=all leaves out runs that
+were imported without the results that it needs.
 """
 
 import sys
@@ -67,6 +68,8 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
             print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *trial.files, sep="\n", flush=True)
     if shard:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
+    elif not found:
+        raise InputError(f"study={study.name} has nothing to publish: all its runs were left out")
     elif study.metrics:
         smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +27,7 @@ from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.source import note_reuse
-from skin.stored_run import TAG, apply_overrides, load_configuration
+from skin.stored_run import TAG, MissingWeightsError, apply_overrides, load_configuration
 from skin.tracking import Store
 from skin.trained import Trained, load_trained
 
@@ -65,12 +66,18 @@ def run_trials(
 ) -> Iterator[Trial]:
     """Yield the results of a study for a run; earlier results are read from MLflow.
 
+    Where the study is about all rows, runs that were imported without weights are left out unless all their
+    results were imported, too.
+
     Args:
         store: of the run; results are logged there.
         planned: the run.
         study: what to measure.
         config: of the command.
         folder: for the files of a measure.
+
+    Raises:
+        MissingWeightsError: an imported run of a named row would have to be measured.
     """
     if planned.run is None:
         yield Trial(planned.variant, planned.seed, "", "", "", {})
@@ -94,15 +101,24 @@ def run_trials(
     base, changes = (
         (given, []) if planned.variant.configs else ([], [one for one in given if one != selected])
     )
-    for condition, settings in (study.conditions or {"": {}}).items():
-        for number, own_settings in numbered_settings(study, settings):
-            line = as_overrides({**study.test, **own_settings})
-            found = subject.measured(study, base, [*line, *changes])
-            files = _fetched(store, found, folder)
-            metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
-            at = planned.variant, planned.seed, condition, number, planned.run.data.tags["fingerprint"]
-            cannot = found.data.tags.get("cannot", "")
-            yield Trial(*at, metrics, said, files, load_outcomes(store, found), cannot)
+    conditions = [
+        (condition, number, as_overrides({**study.test, **own_settings}))
+        for condition, settings in (study.conditions or {"": {}}).items()
+        for number, own_settings in numbered_settings(study, settings)
+    ]
+    try:
+        results = [subject.measured(study, base, [*line, *changes]) for _, _, line in conditions]
+    except MissingWeightsError as error:
+        if study.rows != "all":
+            raise
+        print(f"left out: {error}", file=sys.stderr, flush=True)
+        return
+    for (condition, number, _), found in zip(conditions, results, strict=True):
+        files = _fetched(store, found, folder)
+        metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
+        at = planned.variant, planned.seed, condition, number, planned.run.data.tags["fingerprint"]
+        cannot = found.data.tags.get("cannot", "")
+        yield Trial(*at, metrics, said, files, load_outcomes(store, found), cannot)
 
 
 def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -51,8 +52,10 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
         axis.set_xlabel("x, mm")
     for axis in axes[:, 0]:
         axis.set_ylabel("y, mm")
-    bar = figure.colorbar(picture, ax=axes, label="bound of the place, mm", format="%g")
-    bar.ax.yaxis.set_minor_formatter("{x:g}")
+    steps = (1, 2, 5) if scale.vmax > 5 * scale.vmin else range(1, 10)
+    figure.colorbar(
+        picture, ax=axes, label="bound of the place, mm", format="%g", ticks=LogLocator(subs=steps)
+    ).minorticks_off()
     return save_figure(figure, path)
 
 

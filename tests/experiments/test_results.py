@@ -96,7 +96,7 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
         (
             ["results.part=tables"],
             "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, adapt, studies, "
-            "design, images",
+            "design, tracking, images",
         ),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.optional=[image]"], "results.optional=['image']: there is no part image"),

@@ -47,7 +47,7 @@ def test_lists_of_different_lengths_are_refused():
 
 @pytest.fixture
 def measured(configured, tmp_path, monkeypatch):
-    """Return a function that finishes a training anew, or takes a run, and returns one that counts its trials."""
+    """Finish a training anew, or take a given run; return a function that counts its trials."""
     config = configured("experiment=rules", f"tracking.uri=sqlite:///{tmp_path}/m.db")
     store, count = Store.open(config.tracking), []
 

@@ -41,7 +41,8 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
     figure = Figure(figsize=tuple(size), layout="constrained")
     axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
     shown = {force: 1e3 * np.asarray(bound) for force, bound in maps.items()}
-    scale = LogNorm(min(one.min() for one in shown.values()), max(one.max() for one in shown.values()))
+    lowest, highest = min(one.min() for one in shown.values()), max(one.max() for one in shown.values())
+    scale = LogNorm(lowest, highest)
     extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
     for axis, (force, bound) in zip(axes.flat, shown.items(), strict=True):
         picture = axis.imshow(bound, cmap="viridis_r", norm=scale, extent=extent)
@@ -52,7 +53,7 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
         axis.set_xlabel("x, mm")
     for axis in axes[:, 0]:
         axis.set_ylabel("y, mm")
-    steps = (1, 2, 5) if scale.vmax > 5 * scale.vmin else range(1, 10)
+    steps = (1, 2, 5) if highest > 5 * lowest else range(1, 10)
     figure.colorbar(
         picture, ax=axes, label="bound of the place, mm", format="%g", ticks=LogLocator(subs=steps)
     ).minorticks_off()

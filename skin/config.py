@@ -48,6 +48,7 @@ class Evaluation:
     false_alarm_rate: float
     safe_gestures: int = 5000
     gestures: int | None = None  # of older runs, which evaluated other gestures on other devices
+    profile: str | None = None  # older runs have none
 
 
 @dataclass

@@ -20,7 +20,7 @@ RENAMED: dict[str, str] = {
 _LATER: dict[str, dict[str, Any]] = {
     "touch": {"stretch": 4.0, "leak": 0.6, "strict": False, "over_sensors": True},
     "layout": {"depth": None},
-    "evaluation": {"gestures": None},
+    "evaluation": {"gestures": None, "profile": None},
 }
 MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
 """Settings of Lightning's Trainer that choose the machine, not the result."""

@@ -41,6 +41,7 @@ from skin.settings import import_target
 from skin.source import note_reuse
 from skin.stored_run import TAG
 from skin.tracking import Store
+from skin.trained import threshold_device
 from skin.unfinished import find_unfinished, unfinished_folder
 
 _log = logging.getLogger(__name__)
@@ -78,6 +79,7 @@ def train(config: DictConfig) -> bool:
         refuse_twice(store, identity["fingerprint"])
     check_evaluation(config.evaluation)
     device = build_device(config)
+    judged = device if config.evaluation.profile is None else threshold_device(config, config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
     report_balance(device, shown=PARENT not in os.environ)
@@ -91,7 +93,7 @@ def train(config: DictConfig) -> bool:
         learner.unfinished = unfinished_folder(config.tracking, run)
         describe(store, run.info.run_id, config, data.hash)
         learner.fit(data, logger)
-        point = choose_operating_point(learner, device, config.evaluation)
+        point = choose_operating_point(learner, judged, config.evaluation)
         report = evaluate(learner, device, config.evaluation, point)
         values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
         log_learner(store, run, learner)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
@@ -15,14 +16,14 @@ from mlflow.exceptions import MlflowException
 from omegaconf import DictConfig, OmegaConf
 
 from skin.build import build_device
-from skin.config import Evaluation, validate_config
+from skin.config import Evaluation, plain, validate_config
 from skin.datamodule import TouchData
 from skin.earlier_settings import in_seconds
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
 from skin.fingerprint import renamed
 from skin.learner.base import AbstractLearner
-from skin.pretrained import find_pretrained
+from skin.pretrained import find_copy, find_pretrained
 from skin.safe_loading import load_yaml
 from skin.tracking import RECORDED, Store
 from skin.trust import check_targets
@@ -131,7 +132,7 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
         if key == "profile":
             # A profile is no group of settings of its own, but changes those of the device.
             chosen = override.value()
-            named = compose(f"profile/{chosen}").device if chosen else {}
+            named = profile_settings(chosen) if chosen else {}
             whole.device = OmegaConf.merge(whole.device, {name: composed.device[name] for name in named})
             continue
         parent, _, name = key.rpartition(".")
@@ -142,18 +143,33 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
     return validate_config(whole)
 
 
+def profile_settings(name: str) -> dict[str, Any]:
+    """Return the settings of the device in a profile (``conf/profile/``).
+
+    Raises:
+        InputError: there is no such profile.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    known = loader.get_group_options("profile")
+    if name not in known:
+        raise InputError(f"there is no profile {name}: choose one of {', '.join(known)}")
+    return plain(compose(f"profile/{name}").device)
+
+
 class MissingWeightsError(InputError):
     """A run cannot be used because it was imported: only its results were."""
 
 
 def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -> None:
-    """Load the weights of a run into a learner.
+    """Load the weights of a run into a learner. Those of an imported run are in ``models/``, if anywhere.
 
     Raises:
         InputError: the weights do not fit the touches, such as another window with early fusion.
         MissingWeightsError: the run has none.
     """
-    if source := run.data.tags.get(RECORDED):
+    source = run.data.tags.get(RECORDED)
+    run = (find_copy(run) or run) if source else run
+    if RECORDED in run.data.tags:
         raise MissingWeightsError(
             f"run {run.info.run_id} ({run.info.run_name}) was imported from {source} without its weights: "
             "tracking.recorded=false trains it again"

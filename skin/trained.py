@@ -9,13 +9,20 @@ from torch import Tensor
 
 from skin.build import build_data, build_device, build_learner, build_skin
 from skin.config import Tracking, plain, validate_config
-from skin.device.base import AbstractDevice
+from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.settings import configured
 from skin.skin_distribution import SkinDistribution
-from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
+from skin.stored_run import (
+    find_run,
+    load_configuration,
+    load_learner,
+    load_operating_point,
+    profile_settings,
+)
 from skin.tracking import Store
 
 
@@ -95,25 +102,55 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
 def choose_for_skin(
     learner: AbstractLearner, stored: DictConfig, config: DictConfig
 ) -> OperatingPoint | None:
-    """Return an operating point for the skin of a configuration, for a run that was trained on drawn skins.
+    """Return an operating point for the skin and the device of a configuration; None: the stored one holds.
 
-    Safe touches are more easily mistaken on some skins than on others, so the threshold that was chosen over
-    all of them has another false-alarm rate on each. This one is chosen on fresh gestures on the skin, each
-    measured by a device that is drawn as in training. None if the run was trained on one skin.
+    Safe touches are more easily mistaken on some skins and devices than on others, so a threshold that was
+    chosen over many of them has another false-alarm rate on each. A run that was trained on drawn skins gets
+    one for its skin, and every run one for ``evaluation.profile``.
 
     Args:
         learner: of the run, trained.
         stored: its configuration.
         config: its configuration with the skin to use.
+
+    Raises:
+        InputError: see :func:`threshold_device`.
     """
-    if "skins" not in stored.device:
+    known = OmegaConf.select(stored, "evaluation.profile")
+    if "skins" not in stored.device and config.evaluation.profile == known:
         return None
-    whole, here = plain(stored), plain(config)
+    return choose_operating_point(learner, threshold_device(stored, config), config.evaluation)
+
+
+def threshold_device(stored: DictConfig, config: DictConfig) -> AbstractSimulated:
+    """Return the device whose fresh gestures determine the threshold of the alarm.
+
+    It is the device of the training on the skin of ``config``. If ``evaluation.profile`` is set, every
+    gesture is measured by another device of this profile.
+
+    Args:
+        stored: configuration of a training.
+        config: the same with the skin to use.
+
+    Raises:
+        InputError: the training has no simulated touches, or there is no such profile.
+    """
+    whole, here, profile = plain(stored), plain(config), config.evaluation.profile
+    if "simulator" not in whole["device"]:
+        raise InputError(
+            f"evaluation.profile={profile} chooses the alarm's threshold on simulated touches, and this run "
+            "was trained on others: leave it out"
+        )
     for group in ("body", "layout", "simulator"):
         whole[group] = whole["device"][group] = here[group]
+    if profile is not None:
+        whole["device"] |= profile_settings(profile)
+        # Drawn skins draw a device for every gesture without being told.
+        every = {} if "skins" in whole["device"] else {"randomise": True, "calibration": None}
+        whole["device"] = {key: one for key, one in whole["device"].items() if key != "randomise"} | every
     device = build_device(OmegaConf.create(whole)).reference
     assert device is not None
-    return choose_operating_point(learner, device, config.evaluation)
+    return device
 
 
 def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:

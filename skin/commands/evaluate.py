@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from skin.command import command
 from skin.config import overrides
+from skin.errors import InputError
 from skin.files import results
 
 
@@ -31,6 +32,8 @@ def main(config: DictConfig) -> None:
     run = find_run(store, config.run)
     stored, given = load_configuration(store, run, config.trust), overrides()
     config = apply_overrides(stored, config, given)
+    if "skins" in config.device and config.evaluation.profile is not None:
+        raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
     of = load_trained(store, run, config, stored)
     device, learner, point = of.device, of.learner, of.point
     touches = device.touches("test")  # read before anything is logged, because a port may fail

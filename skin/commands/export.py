@@ -61,8 +61,8 @@ def main(config: DictConfig) -> None:
     stored = load_configuration(store, run, config.trust)
     whole = apply_overrides(stored, config, overrides())
     of = load_trained(store, run, whole, stored)
-    if point := choose_for_skin(of.learner, stored, whole):
-        of = replace(of, point=point)
+    if "skins" in stored.device:
+        of = replace(of, point=choose_for_skin(of.learner, stored, whole))
     module = of.learner.pipeline(of.positions)  # refused before anything is simulated
     if advice := simulator_warning(stored):
         print(advice, file=sys.stderr)

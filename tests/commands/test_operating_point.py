@@ -94,6 +94,34 @@ def test_another_rate_gets_another_threshold(run, folder):
     assert level < stored(folder)["threshold"]
 
 
+def threshold(text):
+    return float(re.search(r"alarm above (\d\.\d+), chosen on 200 fresh", text)[1])
+
+
+def test_a_profile_gets_a_threshold_of_its_own(run, folder):
+    done = run(folder, "evaluate.py", "evaluation.profile=rough", f"out={folder}/profile")
+    assert done.returncode == 0, done.stderr
+    assert abs(threshold(done.stdout) - stored(folder)["threshold"]) > 1e-3
+
+
+def test_a_training_stores_the_threshold_of_a_profile(run, folder, tmp_path):
+    found = run(folder, "evaluate.py", "evaluation.profile=rough", f"out={folder}/profile")
+    words = ["experiment=rules", *SKIN, *SMALL, "evaluation.profile=rough"]
+    done = run(tmp_path, "train.py", *words)
+    assert done.returncode == 0, done.stderr
+    assert threshold(" ".join(done.stdout.split())) == threshold(found.stdout)
+    done = run(tmp_path, "evaluate.py", f"out={tmp_path}/again")
+    assert threshold(done.stdout) == threshold(found.stdout)
+
+
+def test_an_unknown_profile_is_refused_before_anything_is_trained(run, folder, tmp_path):
+    for where, words in ((folder, ["evaluate.py"]), (tmp_path, ["train.py", "experiment=rules", *SKIN])):
+        done = run(where, *words, "evaluation.profile=none_such")
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+        assert "calibrated, drawn, harsh, mild, rough" in done.stderr
+    assert not (tmp_path / "m.db").exists() or not query(tmp_path, "select * from runs")
+
+
 @contextmanager
 def tapped():
     """Give the port of a skin that is left alone for five seconds and then tapped."""
@@ -133,6 +161,16 @@ def test_live_raises_the_alarm_where_the_run_does(run, folder, threshold, given,
     assert re.search(r"[1-9]\d* verdicts", done.stderr)
     assert ("DANGEROUS" in done.stdout) == alarm
     assert f"alarm above {'1e-05' if given else f'{threshold:.4f}'}" in done.stderr
+
+
+def test_live_chooses_the_threshold_of_a_profile(run, folder):
+    found = run(folder, "evaluate.py", "evaluation.profile=rough", f"out={folder}/profile")
+    with tapped() as port:
+        there = ["device=serial", f"device.port={port}", "live.touch=0.3", "seconds=1.2"]
+        done = run(folder, "live.py", *there, "evaluation.profile=rough")
+    assert done.returncode == 0, done.stderr
+    assert "devices of the profile rough" in done.stderr
+    assert threshold(done.stderr) == threshold(found.stdout)
 
 
 def test_live_refuses_an_alarm_that_cannot_be_raised(run, folder):

@@ -6,11 +6,16 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+import torch
 
 from experiments.studies.recorded_runs import export_runs, import_runs, read_records, write_records
 from skin.config import Tracking
 from skin.errors import InputError
+from skin.paths import ROOT
+from skin.pretrained import find_pretrained
+from skin.stored_run import MissingWeightsError
 from skin.tracking import Store
+from skin.trained import load_run
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -72,6 +77,29 @@ def test_a_newer_record_is_imported_too(made_up, tmp_path):
     write_records([record("a" * 16) | {"start": 2000, "metrics": {"x": 1.0}}, record("c" * 16)], made_up)
     assert import_runs(at(tmp_path), made_up) == 1
     assert Store.open(at(tmp_path)).find("FINISHED", fingerprint="a" * 16)[0].data.metrics == {"x": 1.0}
+
+
+def test_an_imported_run_has_the_weights_of_the_pretrained_model_that_it_is(tmp_path):
+    known = find_pretrained("default_skin")
+    records = read_records(ROOT / "docs/results/runs.parquet")
+    own = [one for one in records if one["tags"].get("fingerprint") == known.data.tags["fingerprint"]]
+    write_records(own, tmp_path / "runs.parquet")
+    import_runs(at(tmp_path), tmp_path / "runs.parquet")
+    uri = f"sqlite:///{tmp_path}/m.db"
+    imported, copied = (load_run(name, uri) for name in (own[0]["tags"]["fingerprint"], "default_skin"))
+    touches = copied.device.touches("test")[slice(8)]
+    assert torch.equal(imported.predict(touches), copied.predict(touches))
+
+
+def test_an_imported_run_of_another_training_has_no_weights(tmp_path):
+    """It was trained again, with the same settings."""
+    known = find_pretrained("default_skin")
+    records = read_records(ROOT / "docs/results/runs.parquet")
+    (own,) = (one for one in records if one["tags"].get("fingerprint") == known.data.tags["fingerprint"])
+    write_records([own | {"start": own["start"] + 1}], tmp_path / "runs.parquet")
+    import_runs(at(tmp_path), tmp_path / "runs.parquet")
+    with pytest.raises(MissingWeightsError, match="without its weights"):
+        load_run(own["tags"]["fingerprint"], f"sqlite:///{tmp_path}/m.db")
 
 
 def test_imported_runs_can_be_ignored(made_up, tmp_path):

@@ -43,11 +43,13 @@ def watch_run(
     say(f"loading {title} ({run.info.run_id[:8]})")
     if advice := engine_builder.simulator_warning(stored, device):
         say(advice)
+    profile = watched.evaluation.profile
+    if profile is not None or "skins" in stored.device:
+        devices = "" if profile is None else f" and devices of the profile {profile}"
+        say(f"choosing the threshold of the alarm on simulated touches of this skin{devices}")
     of = load_trained(store, run, trained, stored)
     if "skins" in stored.device:
-        say("choosing the threshold of the alarm on simulated touches of this skin")
-    if point := choose_for_skin(of.learner, stored, watched):
-        of = replace(of, point=point)
+        of = replace(of, point=choose_for_skin(of.learner, stored, watched))
     engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)
     if of.point is not None:
         above = live.patience.above

@@ -16,7 +16,7 @@ from skin.errors import InputError
 from skin.fine_tuning import LEAST, FineTuning
 from skin.recording import Touches
 from skin.rng import Stream, generator
-from skin.stored_run import apply_overrides
+from skin.run_overrides import apply_overrides
 
 _DEFAULT = 48  # gestures of a simulated device
 _OWN = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run

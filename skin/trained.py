@@ -14,15 +14,10 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.run_overrides import profile_settings
 from skin.settings import configured
 from skin.skin_distribution import SkinDistribution
-from skin.stored_run import (
-    find_run,
-    load_configuration,
-    load_learner,
-    load_operating_point,
-    profile_settings,
-)
+from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
 
@@ -83,7 +78,7 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
     Args:
         store: that holds the run.
         run: a finished training.
-        config: its configuration, changed as :func:`skin.stored_run.apply_overrides` does.
+        config: its configuration, changed as :func:`skin.run_overrides.apply_overrides` does.
         stored: its configuration without changes.
 
     Raises:

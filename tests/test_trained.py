@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from skin.config import plain, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
-from skin.stored_run import profile_settings
+from skin.run_overrides import profile_settings
 from skin.trained import choose_for_skin, threshold_device
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]

@@ -76,7 +76,8 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
 def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
     from skin.hardware.live import engine_builder
     from skin.hardware.live.verdict import DebounceSettings
-    from skin.stored_run import apply_overrides, find_run
+    from skin.run_overrides import apply_overrides
+    from skin.stored_run import find_run
     from skin.stored_run import load_configuration as stored
     from skin.tracking import Store
     from skin.trained import load_trained

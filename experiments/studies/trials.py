@@ -26,8 +26,9 @@ from skin.build import build_device
 from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
+from skin.run_overrides import apply_overrides
 from skin.source import note_reuse
-from skin.stored_run import TAG, MissingWeightsError, apply_overrides, load_configuration
+from skin.stored_run import TAG, MissingWeightsError, load_configuration
 from skin.tracking import Store
 from skin.trained import Trained, load_trained
 
@@ -83,42 +84,37 @@ def run_trials(
         yield Trial(planned.variant, planned.seed, "", "", "", {})
         return
     own = planned.run.data.metrics if planned.variant.configs else {}
+    identity = planned.run.data.tags["fingerprint"]
     if study.measure is None and not study.conditions:
         outcomes = load_outcomes(store, planned.run)
-        yield Trial(
-            planned.variant,
-            planned.seed,
-            "",
-            "",
-            planned.run.data.tags["fingerprint"],
-            own,
-            outcomes=outcomes,
-        )
+        yield Trial(planned.variant, planned.seed, "", "", identity, own, outcomes=outcomes)
         return
-    subject = _Run(store, planned.run, config)
-    given, selected = passed_overrides(), f"simulator={planned.run.data.tags.get('simulator')}"
-    # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
-    base, changes = (
-        (given, []) if planned.variant.configs else ([], [one for one in given if one != selected])
-    )
-    conditions = [
-        (condition, number, as_overrides({**study.test, **own_settings}))
-        for condition, settings in (study.conditions or {"": {}}).items()
-        for number, own_settings in numbered_settings(study, settings)
-    ]
     try:
-        results = [subject.measured(study, base, [*line, *changes]) for _, _, line in conditions]
+        results = list(_measured(study, planned, _Run(store, planned.run, config)))
     except MissingWeightsError as error:
         if study.rows != "all":
             raise
         print(f"left out: {error}", file=sys.stderr, flush=True)
         return
-    for (condition, number, _), found in zip(conditions, results, strict=True):
+    for condition, number, found in results:
         files = _fetched(store, found, folder)
         metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
-        at = planned.variant, planned.seed, condition, number, planned.run.data.tags["fingerprint"]
+        at = planned.variant, planned.seed, condition, number, identity
         cannot = found.data.tags.get("cannot", "")
         yield Trial(*at, metrics, said, files, load_outcomes(store, found), cannot)
+
+
+def _measured(study: Study, planned: Planned, subject: "_Run") -> Iterator[tuple[str, str, Run]]:
+    """Yield each condition, the number of the device, and the MLflow run with the results."""
+    given, selected = passed_overrides(), f"simulator={subject.run.data.tags.get('simulator')}"
+    # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
+    base, changes = (
+        (given, []) if planned.variant.configs else ([], [one for one in given if one != selected])
+    )
+    for condition, settings in (study.conditions or {"": {}}).items():
+        for number, own_settings in numbered_settings(study, settings):
+            line = as_overrides({**study.test, **own_settings})
+            yield condition, number, subject.measured(study, base, [*line, *changes])
 
 
 def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

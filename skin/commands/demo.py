@@ -37,7 +37,8 @@ def _emulated(config: DictConfig) -> Iterator[dict[str, str | float]]:
     from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
     from skin.hardware.emulator.faults import Faults
     from skin.hardware.emulator.port import open_port
-    from skin.stored_run import apply_overrides, find_run, load_configuration
+    from skin.run_overrides import apply_overrides
+    from skin.stored_run import find_run, load_configuration
     from skin.tracking import Store
 
     quiet()

@@ -23,7 +23,8 @@ def main(config: DictConfig) -> None:
     from skin.option import option_name
     from skin.plot.evaluation_page import publish_evaluation, verdicts
     from skin.run import log_report
-    from skin.stored_run import apply_overrides, find_run, load_configuration
+    from skin.run_overrides import apply_overrides
+    from skin.stored_run import find_run, load_configuration
     from skin.tracking import Store
     from skin.trained import load_trained
 

@@ -51,7 +51,8 @@ def main(config: DictConfig) -> None:
     from skin.console import quiet
     from skin.exported.writer import write_model
     from skin.hardware.live.engine_builder import describe, simulator_warning
-    from skin.stored_run import apply_overrides, find_run, load_configuration
+    from skin.run_overrides import apply_overrides
+    from skin.stored_run import find_run, load_configuration
     from skin.tracking import Store
     from skin.trained import choose_for_skin, load_trained
 

@@ -10,7 +10,8 @@ from skin.build import build_device
 from skin.hardware.live import engine_builder
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched
-from skin.stored_run import apply_overrides, find_run, load_configuration
+from skin.run_overrides import apply_overrides
+from skin.stored_run import find_run, load_configuration
 from skin.tracking import Store
 from skin.trained import choose_for_skin, load_trained
 

@@ -58,7 +58,8 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
     load_learner(store, parent, learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     touches, others = choose_gestures(target.device, settings)
-    if "skins" in stored.device:  # the threshold of the run holds for drawn skins together
+    # The threshold of a run of drawn skins holds for all of them together.
+    if "skins" in stored.device or target.config.evaluation.profile is not None:
         point = choose_operating_point(learner, target.twin, target.config.evaluation)
     else:
         point = load_operating_point(parent, learner, stored, target.config.evaluation)

@@ -17,6 +17,7 @@ from skin.fine_tuning import LEAST, FineTuning
 from skin.recording import Touches
 from skin.rng import Stream, generator
 from skin.run_overrides import apply_overrides
+from skin.trained import threshold_device
 
 _DEFAULT = 48  # gestures of a simulated device
 _OWN = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run
@@ -28,7 +29,8 @@ class Target:
 
     Attributes:
         device: the skin, or its recording.
-        twin: a simulated device with the body and layout of the skin. Its imperfections are those of the run.
+        twin: a simulated device with the body and layout of the skin. Its imperfections are those of the run,
+            or of ``evaluation.profile``.
         config: of the adapted run.
     """
 
@@ -63,6 +65,9 @@ def find_target(
         there = validate_config(OmegaConf.create(whole | {"device": whole["device"] | {"test": "all"}}))
     device, known = build_device(there), build_device(nominal)
     twin = known.reference or known
+    if config.evaluation.profile is not None:
+        asked = OmegaConf.create(plain(nominal) | {"evaluation": plain(config)["evaluation"]})
+        twin = threshold_device(nominal, asked)
     _check(parent, device, twin)
     content = plain(nominal if device.simulation is None else there)
     content["adapt"] = asdict(settings) | {

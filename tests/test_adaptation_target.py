@@ -1,15 +1,20 @@
 """The gestures that a run is adapted to, and those that are reported."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
-from skin.adaptation_target import choose_gestures, simulated_budget
+from skin.adaptation_target import choose_gestures, find_target, simulated_budget
 from skin.build import build_device
+from skin.config import plain, validate_config
 from skin.device._split import split_slices
 from skin.errors import InputError
 from skin.fine_tuning import FineTuning
+from skin.paths import CONF
 
 NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
 
@@ -60,3 +65,22 @@ def test_gestures_without_labels_are_refused(made_up_device, monkeypatch):
     monkeypatch.setattr(made_up_device, "all_touches", lambda: unknown)
     with pytest.raises(InputError, match="record them with labels"):
         choose_gestures(made_up_device, FineTuning())
+
+
+def test_the_threshold_of_the_alarm_may_be_for_a_profile():
+    words = ["evaluation.profile=rough", "device.noise=0.3"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        stored = OmegaConf.create(plain(validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))))
+        parent = SimpleNamespace(
+            info=SimpleNamespace(run_id="a"), data=SimpleNamespace(tags={"fingerprint": "b"})
+        )
+        found = {
+            given: find_target(parent, stored, compose("adapt", given), FineTuning(), given)
+            for given in (tuple(words), ())
+        }
+    profiled, plainly = found.values()
+    assert (profiled.twin.noise, profiled.twin.gain_spread, profiled.twin.randomise) == (0.1, 0.2, True)
+    assert (plainly.twin.noise, plainly.twin.randomise) == (0.2, False)
+    assert profiled.config.evaluation.profile == "rough"
+    # The gestures to adapt on are measured by the described device, not by one of the profile.
+    assert profiled.device.noise == 0.3

@@ -27,7 +27,8 @@ datamodule
 learner
 evaluation build unfinished claim run_logger pretrained
 stored_run run_overrides model_card fine_tuning
-trained adaptation_target
+trained
+adaptation_target
 exported
 hardware
 plot

@@ -1,11 +1,13 @@
 """Atomic file writing; a full or read-only disk raises InputError."""
 
 import errno
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import Any
 
 from skin.errors import InputError
 
@@ -72,6 +74,19 @@ def write(text: str, path: Path) -> Path:
     with whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
     return path
+
+
+def json_text(content: Any) -> str:
+    """Return JSON with numbers to six digits; further ones depend on the processor."""
+    return json.dumps(_rounded(content), indent=2) + "\n"
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _rounded(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def unwritable(path: Path | str, error: OSError, place: str) -> InputError:

@@ -1,5 +1,6 @@
 """A full disk costs one sentence: nothing is half-written, and what was there before stays."""
 
+import json
 import os
 import resource
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ import torch
 from skin.config import Tracking
 from skin.error_messages import to_input_error
 from skin.errors import InputError
-from skin.files import write
+from skin.files import json_text, write
 from skin.hardware.calibration.bench_session import BenchSession
 from skin.hardware.calibration.bench_session import write_bench_session as write_session
 from skin.labels import TOUCH
@@ -84,6 +85,15 @@ def test_a_folder_that_cannot_be_is_refused(name, tmp_path, made_up_device):
     with pytest.raises(InputError, match=rf"^cannot write .*{name}: "):
         WRITERS[name](tmp_path / "file" / name, made_up_device)
     assert (tmp_path / "file").read_text() == "before"
+
+
+def test_numbers_in_json_have_no_digits_of_the_processor():
+    content = {"a": [0.1 + 0.2, (1 / 3 * 1e-9,)], "b": {"count": 1234567, "known": True, "none": None}}
+    assert json.loads(json_text(content)) == {
+        "a": [0.3, [3.33333e-10]],
+        "b": {"count": 1234567, "known": True, "none": None},
+    }
+    assert json_text({"a": 0.032572243846157964}) == json_text({"a": 0.03257224384616024})
 
 
 def test_an_animation_is_whole(tmp_path, configured):

@@ -1,6 +1,5 @@
 """What a skin can know of a fingertip: the Cramer-Rao bound, blind touches and the receptive radius."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -18,7 +17,7 @@ from skin.body.base import AbstractBody
 from skin.build import build_skin
 from skin.design.information import Noise, Sensitivity, covariance_bound, sensitivity
 from skin.errors import InputError
-from skin.files import write
+from skin.files import json_text, write
 from skin.settings import RISING, checked
 from skin.simulator.base import AbstractSimulator
 from skin.touch.fingertip import Fingertip
@@ -105,7 +104,7 @@ class Bound:
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
         about = {"sensors": len(skin.sensors), "settings": settings, "bounds": [asdict(one) for one in found]}
         print(
-            write(json.dumps(about, indent=2) + "\n", folder / "design.json"),
+            write(json_text(about), folder / "design.json"),
             draw_bounds(skin.body, skin.sensors, maps, folder / "design.png"),
             sep="\n",
         )

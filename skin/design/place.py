@@ -1,6 +1,5 @@
 """Place sensors where their readings tell most about touches."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from skin.design.placement_problem import PlacementProblem
 from skin.design.readings import reading_covariance
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.files import write
+from skin.files import json_text, write
 from skin.plot.figures import save_figure
 from skin.plot.placement import placement
 from skin.sensors import Sensors
@@ -119,7 +118,7 @@ class Place:
         )
         return [
             write(_csv(problem.sensors, chosen), folder / "placement.csv"),
-            write(json.dumps(content, indent=2) + "\n", folder / "placement.json"),
+            write(json_text(content), folder / "placement.json"),
             save_figure(figure, folder / "placement.png"),
         ]
 

@@ -70,10 +70,7 @@ def train(config: DictConfig) -> bool:
     identity["threads"] = str(torch.get_num_threads())
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
-        note_reuse(finished[0])
-        if PARENT not in os.environ:
-            _log.info("run %s did this before: tracking.resume=false repeats it", finished[0].info.run_id)
-            Console().print(metrics_table(finished[0].data.metrics, finished[0].info.run_name))
+        _show_finished(finished[0])
         return False
     if config.tracking.resume:
         refuse_twice(store, identity["fingerprint"])
@@ -102,6 +99,14 @@ def train(config: DictConfig) -> bool:
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
+
+
+def _show_finished(run: Run) -> None:
+    """Print the metrics of a run that did a training before; a sweep prints those of all its runs."""
+    note_reuse(run)
+    if PARENT not in os.environ:
+        _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
+        Console().print(metrics_table(run.data.metrics, run.info.run_name))
 
 
 def _limit_threads(number: int | None) -> None:

@@ -84,7 +84,7 @@ def run_trials(
         yield Trial(planned.variant, planned.seed, "", "", "", {})
         return
     own = planned.run.data.metrics if planned.variant.configs else {}
-    identity = planned.run.data.tags["fingerprint"]
+    identity = planned.run.data.tags.get("fingerprint", "")
     if study.measure is None and not study.conditions:
         outcomes = load_outcomes(store, planned.run)
         yield Trial(planned.variant, planned.seed, "", "", identity, own, outcomes=outcomes)

@@ -53,7 +53,7 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name):
         assert study.statements or study.conditions
     known = {f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
              for label in (*LABELS, "direction") for kind in (*KINDS, "error")}  # fmt: skip
-    known |= OTHER | {"same/direction/degrees"}
+    known |= OTHER | {"same/direction/degrees"} | {f"train_accuracy_{label}" for label in LABELS}
     assert set(study.metrics) <= known or study.measure is not None  # which may have metrics of its own
     for said in study.statements:
         assert set(said.metric.split(" - ")) <= known

@@ -63,11 +63,7 @@ def find_target(
     if "test" in there.device:  # a recording, which is used as a whole
         whole = plain(there)
         there = validate_config(OmegaConf.create(whole | {"device": whole["device"] | {"test": "all"}}))
-    device, known = build_device(there), build_device(nominal)
-    twin = known.reference or known
-    if config.evaluation.profile is not None:
-        asked = OmegaConf.create(plain(nominal) | {"evaluation": plain(config)["evaluation"]})
-        twin = threshold_device(nominal, asked)
+    device, twin = build_device(there), _twin(nominal, config)
     _check(parent, device, twin)
     content = plain(nominal if device.simulation is None else there)
     content["adapt"] = asdict(settings) | {
@@ -82,6 +78,15 @@ def find_target(
     content["evaluation"] = plain(config)["evaluation"]
     content["row"] = f"{stored.row.removesuffix('_adapted')}_adapted"
     return Target(device, twin, validate_config(OmegaConf.create(content)))
+
+
+def _twin(nominal: DictConfig, config: DictConfig) -> AbstractDevice:
+    """Return the simulated device of a skin, or one of ``evaluation.profile``."""
+    if config.evaluation.profile is None:
+        known = build_device(nominal)
+        return known.reference or known
+    asked = OmegaConf.create(plain(nominal) | {"evaluation": plain(config)["evaluation"]})
+    return threshold_device(nominal, asked)
 
 
 def _check(parent: Run, device: AbstractDevice, twin: AbstractDevice) -> None:

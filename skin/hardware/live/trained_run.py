@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from skin.build import build_device
 from skin.hardware.live import engine_builder
@@ -44,12 +44,12 @@ def watch_run(
     say(f"loading {title} ({run.info.run_id[:8]})")
     if advice := engine_builder.simulator_warning(stored, device):
         say(advice)
-    profile = watched.evaluation.profile
-    if profile is not None or "skins" in stored.device:
+    profile, drawn = watched.evaluation.profile, "skins" in stored.device
+    if drawn or profile != OmegaConf.select(stored, "evaluation.profile"):
         devices = "" if profile is None else f" and devices of the profile {profile}"
         say(f"choosing the threshold of the alarm on simulated touches of this skin{devices}")
     of = load_trained(store, run, trained, stored)
-    if "skins" in stored.device:
+    if drawn:
         of = replace(of, point=choose_for_skin(of.learner, stored, watched))
     engine = engine_builder.make_engine(of, live.patience, live.touch, live.drift)
     if of.point is not None:

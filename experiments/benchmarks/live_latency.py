@@ -101,7 +101,7 @@ def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame
     valid = np.ones(values.shape[1], dtype=bool)
     frames = [Frame(n, n / RATE, n / RATE, row, valid) for n, row in enumerate(values)]
     for frame in frames[:ahead]:
-        engine.add(frame)
+        engine.push([frame], None)
     return frames[ahead:]
 
 
@@ -110,5 +110,5 @@ def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
     sensors = engine.window.sensors
     known = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
     wall, core = time.perf_counter(), time.thread_time()
-    assert engine.push(frame, known) is not None
+    engine.push([frame], known)
     return time.perf_counter() - wall, time.thread_time() - core

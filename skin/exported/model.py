@@ -44,10 +44,6 @@ class ExportedModel:
         """
         return self._session.run(["probabilities"], {"readings": readings, "valid": valid})[0]  # type: ignore[return-value]
 
-    def classify(self, readings: np.ndarray, valid: np.ndarray) -> list[float]:
-        """Return the probability of each label, L numbers, of one window (T, S)."""
-        return self.probabilities(readings[None], valid[None])[0].tolist()
-
 
 def _open(path: Path) -> "InferenceSession":
     """Return a session on one thread: a window alone is too small to be shared among threads."""

@@ -46,6 +46,23 @@ class Frame(NamedTuple):
         return self._replace(lost=self.lost + dropped.lost + 1, after=after)
 
 
+class StreamClock:
+    """Time of a stream that goes on over restarts of its device, whose clock begins again then."""
+
+    def __init__(self) -> None:
+        self._segment: int | None = None
+        self._shift = self._host = 0.0
+        self._latest: float | None = None
+
+    def __call__(self, frame: Frame) -> float:
+        """Return the time of a frame, s: the device's clock, shifted by the host's time between two segments."""
+        if frame.segment != self._segment and self._latest is not None:
+            self._shift = self._latest + max(frame.t_host - self._host, 0.0) - frame.t
+        self._segment, self._host = frame.segment, frame.t_host
+        self._latest = frame.t + self._shift
+        return self._latest
+
+
 class FrameError(Exception):
     """A frame that cannot be used.
 

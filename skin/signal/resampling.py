@@ -22,12 +22,14 @@ class Resampled(NamedTuple):
         valid: (T, S), bool: the interval has a valid value.
         saturated: (T, S), bool: a valid value of the interval is at the sensor's limit.
         gap: whether frames are missing in the window.
+        before: number of intervals that end before the first frame of the stream; they are not valid.
     """
 
     values: np.ndarray
     valid: np.ndarray
     saturated: np.ndarray
     gap: bool = False
+    before: int = 0
 
 
 def resample(
@@ -105,7 +107,12 @@ class Window:
 
     def __init__(self, frames: int, rate: float, sensors: int) -> None:
         self.frames, self.rate, self.sensors = frames, rate, sensors
+        self._period = 0.0
         self._clear(4 * frames)
+
+    def clear(self) -> None:
+        """Remove all frames; the known period of the device is kept."""
+        self._clear(len(self._times))
 
     def _clear(self, capacity: int) -> None:
         self._times, self._lost = np.empty(capacity), np.zeros(capacity, dtype=np.int64)
@@ -115,30 +122,22 @@ class Window:
 
     @property
     def period(self) -> float:
-        """Time between two frames of the device, s; 0 with too few frames.
+        """Time between two frames of the device, s; with few frames, that before; 0 if unknown.
 
         The smaller of median and mean: pauses distort the mean, bursts of frames the median.
         """
         first = max(0, self._end - _MANY)
         times, lost = self._times[first : self._end], self._lost[first : self._end]
-        if len(times) < _FEW:
-            return 0.0
-        mean = float(times[-1] - times[0]) / (len(times) - 1 + int(lost[1:].sum()))
-        median = float(np.median(np.diff(times)))
-        return min(mean, median) if median > 0 else mean
-
-    @property
-    def filled(self) -> float:
-        """Filled share of the window, from 0 to 1."""
-        if not self._end:
-            return 0.0
-        received = self._times[self._end - 1] - self._times[0]
-        return float(min(1.0, received * self.rate / self.frames))
+        if len(times) >= _FEW:
+            mean = float(times[-1] - times[0]) / (len(times) - 1 + int(lost[1:].sum()))
+            median = float(np.median(np.diff(times)))
+            self._period = min(mean, median) if median > 0 else mean
+        return self._period
 
     def add(self, frame: "Frame") -> None:
         """Add a frame."""
         if frame.segment != self._segment:
-            self._clear(len(self._times))
+            self.clear()
             self._segment = frame.segment
         if self._end == len(self._times):
             self._make_room()
@@ -194,7 +193,9 @@ class Window:
         inside = times[part] > end - self.frames * interval
         lost = self._lost[part][inside][1:].any()
         ages = np.unique(np.floor((end - times[part][inside]) / interval))
-        return found._replace(gap=bool(lost) or len(ages) < self.frames)
+        before = max(0, self.frames - 1 - int((end - times[0]) / interval)) if len(times) else self.frames
+        missing = self.frames - before - len(ages)
+        return found._replace(gap=bool(lost) or missing > 0, before=before)
 
     def _make_room(self) -> None:
         """Discard frames older than the window; double the capacity unless that frees half of it."""

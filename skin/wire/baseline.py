@@ -5,7 +5,9 @@ import numpy as np
 from skin.errors import InputError
 from skin.wire.errors import SkinTouched
 
-_FEWEST = 10  # frames
+FEWEST = 10
+"""Frames that a baseline needs."""
+
 # As multiples of the noise and of the smallest step seen.
 _MOVED = 8.0, 3.0  # within the frames
 _SHIFTED = 20.0, 10.0  # against the old baseline, because offsets drift
@@ -54,8 +56,8 @@ def median_baseline(values: np.ndarray) -> np.ndarray:
     Raises:
         InputError: too few frames.
     """
-    if len(values) < _FEWEST:
-        raise InputError(f"a baseline needs {_FEWEST} frames, got {len(values)}: give more seconds")
+    if len(values) < FEWEST:
+        raise InputError(f"a baseline needs {FEWEST} frames, got {len(values)}: give more seconds")
     return np.asarray(np.median(values, axis=0))
 
 

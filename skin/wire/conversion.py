@@ -16,12 +16,17 @@ class UnitConversion:
     Attributes:
         scale: (S,), N per unit of the device.
         zero: (S,), values of the untouched skin, in the device's unit.
-        broken: (S,), bool: sensors without valid readings according to the calibration.
+        broken: (S,), bool: sensors without valid readings according to the calibration, or without a zero.
+        noise: (S,), N, standard deviation of a frame of the untouched skin; None: unknown.
+        changing: (S,), share of the frames of the untouched skin that differed from the one before; None:
+            unknown.
     """
 
     scale: np.ndarray
     zero: np.ndarray
     broken: np.ndarray
+    noise: np.ndarray | None = None
+    changing: np.ndarray | None = None
 
     def __call__(self, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool."""

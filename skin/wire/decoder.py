@@ -12,7 +12,7 @@ from skin.wire.format_detection import (
     detect_format,
     detection_error,
 )
-from skin.wire.sequence import HostClock, SequenceTracker
+from skin.wire.sequence import FrameClock, HostClock, SequenceTracker
 from skin.wire.text import Header, parse_header
 
 _LONGEST = 65536  # bytes of a line
@@ -44,7 +44,7 @@ class Decoder:
         self.sensors, self.format = sensors, format
         self.counters, self.quality = Counters(), _Quality()
         self.header: Header | None = None
-        self._order, self._clock = SequenceTracker(), HostClock()
+        self._order, self._clock, self._counted = SequenceTracker(), HostClock(), FrameClock()
         self._all_valid = np.ones(sensors or 0, dtype=bool)
         self._begin()
 
@@ -60,6 +60,7 @@ class Decoder:
         """Start another connection: detect the format again, with the same number of sensors."""
         self._begin()
         self._order.cut(after)
+        self._counted.restart()
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -145,7 +146,10 @@ class Decoder:
         self.quality.note(bad)
 
     def _placed(self, raw: RawFrame, now: float) -> Frame:
-        t_us = now * 1e6 if raw.t_us is None else raw.t_us
+        t_us = raw.t_us
+        if t_us is None:
+            rate = None if self.header is None else self.header.rate
+            t_us = 1e6 * self._counted(now, 1 + self._missing, rate)
         t, segment, lost, after = self._order.place(raw.seq, t_us, self._missing)
         counters = self.counters
         counters.frames += 1

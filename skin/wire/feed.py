@@ -111,6 +111,8 @@ class WireFeed:
         if not self._told and frame_format is not None and frame_format.check in _WEAK:
             _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[frame_format.check])
         self._told = True
+        if header is not None and header.bits:
+            self._health.largest = 2**header.bits - 1
         if self._limits is not None:
             self._health.limits = self._limits
         elif header is not None and header.bits:

@@ -1,14 +1,15 @@
-"""State of each channel: ok, saturated (valid, at its limit), stuck or dead."""
+"""State of each channel: ok, saturated (valid, at its limit), stuck, dead, or impossible (out of range)."""
 
 from typing import Literal
 
 import numpy as np
 
-ChannelState = Literal["ok", "saturated", "stuck", "dead"]
+ChannelState = Literal["ok", "saturated", "stuck", "dead", "impossible"]
 Limits = tuple[float | None, float | None]
 
 _SILENT = 5.0  # s without any change
 _LIVELY = 1.0  # s within which most channels change, if their noise can be seen at all
+_BELOW = 0.01  # share of the range below 0 that an offset explains
 _FAR = 20  # smallest steps of a channel: more than its noise ranges over
 
 
@@ -21,16 +22,20 @@ class ChannelHealth:
     channel that stays at the largest value it has ever sent, far above its smallest, is saturated at an
     unknown limit rather than stuck, because a held press must not be masked.
 
+    A value that the converter cannot give is invalid at once.
+
     Args:
         limits: smallest and largest value of a channel; None where an untouched channel may have this value,
             such as 0 of a resistor that conducts only under load.
 
     Attributes:
         limits: as given; a new value applies from the next frame on.
+        largest: largest count of the converter, whose smallest is 0; None: unknown.
     """
 
     def __init__(self, limits: Limits = (None, None)) -> None:
         self.limits = limits
+        self.largest: float | None = None
         self._last: np.ndarray | None = None
         self._begin_time = True
         self._ever, self._smallest = np.zeros(0, dtype=bool), np.zeros(0)
@@ -69,15 +74,24 @@ class ChannelHealth:
         loaded = self._ever & (self._most - self._least >= _FAR * self._smallest)
         self._saturated = at_limit | (self._silent & loaded & (values >= self._most))
         self._silent &= ~self._saturated
-        return ~self._silent, self._saturated
+        self._impossible = self._outside(values)
+        self._saturated &= ~self._impossible
+        return ~self._silent & ~self._impossible, self._saturated
+
+    def _outside(self, values: np.ndarray) -> np.ndarray:
+        """Return which values the converter cannot give."""
+        if self.largest is None:
+            return np.zeros(len(values), dtype=bool)
+        return (values > self.largest) | (values < -_BELOW * self.largest)
 
     def states(self) -> tuple[ChannelState, ...]:
         """Return the state of each channel at the last frame; empty before the first."""
         if self._last is None:
             return ()
         dead = self._silent & ~self._ever
-        kinds: list[ChannelState] = ["ok", "saturated", "stuck", "dead"]
+        kinds: list[ChannelState] = ["ok", "saturated", "stuck", "dead", "impossible"]
         worst = np.where(dead, 3, np.where(self._silent, 2, np.where(self._saturated, 1, 0)))
+        worst = np.where(self._impossible, 4, worst)
         return tuple(kinds[number] for number in worst)
 
     def _begin(self, values: np.ndarray) -> np.ndarray:
@@ -86,4 +100,5 @@ class ChannelHealth:
         self._smallest = np.full(len(values), np.inf)
         self._ever = np.zeros(len(values), dtype=bool)
         self._saturated, self._silent = self._ever.copy(), self._ever.copy()
+        self._impossible = self._ever.copy()
         return values

@@ -1,5 +1,6 @@
 """Sequence numbers and device time: missing frames, restarts, segments."""
 
+from collections import deque
 from typing import NamedTuple
 
 from skin.signal.frame import After, FrameError
@@ -76,6 +77,72 @@ class SequenceTracker:
         after, self._after, self._wrapped = self._after, "", 0
         self.segment += bool(after)
         return Place(t_us * 1e-6, self.segment, 0, after)
+
+
+class FrameClock:
+    """Time of frames that carry none, from their number and their arrival.
+
+    Frames may arrive in bursts of up to a second. Their number tells how far apart they were measured, once
+    the rate is known: measured over the last seconds, or that of the header until then.
+    """
+
+    _SPAN = 8.0  # s over which the rate is measured
+    _ENOUGH = 1.5  # s
+    _OFTEN = 0.02  # s between two counts: more often would not help
+    _STEADY = 2.0  # s after which the shortest delay is removed
+    _BEHIND = 1.5  # s: a longer pause is one of the device
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, int]] = deque()
+        self._count, self._period = 0, 0.0
+        self._time: float | None = None
+        self._shortest, self._since = float("inf"), 0.0
+
+    def restart(self) -> None:
+        """Begin another connection; the rate is kept."""
+        self._counts.clear()
+        self._time = None
+
+    def __call__(self, arrival: float, frames: int, rate: float | None) -> float:
+        """Return the time of a frame, s.
+
+        Args:
+            arrival: host's time, s.
+            frames: 1, and those known to be missing before it.
+            rate: of the header, Hz.
+        """
+        self._note(arrival, rate)
+        self._count += frames
+        if self._time is None or not self._period:
+            time = arrival
+        else:
+            time = min(self._time + frames * self._period, arrival)
+            time = arrival if arrival - time > self._BEHIND else time
+        self._time = self._steady(time, arrival)
+        return self._time
+
+    def _note(self, arrival: float, rate: float | None) -> None:
+        """Measure the rate from the counts before each arrival."""
+        if self._counts and arrival - self._counts[-1][0] < self._OFTEN:
+            return
+        if self._counts and arrival - self._counts[-1][0] > self._BEHIND:
+            self._counts.clear()
+        self._counts.append((arrival, self._count))
+        while arrival - self._counts[0][0] > self._SPAN:
+            self._counts.popleft()
+        passed = arrival - self._counts[0][0]
+        received = self._count - self._counts[0][1]
+        if passed >= self._ENOUGH and received:
+            self._period = passed / received
+        elif rate and not self._period:
+            self._period = 1 / rate
+
+    def _steady(self, time: float, arrival: float) -> float:
+        """Return a time without the delay that all frames of the last seconds had."""
+        self._shortest = min(self._shortest, arrival - time)
+        if arrival - self._since > self._STEADY:
+            time, self._shortest, self._since = time + self._shortest, float("inf"), arrival
+        return time
 
 
 class HostClock:

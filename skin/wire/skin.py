@@ -151,6 +151,11 @@ class Skin:
         return self._decoder.header if self._decoder else None
 
     @property
+    def away(self) -> bool:
+        """Whether the skin is unplugged and being reopened."""
+        return self._reader.away
+
+    @property
     def channels(self) -> tuple[ChannelState, ...]:
         """State of each channel at the last frame; empty if channels are not checked."""
         return self._reader.feed.states()

@@ -14,7 +14,10 @@ from skin.hardware.live.verdict_message import verdict_message
 
 
 class AlarmLog:
-    """Appends a JSON line to a file for each change: ``alarm``, ``cleared``, ``stale`` and ``resumed``.
+    """Appends a JSON line to a file for each change.
+
+    The events are ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its sensors have
+    no valid reading), ``known``, ``tare``, ``tare_refused`` and ``tare_forced``.
 
     Args:
         file: open for writing. If it becomes unwritable, a message says so once, and the live view continues.
@@ -22,7 +25,7 @@ class AlarmLog:
 
     def __init__(self, file: TextIO) -> None:
         self._file: TextIO | None = file
-        self._alarm, self._stale = False, True
+        self._alarm, self._stale, self._unknown = False, True, False
 
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
         """Write what has changed since the last call."""
@@ -31,6 +34,10 @@ class AlarmLog:
             self.write("stale" if stale else "resumed", verdict, reason, alarm)
         if now != self._alarm:
             self.write("alarm" if now else "cleared", verdict, reason, alarm)
+        unknown = verdict is not None and bool(verdict.unknown)
+        if unknown != self._unknown and not stale:
+            self.write("unknown" if unknown else "known", verdict, reason, alarm)
+            self._unknown = unknown
         self._alarm, self._stale = now, stale
 
     def write(
@@ -63,8 +70,10 @@ def log_alarms(display: Display, path: Path) -> Iterator[None]:
         log = AlarmLog(file)
         log.write("started")
         display.observers.append(log.observe)
+        display.listeners.append(log.write)
         try:
             yield
         finally:
             display.observers.remove(log.observe)
+            display.listeners.remove(log.write)
             log.write("ended")

@@ -19,11 +19,7 @@ FIELDS = ("course", "touches", "alarms", "kept", "early", "median_s", "p95_s", "
 
 _IDLE = 4.0  # s without touch before each one
 _AFTER = 5.0  # s behind it
-_CLOSE = 3.0, 4.5  # s after the beginning and the end of a touch in which every frame is classified
-_AHEAD = 0.5  # s before the beginning and the end
 _LONG = "600 s"  # in the names of courses that last minutes
-_MINUTE = 60.0  # s
-_SPARSE = 0.1, 5.0  # s between two classified frames otherwise, and in touches of minutes
 _SEGMENTS = count()  # of the device's clock: every touch begins with an empty window
 _TAP = {"dynamic": 0, "press": 0, "dangerous": 1}
 _PRESS = {"dynamic": 0, "press": 1, "dangerous": 1}
@@ -127,16 +123,11 @@ def play_touch(
     conversion = UnitConversion(np.ones(len(dead)), constants.offset.double().numpy(), dead)
     touched = np.flatnonzero(true.any(axis=1))
     begin, end, segment = time[touched[0]], time[touched[-1]], next(_SEGMENTS)
-    step = max(1, round(_SPARSE[bool(end - begin > _MINUTE)] * rate))
     engine.reset()
     answers: list[tuple[float, bool]] = []
     for number, (t, row) in enumerate(zip(time.tolist(), measured, strict=True)):
         frame = Frame(number, t, t, row, ~dead, segment)
-        close = any(-_AHEAD <= t - change < span for change, span in zip((begin, end), _CLOSE, strict=True))
-        if not close and number % step:
-            engine.add(frame)
-        elif (verdict := engine.push(frame, conversion)) is not None:
-            answers.append((t, verdict.dangerous))
+        answers += [(verdict.t, verdict.dangerous) for verdict in engine.push([frame], conversion)]
     return _outcome(answers, float(np.abs(true).max()), begin, end)
 
 

@@ -1,9 +1,12 @@
 """State shared by the classifying loop and the views."""
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event, Lock
+from time import monotonic
+from typing import Literal
 
 import numpy as np
 
@@ -11,10 +14,17 @@ from skin.hardware.live.verdict import Verdict
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion
 
+_log = logging.getLogger(__name__)
+
 Observer = Callable[[Verdict | None, str, bool], None]
 """Takes the arguments of :meth:`Display.set_verdict`; it must return at once."""
 
+Tare = Literal["", "tare", "forced"]
+"""A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
+
 _KEPT = 8192  # frames that are kept for slow views
+_CONFIRM = 60.0  # s after a refusal in which a tare may be forced
+REFUSED = "tare refused: something touches the skin; if nothing does, confirm it (terminal: force and Enter)"
 
 
 @dataclass(frozen=True)
@@ -52,6 +62,7 @@ class DisplayState:
         trouble: message about why there is no verdict; else empty.
         alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
         line: text with rate, lost frames and latency.
+        peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
     """
 
     number: int
@@ -61,7 +72,19 @@ class DisplayState:
     verdict: Verdict | None
     trouble: str
     line: str
-    alarm: bool = False
+    alarm: bool
+    peak: np.ndarray
+
+    @property
+    def held(self) -> bool:
+        """Whether the verdict is about a touch that has ended, or an alarm is on: show :attr:`peak`."""
+        ended = self.verdict is not None and self.verdict.touched and self.verdict.contact is None
+        return self.alarm or ended
+
+    @property
+    def map(self) -> np.ndarray:
+        """Forces (S,), N, at the time of the verdict."""
+        return self.peak if self.held else self.values
 
 
 class Display:
@@ -70,21 +93,25 @@ class Display:
     Attributes:
         info: as given.
         closed: event, set at the end.
-        tare: event, set by a view to request a new baseline; cleared by the live loop.
         observers: called with each verdict, in the thread that classifies.
+        listeners: called with the name of each event of the operator, such as ``tare``.
     """
 
     def __init__(self, info: DisplayInfo) -> None:
-        self.info, self.closed, self.tare = info, Event(), Event()
+        self.info, self.closed = info, Event()
         self.observers: list[Observer] = []
+        self.listeners: list[Callable[[str], None]] = []
         self._lock = Lock()
         sensors = len(info.positions)
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
         self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=_KEPT)
         self._valid, self._alarm = np.ones(sensors, dtype=bool), False
+        self._peak = np.zeros(sensors)
         self._number = 0
         self._verdict: Verdict | None = None
-        self._trouble, self._line = "waiting for the first frame", ""
+        self._trouble, self._line, self._note = "waiting for the first frame", "", ""
+        self._request: Tare = ""
+        self._refused_at = -np.inf
 
     def add_frame(self, frame: Frame, conversion: UnitConversion) -> None:
         """Add a frame as sent, with the conversion of its values to N."""
@@ -94,12 +121,16 @@ class Display:
             self._number += 1
             self._frames.append((values, saturated))
             self._valid = valid
+            self._peak = np.maximum(self._peak, np.where(valid, values, 0.0))
 
     def set_verdict(self, verdict: Verdict | None, trouble: str = "", alarm: bool = False) -> None:
         """Set the verdict; or None with the reason and whether an alarm continues."""
         with self._lock:
             self._verdict, self._trouble = verdict, trouble
             self._alarm = alarm if verdict is None else verdict.dangerous
+            touched = verdict is not None and (verdict.touched or verdict.contact is not None)
+            if not touched and not self._alarm:
+                self._peak = np.zeros_like(self._peak)
         for observer in self.observers:
             observer(verdict, trouble, alarm)
 
@@ -108,12 +139,43 @@ class Display:
         with self._lock:
             self._line = line
 
+    def request_tare(self, force: bool = False) -> str:
+        """Request a new baseline; return why it is refused, or an empty text.
+
+        It is refused while something touches the skin. Within a minute after that it can be forced, by a
+        second and explicit confirmation of the operator.
+        """
+        with self._lock:
+            contact = self._verdict is not None and self._verdict.contact is not None
+            refused = contact or self._alarm
+            if force and monotonic() - self._refused_at <= _CONFIRM:
+                self._request, event, self._note = "forced", "tare_forced", ""
+            elif refused or force:
+                self._refused_at = monotonic() if refused else self._refused_at
+                event, self._note = "tare_refused", REFUSED if refused else "there is nothing to force"
+            else:
+                self._request, event, self._note = "tare", "tare", ""
+            note = self._note
+        _log.warning(
+            "%s", {"tare": "new tare", "tare_forced": "tare forced by the operator"}.get(event, note)
+        )
+        for listener in self.listeners:
+            listener(event)
+        return note
+
+    def take_tare(self) -> Tare:
+        """Return the latest request for a new baseline, once."""
+        with self._lock:
+            request, self._request = self._request, ""
+        return request
+
     def state(self, since: int = 0) -> DisplayState:
         """Return the state, with the largest values after the first ``since`` frames."""
         with self._lock:
             fresh = min(max(1, self._number - since), len(self._frames))
             latest = [self._frames[-1 - back] for back in range(fresh)]
-            state = self._verdict, self._trouble, self._line, self._alarm
+            line = ", ".join(text for text in (self._note, self._line) if text)
+            state = self._verdict, self._trouble, line, self._alarm, self._peak
             number, valid = self._number, self._valid
         values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
         return DisplayState(number, np.where(valid, values, 0.0), valid, saturated & valid, *state)

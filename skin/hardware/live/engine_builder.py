@@ -56,7 +56,7 @@ def make_engine(
 
 
 def window_classifier(learner: Predictor, positions: Tensor, rate: float) -> Classify:
-    """Return a function of the readings and validity of one window that asks a learner.
+    """Return a function of the readings and validity of windows that asks a learner.
 
     Args:
         learner: trained.
@@ -65,9 +65,9 @@ def window_classifier(learner: Predictor, positions: Tensor, rate: float) -> Cla
     """
 
     @torch.inference_mode()
-    def classify(readings: np.ndarray, valid: np.ndarray) -> list[float]:
-        known = torch.from_numpy(readings)[None], torch.from_numpy(valid)[None]
-        return learner.probabilities(Touches(*known, positions, None, rate))[0].tolist()
+    def classify(readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        windows = torch.from_numpy(readings), torch.from_numpy(valid)
+        return learner.probabilities(Touches(*windows, positions, None, rate)).numpy()
 
     return classify
 

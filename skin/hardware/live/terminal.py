@@ -61,11 +61,11 @@ def _printed(display: Display, console: Console) -> Iterator[None]:
 
 
 def _read_keys(display: Display) -> None:
-    """Request a new tare at every line ``t``, until the input ends."""
+    """Request a new tare at every line ``t``, or ``force`` after a refusal, until the input ends."""
     with suppress(OSError, ValueError):  # no input, or a closed one
         for text in typed_lines(sys.stdin.fileno()):
-            if text.strip().lower() == "t":
-                display.tare.set()
+            if (word := text.strip().lower()) in ("t", "force"):
+                display.request_tare(force=word == "force")
 
 
 def print_changes(display: Display, console: Console) -> None:
@@ -83,10 +83,11 @@ def print_changes(display: Display, console: Console) -> None:
 def _sentence(state: DisplayState) -> str:
     verdict, alarm = state.verdict, "DANGEROUS: " if state.alarm else ""
     if verdict is None:
-        return alarm + state.trouble.split(":")[0]
+        return f"{alarm}unknown: {state.trouble.split(':')[0]}"
     if not verdict.touched:
-        return "no touch"
-    return alarm + " ".join(word for word, _ in verdict.words())
+        return verdict.reason or verdict.state
+    words = " ".join(word for word, _ in verdict.words())
+    return "; ".join(text for text in (alarm + words, verdict.reason) if text)
 
 
 class _Screen:
@@ -106,7 +107,7 @@ class _Screen:
 def screen(display: Display, state: DisplayState, picture: SkinPicture) -> RenderableType:
     """Return the skin beside the verdict, with the status of the stream below."""
     info, beside = display.info, Table.grid(padding=(0, 3))
-    beside.add_row(_map(picture(state.values, state.valid)), _verdict(state))
+    beside.add_row(_map(picture(state.map, state.valid)), _verdict(state))
     border = "bold red" if state.alarm else "dim"
     panel = Panel(beside, title=f"{info.title} on {info.port}", border_style=border, expand=False)
     return Group(panel, Text(state.line or " ", style="dim"), Text(_KEYS, style="dim"))
@@ -125,11 +126,12 @@ def _map(image: Any) -> Text:
 def _verdict(state: DisplayState) -> RenderableType:
     verdict, alarm = state.verdict, Text("DANGEROUS", "bold white on red")
     if verdict is None:
-        trouble = Text(state.trouble or "waiting", style="yellow")
+        trouble = Text(f"unknown: {state.trouble or 'waiting'}", style="yellow")
         return Group(alarm, Text(), trouble) if state.alarm else trouble
     if not verdict.touched:
-        return Text("no touch", style="dim")
+        return Text(verdict.reason or verdict.state, style="yellow" if verdict.unknown else "dim")
     head, notes = alarm if verdict.dangerous else Text("touch", "bold"), [contact_text(verdict.contact)]
+    notes += [verdict.reason] * bool(verdict.unknown) + ["the touch has ended"] * (verdict.contact is None)
     notes += [f"{count} sensors at their limit"] if (count := int(state.saturated.sum())) else []
     notes += ["frames are missing"] * verdict.gap
     return Group(head, Text(), _bars(verdict), Text("\n".join(notes), "yellow"))

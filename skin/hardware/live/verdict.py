@@ -1,13 +1,25 @@
 """The verdict on a window, and its debouncing."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import NonNegativeFloat
 
 from skin.labels import OPPOSITE
 from skin.settings import checked
+
+
+State = Literal["touch", "no touch", "unknown"]
+_NAMED = 3  # sensors
+
+
+def sensor_list(sensors: Sequence[int]) -> str:
+    """Return the numbers of sensors in words."""
+    more = f" and {len(sensors) - _NAMED} more" if len(sensors) > _NAMED else ""
+    numbers = ", ".join(map(str, sensors[:_NAMED]))
+    return f"sensor{'s' * (len(sensors) > 1)} {numbers}{more}"
 
 
 @dataclass(frozen=True)
@@ -23,8 +35,13 @@ class Verdict:
         labels: label -> debounced prediction; empty without touch.
         dangerous: the alarm, which lasts until the contact ends.
         gap: whether frames are missing in the window.
-        masked: sensors without a valid reading in the whole window.
+        masked: sensors without a valid reading.
         contact: duration of the contact, s; None without contact.
+        unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
+        below: sensors that read below their rest: their wire is broken, their values fall with force, or the
+            tare was taken under a load.
+        shown: label -> its probability in the latest window that agreed with the debounced label; where it
+            is missing, that of this window.
     """
 
     t: float
@@ -36,11 +53,33 @@ class Verdict:
     gap: bool
     masked: tuple[int, ...] = ()
     contact: float | None = None
+    unknown: tuple[int, ...] = ()
+    below: tuple[int, ...] = ()
+    shown: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def state(self) -> State:
+        """``touch``; ``unknown`` where a dangerous touch could not be felt at some sensor; or ``no touch``."""
+        return "touch" if self.touched else "unknown" if self.unknown else "no touch"
+
+    @property
+    def reason(self) -> str:
+        """Where the state is unknown and why, in words; empty where it is known everywhere."""
+        if not self.unknown:
+            return ""
+        text = f"unknown near {sensor_list(self.unknown)}, without a valid reading"
+        if self.below:
+            text += (
+                f"; {sensor_list(self.below)} below rest: broken wire, values that fall with force "
+                "(device.scale below 0), or a tare under load"
+            )
+        return text
 
     def words(self) -> list[tuple[str, float]]:
-        """Return the predicted classes, each with its probability in this window; empty without touch."""
+        """Return the predicted classes, each with its probability; empty without touch."""
+        chances = self.chances | self.shown
         pairs = [
-            (name, self.chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - self.chances[name])
+            (name, chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - chances[name])
             for name, yes in self.labels.items()
         ]
         return [(word, chance) for word, chance in pairs if word]
@@ -64,7 +103,7 @@ class DebounceSettings:
 
     label: NonNegativeFloat = 0.15
     alarm: Annotated[float, Ge(0), Le(0.03)] = 0.02
-    calm: NonNegativeFloat = 0.5
+    calm: NonNegativeFloat = 2.0
     above: Annotated[float, Gt(0), Lt(1)] | None = None
 
 

@@ -22,9 +22,10 @@ def verdict_message(verdict: Verdict | None, reason: str, alarm: bool) -> dict[s
     Returns:
         The fields of ``docs/export.md`` but ``number`` and ``event``.
     """
-    shared = {"schema": SCHEMA, "stale": verdict is None, "reason": reason}
     if verdict is None:
+        shared = {"schema": SCHEMA, "stale": True, "reason": reason, "state": "unknown"}
         return shared | {"time": _utc(0.0), "alarm": alarm}
+    shared = {"schema": SCHEMA, "stale": False, "reason": verdict.reason, "state": verdict.state}
     return shared | {
         "time": _utc(monotonic() - verdict.t_host),
         "alarm": verdict.dangerous,
@@ -38,6 +39,7 @@ def verdict_message(verdict: Verdict | None, reason: str, alarm: bool) -> dict[s
         "contact": verdict.contact,
         "gap": verdict.gap,
         "masked": list(verdict.masked),
+        "unknown": list(verdict.unknown),
     }
 
 

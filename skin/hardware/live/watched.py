@@ -70,7 +70,7 @@ def watch_model(
         about.longest,
     )
     sensors = len(about.positions)
-    engine = Engine(model.classify, about.task, sensors, about.window, about.rate, detection, patience)
+    engine = Engine(model.probabilities, about.task, sensors, about.window, about.rate, detection, patience)
     names = {one.name for one in fields(SerialSource)}
     settings = {name: value for name, value in device.items() if name in names}
     source = SerialSource(sensors=sensors, rate=about.rate, **settings)

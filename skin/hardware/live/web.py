@@ -68,6 +68,9 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
         answer = {
             "touched": verdict.touched,
             "dangerous": verdict.dangerous,
+            "state": verdict.state,
+            "reason": verdict.reason,
+            "contact": verdict.contact is not None,
             "gap": verdict.gap,
             "since": contact_text(verdict.contact),
             "words": verdict.words(),
@@ -77,7 +80,10 @@ def message(state: DisplayState, picture: SkinPicture) -> dict[str, Any]:
         "values": [round(value, 3) for value in state.values.tolist()],
         "valid": state.valid.tolist(),
         "saturated": state.saturated.tolist(),
-        "picture": base64.b64encode(picture(state.values, state.valid).tobytes()).decode(),
+        "peak": [round(value, 3) for value in state.peak.tolist()],
+        "held": state.held,
+        "picture": base64.b64encode(picture(state.map, state.valid).tobytes()).decode(),
+        "unknown": list(range(len(state.valid))) if verdict is None else list(verdict.unknown),
         "verdict": answer,
         "trouble": state.trouble,
         "alarm": state.alarm,
@@ -102,10 +108,10 @@ def _application(display: Display) -> Starlette:
 
     async def tare(request: Request) -> Response:
         # Another site's page can send a plain POST here, but not with a header of its own.
-        if request.headers.get("x-skin") != "tare":
+        if (order := request.headers.get("x-skin")) not in ("tare", "force"):
             return Response(status_code=403)
-        display.tare.set()
-        return Response(status_code=204)
+        refused = display.request_tare(force=order == "force")
+        return JSONResponse({"reason": refused}, status_code=409) if refused else Response(status_code=204)
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
     here = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])

@@ -1,9 +1,11 @@
 """The configuration of a finished run with the overrides of a command line."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from hydra import compose
+from hydra._internal.defaults_list import create_defaults_list
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -28,6 +30,9 @@ _FIXED = (
 def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return a run's configuration with the overrides of a command line, checked.
 
+    An option that the command line chooses may set more than its own group: the file of a skin in
+    docs/your-skin.md has a body, positions and a simulator. All of its settings are taken.
+
     Args:
         stored: as :func:`skin.stored_run.load_configuration` gives it.
         composed: a new configuration with the overrides.
@@ -39,25 +44,122 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
     whole = OmegaConf.create(_raw(stored))
     assert isinstance(whole, DictConfig)
     _follow(whole, composed)
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key = override.key_or_group
-        if key in ("run", "trust") or key.startswith("hydra"):
-            continue
-        group = key.split(".")[0]
-        if group in _FIXED:
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    keys = [override.key_or_group for override in parsed if not _is_steering(override.key_or_group)]
+    for key in keys:
+        if key.split(".")[0] in _FIXED:
             raise InputError(f"{key} was fixed when the run was trained: leave it out, or train another run")
-        if key == "profile":
-            # A profile is no group of settings of its own, but changes those of the device.
-            chosen = override.value()
-            named = profile_settings(str(chosen)) if chosen else {}
-            whole.device = OmegaConf.merge(whole.device, {name: composed.device[name] for name in named})
-            continue
-        parent, _, name = key.rpartition(".")
-        source = OmegaConf.select(composed, parent) if parent else composed
-        # Unresolved, so that a device refers to the simulator of this run.
-        OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+    for option in _find_options(overrides) if keys else []:
+        _take_option(whole, composed, option)
+    for key in keys:
+        if key.split(".")[0] in composed:  # a profile sets the device, and nothing of its own
+            _take(whole, composed, key)
     whole.tracking = composed.tracking
     return validate_config(whole)
+
+
+def _is_steering(key: str) -> bool:
+    """Return whether an override says which run is used, or how the command runs."""
+    return key in ("run", "trust") or key.startswith("hydra")
+
+
+@dataclass(frozen=True)
+class _Option:
+    """What an option that was chosen sets, in its file and in those that the file includes.
+
+    Attributes:
+        name: as in ``body/mine``.
+        group: whose option it is.
+        settings: values in the file by their paths from the root of the configuration.
+    """
+
+    name: str
+    group: str
+    settings: dict[tuple[str, ...], Any]
+
+
+def _find_options(overrides: Sequence[str]) -> list[_Option]:
+    """Return the options that a command line chooses, and those that they choose in turn."""
+    loader = GlobalHydra.instance().config_loader()
+    # The loader has no public function that returns the files of a configuration.
+    parsed, files = loader._parse_overrides_and_create_caching_repo("train", list(overrides))  # type: ignore[attr-defined]
+    groups = [override for override in parsed if files.group_exists(override.key_or_group)]
+    composition = create_defaults_list(files, "train", groups, prepend_hydra=True, skip_missing=True)
+    choices = composition.overrides.override_choices.items()
+    chosen = {f"{group}/{name}": group for group, name in choices if not group.startswith("hydra/")}
+    options: list[_Option] = []
+    for element in reversed(composition.defaults):  # a file comes after the ones that it includes
+        path = element.config_path or ""
+        group = chosen.get(path) or chosen.get(element.parent or "")
+        content = files.load_config(path) if group else None
+        if group is None or content is None:
+            continue
+        chosen[path] = group
+        package = tuple(element.package.split(".")) if element.package else ()
+        options.append(_Option(path, group, dict(_leaves(_raw(content.config), package))))
+    return options
+
+
+def _leaves(settings: dict[str, Any], above: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield all values with their paths; a list is one value."""
+    for name, value in settings.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*above, name))
+        else:
+            yield (*above, name), value
+
+
+def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> None:
+    """Take the settings of an option.
+
+    Raises:
+        InputError: it changes a setting that the weights depend on.
+    """
+    given = _raw(composed)
+    taken = option.group in composed and option.group not in _FIXED
+    if taken:
+        _take(whole, composed, option.group)
+    for path, value in option.settings.items():
+        group = path[0]
+        if taken and group == option.group:
+            continue
+        # What a later file or the command line replaced is not taken.
+        if _is_steering(group) or _value(given, path) != value:
+            continue
+        if group in _FIXED:
+            if _value(plain(whole), path) != _value(plain(composed), path):
+                raise InputError(
+                    f"{'.'.join(path)} in the option {option.name} was fixed when the run was trained: leave "
+                    "it out of the file, or train another run"
+                )
+        elif _value(given, (group, "_target_")) != _value(_raw(whole), (group, "_target_")):
+            _take(whole, composed, group)
+        else:
+            _take_leaf(whole, path, value)
+
+
+def _value(settings: Any, path: tuple[str, ...]) -> Any:
+    """Return the value at a path; None where there is none."""
+    for name in path:
+        settings = settings.get(name) if isinstance(settings, dict) else None
+    return settings
+
+
+def _take(whole: DictConfig, composed: DictConfig, key: str) -> None:
+    """Take a group or a setting, unresolved, so that a device refers to the simulator of this run."""
+    parent, _, name = key.rpartition(".")
+    source = OmegaConf.select(composed, parent) if parent else composed
+    OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+
+
+def _take_leaf(whole: DictConfig, path: tuple[str, ...], value: Any) -> None:
+    """Take one setting; names of materials in its path may have dots."""
+    part = whole
+    for name in path[:-1]:
+        if not isinstance(part.get(name), DictConfig):
+            part[name] = {}
+        part = part[name]
+    part[path[-1]] = value
 
 
 def profile_settings(name: str) -> dict[str, Any]:

@@ -2,21 +2,30 @@
 
 import warnings
 from dataclasses import dataclass
+from typing import overload
 
+import numpy as np
+import torch
+from hydra.errors import InstantiationException
 from mlflow.entities import Run
+from numpy.typing import ArrayLike
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from skin.body.base import AbstractBody
 from skin.build import build_data, build_device, build_learner, build_skin
 from skin.config import Tracking, plain, validate_config
 from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
+from skin.layout.base import AbstractLayout
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.run_overrides import profile_settings
 from skin.settings import configured
 from skin.skin_distribution import SkinDistribution
+from skin.skin_settings import with_skin
 from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
@@ -46,30 +55,86 @@ class Trained:
         """The names of the columns of :meth:`predict`."""
         return tuple(self.device.task.names)
 
-    def predict(self, touches: Touches) -> Tensor:
+    @overload
+    def predict(self, touches: Touches) -> Tensor: ...
+
+    @overload
+    def predict(self, touches: ArrayLike) -> np.ndarray: ...
+
+    def predict(self, touches: Touches | ArrayLike) -> Tensor | np.ndarray:
         """Return the probability of each label, (B, L), for touches of this window and rate.
+
+        Args:
+            touches: B touches; or their readings, an array (B, T, S), N above the readings without touch, in
+                the order of :attr:`positions`, with T = :attr:`window` frames at :attr:`rate`; or one window
+                (T, S). NaN is an invalid reading.
+
+        Returns:
+            A tensor for touches. For an array, an array of float32; its shape is (L,) for one window.
 
         Raises:
             InputError: the touches do not fit the run.
         """
-        return self.learner.probabilities(touches)
+        if isinstance(touches, Touches):
+            return self.learner.probabilities(touches)
+        windows = self._windows(touches)
+        if not windows.size:
+            return np.empty((*windows.shape[:-2], len(self.labels)), np.float32)
+        batch = torch.from_numpy(windows.reshape(-1, *windows.shape[-2:]))
+        valid = ~batch.isnan()
+        known = Touches(batch.nan_to_num(), valid, self.positions, None, self.rate)
+        return self.learner.probabilities(known).numpy().reshape(*windows.shape[:-2], -1)
+
+    def _windows(self, readings: ArrayLike) -> np.ndarray:
+        """Return readings as (B, T, S) or (T, S), float32.
+
+        Raises:
+            InputError: they are no numbers, are infinite, or have another shape.
+        """
+        try:
+            windows = np.array(readings, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"readings must be an array of numbers: {error}") from error
+        frames, sensors = self.window, len(self.positions)
+        if windows.ndim not in (2, 3) or windows.shape[-2:] != (frames, sensors):
+            raise InputError(
+                f"readings must be (B, {frames}, {sensors}) or ({frames}, {sensors}), windows of {frames} "
+                f"frames at {self.rate:g} Hz of {sensors} sensors, got {windows.shape}"
+            )
+        if np.isinf(windows).any():
+            raise InputError("readings must be finite: give NaN for an invalid reading")
+        return windows
 
 
-def load_run(name: str = "latest", uri: str | None = None, trust: bool = False) -> Trained:
+def load_run(
+    name: str = "latest",
+    uri: str | None = None,
+    trust: bool = False,
+    body: AbstractBody | str | None = None,
+    layout: AbstractLayout | str | None = None,
+) -> Trained:
     """Return a pretrained model or a finished training run.
 
     Args:
         name: of the model, or the beginning of the run's id; ``latest`` is the last run that finished.
         uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
         trust: allow any class in its configuration, which may run any code.
+        body: the body of the skin to use it on, such as :class:`skin.body.sheet.Sheet`, or the name of an
+            option, such as ``arm``; None: that of the run.
+        layout: the sensors of this skin: a layout such as :class:`skin.layout.grid.Grid`, the name of an
+            option, or the path of a CSV file; None: those of the run.
 
     Raises:
-        InputError: there is no such run, or it cannot be loaded.
+        InputError: there is no such run, it cannot be loaded, or it does not fit the skin.
     """
     store = Store.open(Tracking(uri, None, "skin", True, None))
     run = find_run(store, name)
     stored = load_configuration(store, run, trust)
-    return load_trained(store, run, validate_config(stored), stored)
+    try:
+        whole = with_skin(plain(stored), body, layout)
+        return load_trained(store, run, validate_config(OmegaConf.create(whole)), stored)
+    except InstantiationException as error:
+        raise to_input_error(error) or error from error
 
 
 def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:

@@ -26,7 +26,7 @@ classifier class_balance
 datamodule
 learner
 evaluation build unfinished claim run_logger pretrained
-stored_run run_overrides model_card fine_tuning
+stored_run run_overrides skin_settings model_card fine_tuning
 trained
 adaptation_target
 exported

@@ -5,11 +5,13 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 
 import skin
 from skin.paths import ROOT
+from skin.recording import Touches
 
 SMALL = ["simulator=naive", "data.gestures=200", "device.test_gestures=32", "evaluation.devices=0"]
 SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64"]
@@ -74,3 +76,66 @@ def test_the_example_of_the_readme_runs():
     exec(code, made)
     assert made["readings"].shape == (20,)
     assert made["pressure"].grad.abs().max() > 0
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """Return the variables of the Python example of the page on ``any_skin`` after it has run."""
+    page = (ROOT / "docs" / "any-skin.md").read_text()
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    variables = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("example"))
+        exec(code, variables)
+    return variables
+
+
+def test_the_example_predicts_from_an_array(example):
+    run, probabilities = example["run"], example["probabilities"]
+    assert run.positions.shape == (9, 3)
+    assert isinstance(probabilities, np.ndarray)
+    assert (probabilities.shape, probabilities.dtype) == ((1, 4), np.float32)
+    chances = dict(zip(run.labels, probabilities[0], strict=True))
+    assert chances["press"] > 0.5 > chances["big"]
+
+
+def test_one_window_a_list_and_touches_give_the_same(example):
+    run, readings, probabilities = (example[name] for name in ("run", "readings", "probabilities"))
+    np.testing.assert_allclose(run.predict(readings[0]), probabilities[0], atol=1e-5)
+    np.testing.assert_allclose(run.predict(readings.tolist()), probabilities, atol=1e-5)
+    values = torch.from_numpy(readings).float()
+    touches = Touches(values.nan_to_num(), ~values.isnan(), run.positions, None, run.rate)
+    tensor = run.predict(touches)
+    assert isinstance(tensor, torch.Tensor)
+    np.testing.assert_allclose(tensor.numpy(), probabilities, atol=1e-5)
+    assert run.predict(readings[:0]).shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda readings: readings[:, :20], r"\(B, 30, 9\) or \(30, 9\).*got \(1, 20, 9\)"),
+        (lambda readings: readings[..., :8], r"9 sensors, got \(1, 30, 8\)"),
+        (lambda readings: readings[0, 0], r"got \(9,\)"),
+        (lambda readings: readings + np.inf, "must be finite: give NaN"),
+        (lambda readings: [["touch"]], "must be an array of numbers"),
+    ],
+)
+def test_other_arrays_are_refused(example, change, message):
+    with pytest.raises(skin.InputError, match=message):
+        example["run"].predict(change(example["readings"]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"body": "sleeve"}, "there is no body sleeve: give one of arm, sheet"),
+        ({"body": 3}, "body must be a body such as skin.Sheet"),
+        ({"layout": "gird"}, "there is no layout gird: give one of file, grid"),
+        ({"layout": "none.csv"}, "no layout file none.csv"),
+        ({"layout": 3}, "layout must be a layout such as skin.Grid"),
+    ],
+)
+def test_a_skin_that_cannot_be_built_is_refused(settings, message, tmp_path):
+    with pytest.raises(skin.InputError, match=message):
+        skin.load_run("any_skin", f"sqlite:///{tmp_path}/m.db", **settings)

@@ -49,6 +49,7 @@ def main(config: DictConfig) -> None:
         raise InputError(f"out={config.out} must end in .onnx: as in out=skin.onnx")
 
     from skin.console import quiet
+    from skin.exported.identity import describe_skin
     from skin.exported.writer import write_model
     from skin.hardware.live.engine_builder import describe, simulator_warning
     from skin.run_overrides import apply_overrides
@@ -68,6 +69,7 @@ def main(config: DictConfig) -> None:
     if advice := simulator_warning(stored):
         print(advice, file=sys.stderr)
     described = describe(of, run.info.run_id, str(run.info.run_name), settings.touch)
+    described = replace(described, skin=describe_skin(whole, of.positions.numpy()))
     path = path or results(None) / f"{str(run.info.run_name).split()[0]}_{run.info.run_id[:8]}.onnx"
     touches = _touches(of, settings.touches)
     difference = write_model(module, described, touches, path)

@@ -55,8 +55,10 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> No
 
     messages = Console(stderr=True, highlight=False)
     if str(config.run).endswith(".onnx"):
+        from skin.exported.identity import check_overrides
         from skin.hardware.live.watched import watch_model
 
+        check_overrides(config.run, config, given)
         watched = watch_model(config.run, plain(config)["device"], live, messages.print)
     else:
         from skin.console import quiet

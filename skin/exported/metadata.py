@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, MinLen
 
@@ -37,6 +37,8 @@ class ModelMetadata:
         contact: N above the baseline that count as touch.
         learned: whether the label ``touch`` counts as touch, too.
         longest: s, longest touch of the training.
+        skin: settings of the body, the layout, the simulator, the touches and the evaluation that the network
+            was exported with; None if unknown, as in files of earlier versions.
     """
 
     run: str
@@ -55,6 +57,7 @@ class ModelMetadata:
     contact: Annotated[float, Gt(0)]
     learned: bool
     longest: Annotated[float, Gt(0)]
+    skin: dict[str, Any] | None = None
 
     @property
     def task(self) -> Task:

@@ -88,15 +88,23 @@ def check_seal(path: Path) -> None:
         OSError: unreadable.
     """
     regular(path)
-    if not path.stat().st_size:
-        return
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        place = _find(content)
-        if place is not None and content[place].decode() != _digest(content, place):
-            raise ChecksumError
+    if path.stat().st_size:  # nothing cannot be mapped
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            check_content(content)
 
 
-def _find(content: mmap.mmap) -> slice | None:
+def check_content(content: bytes | mmap.mmap) -> None:
+    """Do the same with the content of a file.
+
+    Raises:
+        ChecksumError: it is not as it was written.
+    """
+    place = _find(content)
+    if place is not None and content[place].decode() != _digest(content, place):
+        raise ChecksumError
+
+
+def _find(content: bytes | mmap.mmap) -> slice | None:
     """Return where the checksum is: in the last entry, because metadata are at the end."""
     start = content.rfind(KEY.encode())
     match = None if start < 0 else _ENTRY.match(content, start)
@@ -105,7 +113,7 @@ def _find(content: mmap.mmap) -> slice | None:
     return match and slice(*match.span(1))
 
 
-def _digest(content: mmap.mmap, place: slice) -> str:
+def _digest(content: bytes | mmap.mmap, place: slice) -> str:
     with memoryview(content) as whole:
         result = hashlib.sha256(whole[: place.start])
         result.update(BLANK.encode())

@@ -4,6 +4,8 @@ import json
 import math
 import stat
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +136,27 @@ def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
         if kind.hasobject or size != entry.file_size - file.tell():
             raise ValueError(f"{entry.filename} holds objects, or claims another size than it has")
     return size
+
+
+@contextmanager
+def limited_memory(more: int) -> Iterator[None]:
+    """Let this process take no more than ``more`` bytes on top of what it has, while the block runs.
+
+    Who asks for more gets a MemoryError or the error of its library. There is no limit where the system does
+    not know one for address space, as on macOS and Windows.
+    """
+    known = Path("/proc/self/statm")
+    if not known.exists():
+        yield
+        return
+    import resource  # not on Windows
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    limit = int(known.read_text().split()[0]) * resource.getpagesize() + more
+    if before[0] != resource.RLIM_INFINITY:
+        limit = min(limit, before[0])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)

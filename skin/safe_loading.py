@@ -124,6 +124,27 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
         raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
 
 
+def check_archive(path: Path, most: int = _BYTES) -> None:
+    """Check that what a zip archive, such as weights of torch, expands to fits into memory.
+
+    Args:
+        path: of the file.
+        most: largest total size of its entries, bytes.
+
+    Raises:
+        ValueError: no regular file, no zip archive, or larger entries.
+        OSError: unreadable.
+    """
+    regular(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(entry.file_size for entry in archive.infolist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"it is no archive of weights: {error}") from error
+    if total > most:
+        raise ValueError(f"it expands to {total} bytes, more than {most}")
+
+
 def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
     """Return the size of an array, bytes, which must match that of its entry."""
     with archive.open(entry) as file:

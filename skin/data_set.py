@@ -105,7 +105,7 @@ class Manifest:
 
     def write(self, folder: Path) -> None:
         """Write the manifest into a folder."""
-        files.write(json.dumps(vars(self), indent=1) + "\n", folder / MANIFEST)
+        files.write(files.json_line(vars(self), indent=1) + "\n", folder / MANIFEST)
 
     def path(self, folder: Path, number: int) -> Path:
         """Return the path of a shard."""

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -78,7 +79,28 @@ def write(text: str, path: Path) -> Path:
 
 def json_text(content: Any) -> str:
     """Return JSON with numbers to six digits; further ones depend on the processor."""
-    return json.dumps(_rounded(content), indent=2) + "\n"
+    return json_line(_rounded(content), indent=2) + "\n"
+
+
+def json_line(content: Any, **settings: Any) -> str:
+    """Return valid JSON: numbers that are not finite, which JSON lacks, become ``null``.
+
+    Args:
+        content: plain containers.
+        settings: of :func:`json.dumps`.
+    """
+    try:
+        return json.dumps(content, allow_nan=False, **settings)
+    except ValueError:  # seldom: the copy is made only where it is needed
+        return json.dumps(_finite(content), allow_nan=False, **settings)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _rounded(value: Any) -> Any:

@@ -4,22 +4,35 @@ A folder holds ``run.json`` (:data:`RECORD`), ``config.yaml``, the file of weigh
 and ``SHA256SUMS`` with the hashes of the others, which ``sha256sum --check`` reads.
 """
 
-import hashlib
-import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from annotated_types import Ge, Le
 from mlflow.entities import LifecycleStage, Metric, Run, RunData, RunInfo, RunStatus, RunTag
 
+from skin.checksum import file_sha256
 from skin.errors import InputError
 from skin.paths import candidates
+from skin.safe_loading import TEXT, parse_json, read_file
+from skin.settings import check_settings
 
 FORMAT = 1
 """Version of the content of the folder. Raise it when older folders can no longer be read."""
 MODELS = "models"
 """The folder of all models, in the current folder and beside the package."""
 RECORD, CONFIG, CARD, SUMS = "run.json", "config.yaml", "README.md", "SHA256SUMS"
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What is read of :data:`RECORD`; ``start_time`` in ms since 1970."""
+
+    run: str
+    start_time: Annotated[int, Ge(0), Le(2**53)]
+    tags: dict[str, str]
+    metrics: dict[str, float]
 
 
 def find_pretrained(name: str) -> Run | None:
@@ -60,7 +73,9 @@ def checksums(folder: Path, learned: str) -> str:
         folder: with the files.
         learned: name of the file of weights.
     """
-    return "".join(f"{_hash(folder / name)}  {name}\n" for name in sorted((RECORD, CONFIG, CARD, learned)))
+    return "".join(
+        f"{file_sha256(folder / name)}  {name}\n" for name in sorted((RECORD, CONFIG, CARD, learned))
+    )
 
 
 def _record(folder: Path) -> dict[str, Any]:
@@ -70,7 +85,7 @@ def _record(folder: Path) -> dict[str, Any]:
         InputError: the folder is not as it was written.
     """
     try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        record = parse_json(read_file(folder / RECORD, TEXT))
         found = record["format"]
     except (OSError, ValueError, TypeError, LookupError) as error:
         raise InputError(f"{folder} is no pretrained model, {RECORD} cannot be read: {error}") from error
@@ -80,21 +95,18 @@ def _record(folder: Path) -> dict[str, Any]:
             "the package that wrote it, or write it again with skin publish"
         )
     try:
-        known = (folder / SUMS).read_text(encoding="utf-8").splitlines()
+        known = read_file(folder / SUMS, TEXT).decode("utf-8").splitlines()
         current = checksums(folder, Path(record["tags"]["learned"]).name).splitlines()
-    except (OSError, ValueError, TypeError, LookupError) as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"{folder} is no complete pretrained model: {error}") from error
     if altered := [line.split()[1] for line in current if line not in known]:
         raise InputError(
             f"{', '.join(altered)} in {folder} differs from {SUMS}: restore the folder, or write it again "
             "with skin publish"
         )
+    needed = {name: record[name] for name in _Record.__annotations__ if name in record}
+    check_settings(_Record, needed, f"{RECORD} of {folder}", whole=True)
     return record
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _run(name: str, folder: Path, record: dict[str, Any]) -> Run:

@@ -6,9 +6,11 @@ rows, then ``saturated_00`` ...: 1 where a sensor is at its limit. What is unkno
 that means nothing (a dead sensor) is empty and is read back as 0 and invalid. Everything else (units,
 layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in
 ``x.csv.json``.
+
+Both have checksums of everything: a Parquet file as of :mod:`skin.checksum`, and ``x.csv.json`` under
+``sha256`` of the table and of itself. What has none, of older versions or made by hand, is read without.
 """
 
-import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +25,7 @@ import torch
 from torch import Tensor
 
 from skin import files
+from skin.checksum import ChecksumError, check_seal, file_sha256, sha256, write_parquet
 from skin.errors import InputError
 from skin.files import tabular, whole
 from skin.labels import Task
@@ -36,6 +39,7 @@ from skin.recording_metadata import (
     describe_recording,
     numbered,
 )
+from skin.safe_loading import read_file
 
 _EACH_FRAME = ("reading_", "force", "D_s_", "D_t_")
 
@@ -56,17 +60,16 @@ def write_recording(recording: Recording, path: str | Path, first: int = 0) -> P
     table = _table(recording, about)
     with whole(path) as partial:
         if path.suffix == ".parquet":
-            text = json.dumps(about)
-            table = table.replace_schema_metadata({"skin": text, "skin_sha256": _sha256(text.encode())})
+            text = files.json_line(about)
+            table = table.replace_schema_metadata({"skin": text, "skin_sha256": sha256(text.encode())})
             # A dictionary of noisy readings would take most of the time and save no space.
             dictionary = [name for name in table.column_names if not name.startswith(_EACH_FRAME)]
-            pa.parquet.write_table(
-                table, partial, compression="zstd", use_dictionary=dictionary, write_page_checksum=True
-            )
+            write_parquet(table, partial, compression="zstd", use_dictionary=dictionary)
         else:
             pa.csv.write_csv(table, partial)
             # The table is moved last, because the sidecar is useless without it.
-            files.write(json.dumps(about, indent=1) + "\n", _sidecar(path))
+            sums = {"sha256": {"table": file_sha256(partial), "description": _description_sum(about)}}
+            files.write(files.json_line(about | sums, indent=1) + "\n", _sidecar(path))
     return path
 
 
@@ -82,6 +85,8 @@ def read_recording(path: str | Path, complete: bool = True) -> Recording:
     """
     path = tabular(path, "a recording")
     with _refused(path):
+        if path.suffix == ".parquet":
+            check_seal(path)
         about, task = _described(path)
         if not complete:
             about |= {"force": False, "displacement": False, "parameters": []}
@@ -116,7 +121,16 @@ def _described(path: Path) -> tuple[dict[str, Any], Task]:
     about = _read_about(path)
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
-    return about, check_metadata(about, str(path))
+    task = check_metadata(about, str(path))
+    sums = about.pop("sha256", None)
+    if sums is not None and sums != {"table": file_sha256(path), "description": _description_sum(about)}:
+        raise ChecksumError(f"remove sha256 from {_sidecar(path).name} if you changed it or the table")
+    return about, task
+
+
+def _description_sum(about: dict[str, Any]) -> str:
+    """Return the checksum of a description, whatever its spacing and order."""
+    return sha256(files.json_line(about, sort_keys=True).encode())
 
 
 def _sidecar(path: Path) -> Path:
@@ -151,21 +165,17 @@ def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
     )
 
 
-def _sha256(text: bytes) -> str:
-    return hashlib.sha256(text).hexdigest()
-
-
 def _read_about(path: Path) -> dict[str, Any]:
     if path.suffix == ".csv":
         sidecar = _sidecar(path)
         if not sidecar.is_file():
             raise ValueError(f"it needs {sidecar.name} beside it: units, layout and rate are there")
-        return json.loads(sidecar.read_text(encoding="utf-8"))
+        return json.loads(read_file(sidecar))
     stored = pa.parquet.read_schema(path).metadata or {}
     if b"skin" not in stored:
         raise ValueError("its schema has no units, layout and rate under 'skin'")
     # Older files have no checksum.
-    if stored.get(b"skin_sha256", _sha256(stored[b"skin"]).encode()) != _sha256(stored[b"skin"]).encode():
+    if stored.get(b"skin_sha256", sha256(stored[b"skin"]).encode()) != sha256(stored[b"skin"]).encode():
         raise ValueError("its units, layout and rate are not those that were written")
     return json.loads(stored[b"skin"])
 

@@ -1,7 +1,11 @@
 """Read files from unknown sources without running code and in bounded memory."""
 
+import json
 import math
+import stat
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +14,80 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-_TEXT = 1 << 20  # bytes: the largest configuration is some kB
+TEXT = 1 << 20
+"""Bytes of a configuration or a calibration: the largest ones are some kB."""
 _DEEP = 50  # levels: the deepest configuration has 6
 _BYTES = 1 << 30
+
+
+def regular(path: Path) -> None:
+    """Check that a file is a regular one: a device has no end, and a named pipe may never answer.
+
+    Raises:
+        ValueError: it is something else.
+        OSError: there is none.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise ValueError("it is no regular file")
+
+
+def read_file(path: Path, most: int = _BYTES) -> bytes:
+    """Return the content of a regular file.
+
+    Args:
+        path: of the file.
+        most: largest size, bytes.
+
+    Raises:
+        ValueError: larger, or no regular file.
+        OSError: unreadable.
+    """
+    regular(path)
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"it has more than {most} bytes")
+    return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the content of JSON text, whose numbers are finite.
+
+    Raises:
+        ValueError: no JSON, nested too deep, or with ``NaN`` or ``Infinity``.
+    """
+    try:
+        return json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    if math.isinf(number := float(text)):
+        raise ValueError(f"{text} is too large")
+    return number
 
 
 def load_yaml(path: Path) -> Any:
     """Return the content of a YAML file as plain containers, without resolving interpolations.
 
     Raises:
-        ValueError: no YAML, too large, or with aliases, which can expand to gigabytes.
+        ValueError: no regular file, no YAML, too large, or with aliases, which can expand to gigabytes.
         OSError: unreadable.
     """
-    if path.stat().st_size > _TEXT:
-        raise ValueError(f"it has more than {_TEXT} bytes")
-    text = path.read_text(encoding="utf-8")
+    return parse_yaml(read_file(path, TEXT).decode("utf-8"))
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the content of YAML text as :func:`load_yaml` does.
+
+    Raises:
+        ValueError: no YAML, or with aliases.
+    """
     try:
         depth = 0
         for event in yaml.parse(text, Loader=yaml.SafeLoader):
@@ -32,7 +95,7 @@ def load_yaml(path: Path) -> Any:
             if isinstance(event, yaml.AliasEvent) or depth > _DEEP:
                 raise ValueError(f"aliases and more than {_DEEP} levels are not read")
         return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except (yaml.YAMLError, OmegaConfBaseException, AssertionError) as error:
+    except (yaml.YAMLError, OmegaConfBaseException, AssertionError, TypeError, LookupError) as error:
         raise ValueError(" ".join(str(error).split()) or "it is no configuration") from error
 
 
@@ -47,6 +110,7 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
         ValueError: no such file, objects, larger arrays, or shapes that do not match the data.
         OSError: unreadable.
     """
+    regular(path)
     try:
         with zipfile.ZipFile(path) as archive:
             total = sum(_claimed(archive, entry) for entry in archive.infolist())
@@ -58,6 +122,27 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # whatever zipfile, zlib, numpy and the parser of its header raise
         raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
+
+
+def check_archive(path: Path, most: int = _BYTES) -> None:
+    """Check that what a zip archive, such as weights of torch, expands to fits into memory.
+
+    Args:
+        path: of the file.
+        most: largest total size of its entries, bytes.
+
+    Raises:
+        ValueError: no regular file, no zip archive, or larger entries.
+        OSError: unreadable.
+    """
+    regular(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(entry.file_size for entry in archive.infolist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"it is no archive of weights: {error}") from error
+    if total > most:
+        raise ValueError(f"it expands to {total} bytes, more than {most}")
 
 
 def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
@@ -72,3 +157,27 @@ def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
         if kind.hasobject or size != entry.file_size - file.tell():
             raise ValueError(f"{entry.filename} holds objects, or claims another size than it has")
     return size
+
+
+@contextmanager
+def limited_memory(more: int) -> Iterator[None]:
+    """Let this process take no more than ``more`` bytes on top of what it has, while the block runs.
+
+    Who asks for more gets a MemoryError or the error of its library. There is no limit where the system does
+    not know one for address space, as on macOS and Windows.
+    """
+    known = Path("/proc/self/statm")
+    if not known.exists():
+        yield
+        return
+    import resource  # not on Windows
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    limit = int(known.read_text().split()[0]) * resource.getpagesize() + more
+    if before[0] != resource.RLIM_INFINITY:
+        limit = min(limit, before[0])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)

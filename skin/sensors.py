@@ -4,6 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+MOST = 10_000
+"""Sensors that a file may have: a thousand times those of a usual skin."""
+
 
 @dataclass(frozen=True)
 class Sensors:

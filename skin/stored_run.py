@@ -3,12 +3,18 @@
 import logging
 import pickle
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from hydra.errors import InstantiationException
 from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
+from mlflow.utils.file_utils import local_file_uri_to_path
+from mlflow.utils.uri import is_local_uri
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from skin.build import build_device
 from skin.config import Evaluation
@@ -19,7 +25,7 @@ from skin.evaluation.operating_point import OperatingPoint, choose_operating_poi
 from skin.fingerprint import renamed
 from skin.learner.base import AbstractLearner
 from skin.pretrained import find_copy, find_pretrained
-from skin.safe_loading import load_yaml
+from skin.safe_loading import load_yaml, regular
 from skin.tracking import RECORDED, Store
 from skin.trust import check_targets
 
@@ -82,13 +88,33 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
             stored = renamed(load_yaml(path))
         except (ValueError, OSError) as error:
             raise InputError(f"run {run.info.run_id} has no readable config.yaml: {error}") from error
-    if not isinstance(stored, dict):
+    if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
         raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
-    stored = in_seconds(stored)
+    with described(run):
+        stored = in_seconds(stored)
     if not trust:
         check_targets(stored, f"config.yaml of run {run.info.run_id}")
     # Older runs list the settings of all commands of their time, unset.
     return OmegaConf.create({key: value for key, value in stored.items() if value is not None})
+
+
+@contextmanager
+def described(run: Run) -> Iterator[None]:
+    """Turn what goes wrong with settings of a stored run into an InputError: they may be damaged.
+
+    Args:
+        run: that the settings are of.
+    """
+    try:
+        yield
+    except (InputError, OmegaConfBaseException):
+        raise
+    except (*_UNFIT, AssertionError, InstantiationException) as error:
+        cause = error.__cause__ if isinstance(error, InstantiationException) else None
+        raise InputError(
+            f"config.yaml of run {run.info.run_id} describes nothing that can be built: "
+            f"{_reason(cause or error)}"
+        ) from error
 
 
 class MissingWeightsError(InputError):
@@ -169,14 +195,24 @@ def fetch(store: Store, run: Run, name: str, folder: str) -> Path:
     """
     place = run.info.artifact_uri
     try:
+        _check_regular(place, name)
         # Not by its id: a pretrained model is not in the database.
         return Path(download_artifacts(f"{place}/{name}", dst_path=folder, tracking_uri=store.uri))
-    except (MlflowException, OSError) as error:
+    except (MlflowException, OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"run {run.info.run_id} has no {name} in {place}: {reason}") from error
 
 
-def _reason(error: Exception) -> str:
+def _check_regular(place: str, name: str) -> None:
+    """Raise a ValueError where a file of a local run is a device or a named pipe, which would never end."""
+    if is_local_uri(place):
+        path = Path(local_file_uri_to_path(place)) / name
+        for part in path.rglob("*") if path.is_dir() else [path]:
+            if part.exists() and not part.is_dir():
+                regular(part)
+
+
+def _reason(error: BaseException) -> str:
     """Return a short message; that of torch on a pickle would advise to run its code."""
     if isinstance(error, pickle.PickleError):
         return "it holds something else than numbers"

@@ -26,7 +26,7 @@ from skin.run_overrides import profile_settings
 from skin.settings import configured
 from skin.skin_distribution import SkinDistribution
 from skin.skin_settings import with_skin
-from skin.stored_run import find_run, load_configuration, load_learner, load_operating_point
+from skin.stored_run import described, find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
 
@@ -150,8 +150,9 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
         InputError: its weights do not fit the configuration.
     """
     _warn_of_unknown_skin(stored, config)
-    device, learner = build_device(config), build_learner(config)
-    data = build_data(config, device.blank())
+    with described(run):
+        device, learner = build_device(config), build_learner(config)
+        data = build_data(config, device.blank())
     load_learner(store, run, learner, data)
     known = data.example
     point = None if "skins" in config.device else choose_for_skin(learner, stored, config)

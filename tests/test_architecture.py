@@ -9,13 +9,13 @@ from skin.paths import CONF, ROOT
 
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
-errors interrupt paths option
-trust earlier_settings
+errors interrupt paths option safe_loading
+trust earlier_settings checksum
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
 config recording body gesture_measures server shard
 command
-files safe_loading recording_metadata layout summary plausibility outbox
+files recording_metadata layout summary plausibility outbox
 recording_file touch tracking
 simulator data_set
 contact sensor_geometry skin_distribution

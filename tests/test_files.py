@@ -12,7 +12,7 @@ import torch
 from skin.config import Tracking
 from skin.error_messages import to_input_error
 from skin.errors import InputError
-from skin.files import json_text, write
+from skin.files import json_line, json_text, write
 from skin.hardware.calibration.bench_session import BenchSession
 from skin.hardware.calibration.bench_session import write_bench_session as write_session
 from skin.labels import TOUCH
@@ -164,3 +164,9 @@ def test_a_file_has_reached_the_disk_before_it_takes_its_place(tmp_path, monkeyp
     monkeypatch.setattr(os, "fsync", lambda file: synced.append((os.fstat(file).st_size, path.exists())))
     write("0123456789", path)
     assert synced == [(10, False)]
+
+
+def test_json_has_no_numbers_that_are_none():
+    content = {"a": [float("inf"), -1e300, 1], "b": {"c": (float("nan"), "NaN")}}
+    assert json_line(content) == '{"a": [null, -1e+300, 1], "b": {"c": [null, "NaN"]}}'
+    assert json.loads(json_text({"a": float("inf")})) == {"a": None}

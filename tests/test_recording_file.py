@@ -12,11 +12,14 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin.errors import InputError
 from skin.labels import TOUCH, Task
 from skin.recording import Recording, Touches
 from skin.recording_file import read_description, read_recording, write_recording
+from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 BATCH, TIME, SENSORS = 7, 5, 3
 
@@ -45,6 +48,15 @@ def recording(**changes) -> Recording:
         "metadata": {"seed": 3, "note": "ü"},
     }
     return Recording(**(parts | changes))
+
+
+def by_hand(path: Path) -> Path:
+    """Remove the checksums beside a CSV file, as a person does who changes it."""
+    beside = path.with_name(path.name + ".json")
+    about = json.loads(beside.read_text())
+    del about["sha256"]
+    beside.write_text(json.dumps(about))
+    return path
 
 
 def same(one, other) -> bool:
@@ -104,6 +116,7 @@ def test_units_and_layout_are_in_the_file(tmp_path):
         pa.parquet.read_schema(write_recording(kept, tmp_path / "x.parquet")).metadata[b"skin"]
     )
     beside = json.loads(write_recording(kept, tmp_path / "x.csv").with_name("x.csv.json").read_text())
+    assert set(beside.pop("sha256")) == {"table", "description"}
     assert about == beside
     assert about["units"]["reading"] == "N"
     assert about["positions"] == kept.touches.positions.tolist()
@@ -134,7 +147,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
         partial.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr("pyarrow.parquet.write_table", fail)
+    monkeypatch.setattr("skin.recording_file.write_parquet", fail)
     with pytest.raises(InputError, match=r"cannot write .*disk full"):
         write_recording(recording(force=None), path)
     assert path.read_bytes() == before
@@ -159,7 +172,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path):
 
 
 def test_a_csv_without_some_rows_or_columns_is_refused(tmp_path):
-    path = write_recording(recording(), tmp_path / "x.csv")
+    path = by_hand(write_recording(recording(), tmp_path / "x.csv"))
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:-1]))
     with pytest.raises(InputError, match=r"34 rows, not 7 touches of 5 frames"):
@@ -173,7 +186,7 @@ def test_a_csv_without_some_rows_or_columns_is_refused(tmp_path):
 
 
 def test_other_units_are_refused(tmp_path):
-    path = write_recording(recording(), tmp_path / "x.csv")
+    path = by_hand(write_recording(recording(), tmp_path / "x.csv"))
     beside = path.with_name("x.csv.json")
     beside.write_text(beside.read_text().replace('"reading": "N"', '"reading": "kgf"'))
     with pytest.raises(InputError, match=r"has the units .*kgf"):
@@ -182,7 +195,7 @@ def test_other_units_are_refused(tmp_path):
 
 def test_recordings_from_before_directions_are_read(tmp_path):
     kept = recording()
-    path = write_recording(kept, tmp_path / "x.csv")
+    path = by_hand(write_recording(kept, tmp_path / "x.csv"))
     beside = path.with_name("x.csv.json")
     about = json.loads(beside.read_text())
     del about["task"]["direction"]
@@ -287,3 +300,46 @@ def test_a_gesture_without_frames_is_refused(tmp_path, name):
     path.write_text(path.read_text().splitlines()[0] + "\n")
     with pytest.raises(InputError, match=f"x.csv: description.{name}=0 must be greater than or equal to 1"):
         read_recording(path)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return a folder with a recording in both formats."""
+    folder = tmp_path_factory.mktemp("recording")
+    for suffix in ("parquet", "csv"):
+        write_recording(recording(parameters={}), folder / f"x.{suffix}")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["x.parquet", "x.csv", "x.csv.json"])
+def test_damage_never_passes_for_readings(written, tmp_path, name):
+    for path in written.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+
+    @DAMAGED_FILES
+    @given(data=st.data())
+    def try_it(data):
+        (tmp_path / name).write_bytes(data.draw(damaged((written / name).read_bytes())))
+        known = opened(lambda: read_recording(tmp_path / name.removesuffix(".json")))
+        assert known is None or same(known, recording(parameters={}))
+
+    try_it()
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_a_description_by_hand_works_or_is_refused(written, data):
+    path = written / "y.csv"
+    path.write_bytes((written / "x.csv").read_bytes())
+    about = json.loads((written / "x.csv.json").read_text())
+    del about["sha256"]
+    (written / "y.csv.json").write_text(json.dumps(data.draw(mutated(about))))
+    opened(lambda: read_recording(path))
+
+
+def test_who_changes_a_csv_is_told_what_to_do(tmp_path):
+    path = write_recording(recording(), tmp_path / "x.csv")
+    path.write_text(path.read_text().replace("0.", "1.", 1))
+    with pytest.raises(InputError, match=r"remove sha256 from x\.csv\.json if you changed"):
+        read_recording(path)
+    assert len(read_recording(by_hand(path))) == BATCH

@@ -18,6 +18,7 @@ from mlflow.entities import Param, Run, RunInfo
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from omegaconf import OmegaConf
 
+from skin.checksum import check_seal, write_parquet
 from skin.config import Tracking
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
@@ -43,6 +44,7 @@ _SCHEMA = pa.schema(
 _MAPS = ("tags", "params", "metrics", "files")
 _IDENTITY = ("fingerprint", "members", "evaluated", "study")
 _CONFIGURATION = "config.yaml"
+_ROWS, _VALUES, _SIZE = 10**5, 10**7, 1 << 30  # a thousand times those of the published results
 _KEPT = (_CONFIGURATION, OUTCOMES)  # files of a training that are recorded
 
 
@@ -50,17 +52,44 @@ def read_records(path: Path) -> list[Record]:
     """Return the records of a file; none if there is no file.
 
     Raises:
-        InputError: the file cannot be read or has other columns.
+        InputError: the file cannot be read, is damaged, or has other columns.
     """
     if not path.exists():
         return []
     try:
-        table = pq.read_table(path, schema=_SCHEMA)
-    except (OSError, pa.ArrowException) as error:
+        check_seal(path)
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            _check_size(file.metadata)
+            table = file.read()
+            if table.schema.remove_metadata() != _SCHEMA:
+                raise ValueError("it has other columns")
+            return [_checked(record) for record in table.to_pylist()]
+    except (OSError, ValueError, TypeError, OverflowError, pa.ArrowException) as error:
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"{path} holds no results of `skin results`: results.file=FILE names another"
+            f"{path} holds no results of `skin results`: {reason}: restore it, or results.file=FILE names "
+            "another"
         ) from error
-    return [one | {name: dict(one[name]) for name in _MAPS} for one in table.to_pylist()]
+
+
+def _check_size(about: pq.FileMetaData) -> None:
+    """Check what a file claims to hold before memory is allocated for it."""
+    groups = [about.row_group(number) for number in range(about.num_row_groups)]
+    columns = [group.column(number) for group in groups for number in range(about.num_columns)]
+    values = max((column.num_values for column in columns), default=0)
+    size = sum(column.total_uncompressed_size for column in columns)
+    if about.num_rows > _ROWS or values > _VALUES or not 0 <= size <= _SIZE:
+        raise ValueError(f"it claims {about.num_rows} runs of {size} bytes")
+
+
+def _checked(row: dict[str, Any]) -> Record:
+    """Return a row as a record, whose entries have names and values."""
+    record = row | {name: dict(row[name]) for name in _MAPS}
+    empty = [name for name, value in record.items() if value is None]
+    empty += [name for name in _MAPS if None in record[name].values()]
+    if empty:
+        raise ValueError(f"a run has no {empty[0]}")
+    return record
 
 
 def write_records(records: list[Record], path: Path) -> None:
@@ -69,7 +98,7 @@ def write_records(records: list[Record], path: Path) -> None:
     lines = [one | {name: sorted(one[name].items()) for name in _MAPS} for one in ordered]
     with whole(path, "results.file=FILE") as partial:
         table = pa.Table.from_pylist(lines, schema=_SCHEMA)
-        pq.write_table(table, partial, compression="zstd", compression_level=19)
+        write_parquet(table, partial, compression="zstd", compression_level=19)
 
 
 def import_runs(settings: Tracking, path: Path) -> int:

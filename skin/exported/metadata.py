@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Gt, MinLen
 
 from skin.errors import InputError
+from skin.files import json_line
 from skin.labels import Task
 from skin.settings import ONCE, configured
 
@@ -66,7 +67,7 @@ class ModelMetadata:
 
     def text(self) -> str:
         """Return the description as JSON, with its schema and the number of sensors."""
-        return json.dumps({"schema": SCHEMA, "sensors": len(self.positions), **asdict(self)})
+        return json_line({"schema": SCHEMA, "sensors": len(self.positions), **asdict(self)})
 
     @classmethod
     def parse(cls, entries: Mapping[str, str], path: str) -> "ModelMetadata":

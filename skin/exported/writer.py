@@ -14,6 +14,8 @@ from torch import nn
 from tqdm import tqdm
 
 from skin import files
+from skin.checksum import BLANK, seal
+from skin.checksum import KEY as CHECKSUM
 from skin.errors import InputError
 from skin.exported.metadata import KEY, ModelMetadata
 from skin.exported.model import ExportedModel
@@ -41,11 +43,13 @@ def write_model(module: nn.Module, metadata: ModelMetadata, touches: Touches, pa
         InputError: ONNX cannot express the module, the file differs from it, or it cannot be written.
     """
     whole = _convert(module, touches)
+    whole.metadata_props[CHECKSUM] = BLANK
     whole.metadata_props[KEY] = metadata.text()
     with files.whole(path, "out=FILE.onnx") as partial:
         import onnx_ir
 
         onnx_ir.save(whole, partial)
+        seal(partial)
         difference = _difference(module, ExportedModel(partial), touches)
         if not difference <= TOLERANCE and not difference <= 2 * _rounding(module, touches):
             raise InputError(

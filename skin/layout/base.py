@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 from pydantic import PositiveFloat
+from scipy.spatial import cKDTree
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
@@ -74,11 +75,14 @@ def _inside(body: AbstractBody, positions: np.ndarray) -> None:
 
 
 def _apart(positions: np.ndarray) -> None:
-    distance = np.linalg.norm(positions[:, None, :2] - positions[None, :, :2], axis=-1)
-    first, second = np.nonzero(np.triu(distance < _APART, k=1))
-    if len(first):
-        x, y, _ = positions[first[0]]
+    # Not all pairs, which would take gigabytes for the most sensors that a file may have.
+    distance, nearest = cKDTree(positions[:, :2]).query(positions[:, :2], k=2)
+    close = np.flatnonzero(distance[:, 1] < _APART)
+    if len(close):
+        first = int(close[0])
+        second = next(int(other) for other in nearest[first] if other != first)
+        x, y, _ = positions[first]
         raise InputError(
-            f"sensors {first[0] + 1} and {second[0] + 1} are at one place, x = {x:g} m, y = {y:g} m: "
+            f"sensors {first + 1} and {second + 1} are at one place, x = {x:g} m, y = {y:g} m: "
             "move one or remove it from the layout"
         )

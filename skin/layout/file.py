@@ -2,6 +2,8 @@
 
 import csv
 import math
+from io import StringIO
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,8 @@ from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.layout.base import AbstractLayout, Footprint, place
 from skin.paths import candidates
-from skin.sensors import Sensors
+from skin.safe_loading import read_file
+from skin.sensors import MOST, Sensors
 from skin.settings import checked
 
 _NEED = (
@@ -19,6 +22,9 @@ _NEED = (
 )
 _FACING = ("normal_x", "normal_y", "normal_z")
 _PLACE = ("x_m", "y_m", "depth_m")
+_BYTES = 1 << 22  # of a file: some hundred for each of the most sensors
+_LARGEST = 1e9
+_SHOWN = 80  # characters of the file, in a message
 
 
 @checked("layout")
@@ -36,8 +42,8 @@ class File(AbstractLayout):
         depth: of all sensors, m, where the file has no ``depth_m``; None: ``body.sensor_depth``.
 
     Raises:
-        InputError: a missing or empty file, a missing column, a cell that is not a number, or a normal of
-            length 0, with its line.
+        InputError: a missing or empty file, more than 10 000 sensors, a missing column, a cell that is not a
+            number, or a normal of length 0, with its line.
     """
 
     def __init__(
@@ -73,17 +79,21 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of the file, each (S,), m."""
     try:
         # utf-8-sig, because spreadsheets write a byte order mark.
-        with path.open(encoding="utf-8-sig", newline="") as lines:
-            reader = csv.DictReader(lines, skipinitialspace=True)
-            reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
-            needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
-            if missing := needed - set(names):
-                found = ", ".join(names) or "nothing"
-                raise ValueError(f"no column {' and '.join(sorted(missing))}, found {found}")
-            columns = [name for name in names if name in _PLACE + _FACING]
-            rows = [_numbers(reader.line_num, row, columns) for row in reader]
-            if not rows:
-                raise ValueError("no sensor below the header")
+        lines = StringIO(read_file(path, _BYTES).decode("utf-8-sig"), newline="")
+        reader = csv.DictReader(lines, skipinitialspace=True)
+        reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
+        needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
+        if missing := needed - set(names):
+            found = ", ".join(names) or "nothing"
+            raise ValueError(f"no column {' and '.join(sorted(missing))}, found {found[:_SHOWN]}")
+        columns = [name for name in names if name in _PLACE + _FACING]
+        if twice := [name for name in columns if columns.count(name) > 1]:
+            raise ValueError(f"the column {twice[0]} is there twice")
+        rows = [_numbers(reader.line_num, row, columns) for row in islice(reader, MOST + 1)]
+        if not rows:
+            raise ValueError("no sensor below the header")
+        if len(rows) > MOST:
+            raise ValueError(f"it has more than {MOST} sensors")
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"cannot read the layout {path}: {error}; {_NEED}") from error
     return dict(zip(columns, np.array(rows).T, strict=True))
@@ -97,11 +107,11 @@ def _numbers(line: int, row: dict[str, str], columns: list[str]) -> list[float]:
             number = float(row[name] or "")
         except ValueError:
             number = math.nan
-        if not math.isfinite(number):
+        if not abs(number) < _LARGEST:  # nor is it NaN
             unit = " in m" if name in _PLACE else ""
-            raise ValueError(f"line {line}: {name} must be a number{unit}, got {row[name]!r}")
+            raise ValueError(f"line {line}: {name} must be a number{unit}, got {repr(row[name])[:_SHOWN]}")
         numbers.append(number)
     facing = [number for name, number in zip(columns, numbers, strict=True) if name in _FACING]
-    if facing and not any(facing):
+    if facing and not math.hypot(*facing) > 1 / _LARGEST:
         raise ValueError(f"line {line}: a normal of length 0 faces nowhere: 0,0,1 faces the surface")
     return numbers

@@ -20,6 +20,7 @@ from skin.fusion.base import AbstractFusion
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.representation.base import Frames
+from skin.safe_loading import check_archive
 
 if TYPE_CHECKING:
     from pytorch_lightning import Callback, Trainer
@@ -202,6 +203,7 @@ class Network(AbstractLearner):
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Load the weights that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
+        check_archive(path)
         self.build(data).load_state_dict(torch.load(path, weights_only=True, map_location="cpu"))
 
     def build(self, data: "TouchData") -> "TouchClassifier":

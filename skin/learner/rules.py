@@ -15,6 +15,7 @@ from skin.errors import InputError
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.recording import Touches
+from skin.safe_loading import TEXT, parse_json, read_file
 from skin.signal.features import engineered_features
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class Rules(AbstractLearner):
 
     def load(self, data: "TouchData", path: Path) -> None:
         """Load the rules that :meth:`save` wrote."""
-        stored = json.loads(Path(path).read_text())
+        stored = parse_json(read_file(Path(path), TEXT))
         rules = {name: Rule(**stored[name]) for name in data.task.names}
         known = engineered_features(data.example.to("cpu"))
         for name, rule in rules.items():

@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from skin import files
+from skin.checksum import ChecksumError, check_text, text_sum
 from skin.errors import InputError
 from skin.paths import candidates
-from skin.safe_loading import load_yaml
+from skin.safe_loading import TEXT, parse_yaml, read_file
+from skin.sensors import MOST
 
 FORMAT = 1
+_KEYS = ("format", "sha256", "count", "scale", "zero", "sensors", "broken", "ranges", "about")
 QUANTITIES = {
     "gain": 1.0,
     "offset": 0.0,
@@ -27,6 +30,8 @@ QUANTITIES = {
 }
 """Quantities per sensor, as in :class:`skin.signal.imperfection.Constants`, with defaults."""
 _SIGNED = ("offset", "drift")
+_SHOWN = 80  # characters of values, in a message
+_LARGEST = 1e12  # of any quantity: no force, time or gain of a device is near it
 BROKEN = ("dead", "stuck", "saturated")
 """Kinds of broken sensors; ``stuck`` and ``saturated`` ones always read their ``offset``."""
 
@@ -68,15 +73,20 @@ class Calibration:
             _check(name, values)
             if len(values) != 2 or values[0] > values[1] or not math.isfinite(values[1]):
                 raise InputError(f"ranges.{name} must be [low, high], both finite, got {list(values)}")
-        wrong = [number for group in self.broken.values() for number in group if not 0 <= number < len(self)]
-        if wrong or not self.scale > 0:
+        if any(number not in range(len(self) + 1) for number in self.ranges.get("dead", ())):
+            raise InputError(f"ranges.dead must be whole numbers up to {len(self)} sensors")
+        wrong = [number for group in self.broken.values() for number in group if not self._has(number)]
+        if wrong or not self.scale > 0 or not math.isfinite(self.scale) or not math.isfinite(self.zero):
             raise InputError(
                 f"a calibration of {len(self)} sensors breaks sensors 0 to {len(self) - 1} and has a scale "
-                f"above 0, got sensors {wrong}, scale {self.scale}"
+                f"above 0, got sensors {wrong}, scale {self.scale}, zero {self.zero}"
             )
 
     def __len__(self) -> int:
         return len(next(iter(self.sensors.values())))
+
+    def _has(self, number: Any) -> bool:
+        return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < len(self)
 
     def newtons(self, raw: np.ndarray) -> np.ndarray:
         """Return raw values in N, with offsets and gains, like the readings of a simulated device."""
@@ -140,35 +150,53 @@ def read_calibration(path: str | Path) -> Calibration:
         path: YAML file; relative paths are searched in the current folder, then beside the package.
 
     Raises:
-        InputError: no such file, unreadable, or invalid contents.
+        InputError: no such file, unreadable, invalid contents, or a line ``sha256`` with the checksum of
+            other contents.
     """
     found = next((place for place in candidates(path) if place.is_file()), None)
     if found is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
-        stored: Any = load_yaml(found)
+        text = read_file(found, TEXT).decode("utf-8")
+        stored: Any = parse_yaml(text)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read the calibration {found}: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         raise InputError(f"{found} is no calibration: it needs format: {FORMAT}, count: and sensors:")
     try:
-        count = int(stored["count"])
-        sensors = {
-            name: list(value) if isinstance(value, list) else [value] * count
-            for name, value in stored["sensors"].items()
-        }
-        broken = stored.get("broken") or {}
-        ranges, about = stored.get("ranges") or {}, stored.get("about") or {}
-        scale, zero = float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0))
-        return Calibration(sensors, broken, ranges, scale, zero, about)
-    except InputError as error:
-        raise InputError(f"{found}: {error}") from error
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        check_text(text, stored)
+        return _calibration(stored)
+    except ChecksumError as error:
+        raise InputError(f"{found}: {error}: remove its line sha256 if you changed it by hand") from error
+    except (InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{found} is no calibration: {error}") from error
 
 
+def _calibration(stored: Mapping[str, Any]) -> Calibration:
+    """Return the calibration that a file describes; its size is checked before memory is allocated."""
+    _known(stored, _KEYS, "a calibration")
+    count = stored["count"]
+    if type(count) is not int or not 1 <= count <= MOST:
+        raise InputError(f"count must be a whole number from 1 to {MOST}, got {count!r}")
+    sensors = {
+        name: value if isinstance(value, list) else [value] * count
+        for name, value in stored["sensors"].items()
+    }
+    if wrong := [name for name, values in sensors.items() if len(values) != count]:
+        raise InputError(
+            f"a calibration needs as many numbers of every quantity as count says, {count}, got "
+            f"{len(sensors[wrong[0]])} of {wrong[0]}"
+        )
+    broken, ranges, about = (stored.get(name) or {} for name in ("broken", "ranges", "about"))
+    if not isinstance(about, dict):
+        raise InputError(f"about must be settings by name, got {about!r}")
+    return Calibration(
+        sensors, broken, ranges, float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0)), about
+    )
+
+
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
-    """Write a calibration atomically, one quantity per line.
+    """Write a calibration atomically, one quantity per line, with a checksum.
 
     Raises:
         InputError: the file cannot be written.
@@ -181,17 +209,27 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
         lines.append(f"{group}:" + ("" if values else " {}"))
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]
     lines.append(f"about: {json.dumps(dict(calibration.about))}")
+    # Before the count, which no file lacks: who cuts off the checksum cuts off more than it.
+    lines.insert(2, text_sum("\n".join(lines)))
     path = Path(path).expanduser()
     return files.write("\n".join(lines) + "\n", path)
 
 
 def _known(given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:
     if unknown := set(given) - set(names):
-        raise InputError(f"{group} takes {', '.join(names)}, got {', '.join(sorted(unknown))}")
+        raise InputError(f"{group} takes {', '.join(names)}, got {', '.join(sorted(map(str, unknown)))}")
 
 
 def _check(name: str, values: Sequence[float]) -> None:
-    numbers = all(isinstance(value, int | float) and not math.isnan(value) for value in values)
+    numbers = isinstance(values, Sequence) and all(_is_number(name, value) for value in values)
     if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
         least = "" if name in _SIGNED else " from 0 up"
-        raise InputError(f"{name} must be numbers{least}, got {list(values)}")
+        shown = str(values)
+        raise InputError(f"{name} must be numbers{least}, got {shown[:_SHOWN]}")
+
+
+def _is_number(name: str, value: Any) -> bool:
+    """Return whether a value is a number that a device can have; a limit may be infinite."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return abs(value) <= _LARGEST or (name == "clip" and value == math.inf)

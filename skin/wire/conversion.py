@@ -8,6 +8,8 @@ from skin.errors import InputError
 from skin.signal.calibration import Calibration
 from skin.wire.text import Header
 
+_LARGEST = 1e9  # N: more would overflow in a network or in JSON
+
 
 @dataclass(frozen=True)
 class UnitConversion:
@@ -29,9 +31,14 @@ class UnitConversion:
     changing: np.ndarray | None = None
 
     def __call__(self, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool."""
-        valid = valid & ~self.broken
-        return np.where(valid, (values - self.zero) * self.scale, 0.0).astype(np.float32), valid
+        """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool.
+
+        A reading that no skin can have is invalid.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            newtons = (values - self.zero) * self.scale
+            valid = valid & ~self.broken & (np.abs(newtons) <= _LARGEST)
+        return np.where(valid, newtons, 0.0).astype(np.float32), valid
 
 
 def unit_conversion(

@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.layout.file import File
 from skin.layout.grid import Grid
+from tests.damage import DAMAGED_FILES, damaged, opened
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
@@ -107,3 +110,46 @@ def test_a_script_may_give_a_path(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("x_m,y_m\n0.1,0.1\n")
     assert len(File(path).sensors(BODY)) == 1
+
+
+MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
+0.02, 0.03, 0.004, 0, 0, 1
+0.08, 0.031, 0.004, 0.5, 0, 1
+0.15, 0.12, 0.005, 0, -1, 2
+"""
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_every_file_works_or_is_refused(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "damaged.csv"
+    path.write_bytes(data.draw(damaged(MINE)))
+    read = opened(lambda: File(str(path)).sensors(BODY))
+    assert read is None or (np.isfinite(read.positions).all() and np.isfinite(read.normals).all())
+
+
+def test_more_sensors_than_any_skin_has_are_refused_before_they_take_memory(sensors):
+    rows = "".join(f"{0.00001 * number},0.1\n" for number in range(10_001))
+    with pytest.raises(InputError, match="it has more than 10000 sensors"):
+        sensors(f"x_m,y_m\n{rows}")
+    with pytest.raises(InputError, match="it has more than 4194304 bytes"):
+        sensors("x_m,y_m\n" + "0.1,0.1\n" * 600_000)
+    assert (
+        len(sensors("x_m,y_m\n" + "".join(f"{0.00001 * number},0.1\n" for number in range(10_000)))) == 10_000
+    )
+
+
+@pytest.mark.parametrize("number", ["1e300", "1e999", "nan", "-1e10"])
+def test_numbers_that_overflow_are_refused(sensors, number):
+    with pytest.raises(InputError, match="line 2: normal_x must be a number"):
+        sensors(f"{FACING}0.1,0.1,{number},0,1\n")
+
+
+def test_a_column_twice_is_refused(sensors):
+    with pytest.raises(InputError, match="the column x_m is there twice"):
+        sensors("x_m,y_m,x_m\n0.1,0.1,0.2\n")
+
+
+def test_a_normal_too_short_to_have_a_direction_is_refused(sensors):
+    with pytest.raises(InputError, match="a normal of length 0"):
+        sensors(f"{FACING}0.1,0.1,1e-300,0,0\n")

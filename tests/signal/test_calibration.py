@@ -1,10 +1,17 @@
 """Calibration files: what is written is read, and what a person may write."""
 
+import os
+import re
+
 import numpy as np
 import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin.errors import InputError
 from skin.signal.calibration import Calibration, read_calibration, write_calibration
+from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 WHOLE = Calibration(
     {
@@ -74,3 +81,52 @@ def test_what_cannot_be_used_is_refused(tmp_path, text, reason):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no calibration .*skin calibrate"):
         read_calibration(tmp_path / "none.yaml")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return write_calibration(WHOLE, tmp_path_factory.mktemp("calibration") / "mine.yaml")
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_damage_never_passes_for_constants(written, data):
+    path = written.with_name("damaged.yaml")
+    path.write_bytes(data.draw(damaged(written.read_bytes())))
+    assert opened(lambda: read_calibration(path)) in (None, WHOLE)
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_a_file_by_hand_works_or_is_refused(written, data):
+    path = written.with_name("by_hand.yaml")
+    content = {name: value for name, value in yaml.safe_load(written.read_text()).items() if name != "sha256"}
+    path.write_text(yaml.safe_dump(data.draw(mutated(content)), allow_unicode=True))
+    calibration = opened(lambda: read_calibration(path))
+    if calibration is not None:
+        calibration.values()
+        calibration.draw((len(calibration),), np.random.default_rng(0))
+        write_calibration(calibration, path.with_name("again.yaml"))
+
+
+def test_who_changes_a_file_by_hand_is_told_what_to_do(written, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(written.read_text().replace("511.5", "512.5"))
+    with pytest.raises(InputError, match="remove its line sha256 if you changed it by hand"):
+        read_calibration(path)
+    path.write_text(re.sub("sha256.*\n", "", path.read_text()))
+    assert read_calibration(path).zero == 512.5
+
+
+@pytest.mark.parametrize("count", ["1000000000", "0", "-1", "true", "2.0", "'3'", "1e9"])
+def test_no_memory_is_taken_for_a_count_that_no_skin_has(tmp_path, count):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"format: 1\ncount: {count}\nsensors: {{gain: 1}}\n")
+    with pytest.raises(InputError, match="count must be a whole number from 1 to 10000"):
+        read_calibration(path)
+
+
+def test_a_named_pipe_is_no_calibration(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    with pytest.raises(InputError, match="no calibration"):
+        read_calibration(tmp_path / "pipe.yaml")

@@ -5,8 +5,12 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from experiments.studies.recorded_runs import export_runs, import_runs, read_records, write_records
 from skin.config import Tracking
@@ -16,6 +20,7 @@ from skin.pretrained import find_pretrained
 from skin.stored_run import MissingWeightsError
 from skin.tracking import Store
 from skin.trained import load_run
+from tests.damage import DAMAGED_FILES, damaged, opened
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -217,3 +222,32 @@ def test_what_needs_weights_says_how_to_train_them(run, restored):
     assert (again.returncode, again.stdout.count("took")) == (0, 2), again.stderr
     done = run(restored, "study", "study=misplaced", *STUDY[1:], "study.rows=[linked_graph]", "out=x")
     assert done.returncode == 0, done.stderr
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_damage_never_passes_for_results(tmp_path_factory, data):
+    folder = tmp_path_factory.getbasetemp()
+    path = folder / "whole.parquet"
+    if not path.exists():
+        write_records([record("a" * 16), record("a" * 16, study="b"), record("c" * 16)], path)
+    (folder / "damaged.parquet").write_bytes(data.draw(damaged(path.read_bytes())))
+    assert opened(lambda: read_records(folder / "damaged.parquet")) in (None, read_records(path))
+
+
+def test_the_published_results_have_a_checksum(tmp_path):
+    content = bytearray((ROOT / "docs/results/runs.parquet").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "runs.parquet").write_bytes(content)
+    with pytest.raises(InputError, match="its checksum is not that of its content: restore it"):
+        read_records(tmp_path / "runs.parquet")
+
+
+@pytest.mark.parametrize("wrong", ["null", "columns"])
+def test_results_without_a_value_are_refused(made_up, tmp_path, wrong):
+    table = pq.read_table(made_up)
+    name = pa.nulls(len(table), pa.string())
+    table = table.set_column(1, "name", name) if wrong == "null" else table.drop_columns("name")
+    pq.write_table(table.replace_schema_metadata(None), tmp_path / "x.parquet")
+    with pytest.raises(InputError, match="a run has no name" if wrong == "null" else "it has other columns"):
+        read_records(tmp_path / "x.parquet")

@@ -1,13 +1,12 @@
 """A log file of alarms."""
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from skin.files import unwritable
+from skin.files import json_line, unwritable
 from skin.hardware.live.display import Display
 from skin.hardware.live.verdict import Verdict
 from skin.hardware.live.verdict_message import verdict_message
@@ -47,7 +46,7 @@ class AlarmLog:
         if self._file is None:
             return
         try:
-            self._file.write(json.dumps({"event": event, **verdict_message(verdict, reason, alarm)}) + "\n")
+            self._file.write(json_line({"event": event, **verdict_message(verdict, reason, alarm)}) + "\n")
             self._file.flush()
         except OSError as error:
             self._file = None

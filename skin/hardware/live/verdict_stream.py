@@ -1,6 +1,5 @@
 """Verdicts as JSON lines, on standard output or to the clients of a TCP port."""
 
-import json
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from time import monotonic
 from typing import Literal
 
 from skin.errors import InputError
+from skin.files import json_line
 from skin.hardware.live.display import Display
 from skin.hardware.live.verdict import Verdict
 from skin.hardware.live.verdict_message import verdict_message
@@ -59,7 +59,7 @@ class VerdictStream:
     def _send(self, event: str) -> None:
         self._number, self._sent = self._number + 1, monotonic()
         message = {"number": self._number, "event": event, **verdict_message(*self._state)}
-        line = (json.dumps(message) + "\n").encode()
+        line = (json_line(message) + "\n").encode()
         for lines in self._readers:
             try:
                 lines.put_nowait(line)

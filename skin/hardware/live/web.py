@@ -2,7 +2,6 @@
 
 import asyncio
 import base64
-import json
 import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from starlette.responses import FileResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 from skin.errors import InputError
+from skin.files import json_line
 from skin.hardware.live.display import Display, DisplayState
 from skin.hardware.live.picture import SkinPicture
 from skin.hardware.live.terminal import contact_text
@@ -125,7 +125,7 @@ async def _events(display: Display, picture: SkinPicture) -> AsyncIterator[str]:
     while not display.closed.is_set():
         state = display.state(number)
         number = state.number
-        yield f"data: {json.dumps(message(state, picture))}\n\n"
+        yield f"data: {json_line(message(state, picture))}\n\n"
         # A picture that is a little late does not delay the next; those that are very late are left out.
         due = max(due + 1 / HERTZ, monotonic() - 1 / HERTZ)
         await asyncio.sleep(max(0.0, due - monotonic()))

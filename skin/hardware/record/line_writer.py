@@ -11,7 +11,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from skin.errors import InputError
-from skin.files import unwritable
+from skin.files import json_line, unwritable
 
 _SUM = ', "sum": "'
 
@@ -102,7 +102,7 @@ def locked(path: Path) -> Iterator[None]:
 
 def encode_event(event: str, **what: Any) -> tuple[str, str]:
     """Return an event as a line of JSON after #, with its checksum, and the checksum."""
-    text = "# " + json.dumps({"event": event, **what})
+    text = "# " + json_line({"event": event, **what})
     token = f"{zlib.crc32(text.encode()):08x}"
     return f'{text[:-1]}{_SUM}{token}"}}', token
 

@@ -63,3 +63,14 @@ def test_a_full_disk_ends_the_log_and_not_the_view(capsys):
     log.observe(verdict(True), "", False)
     log.observe(verdict(False), "", False)
     assert capsys.readouterr().err == "the alarm log ends here: No space left on device\n"
+
+
+def test_the_log_is_valid_json_whatever_a_verdict_holds(tmp_path):
+    shown, path = display(), tmp_path / "alarms.jsonl"
+    broken = Verdict(
+        float("inf"), monotonic(), {"a": float("nan")}, True, {"a": True}, True, False, (), 1e300
+    )
+    with log_alarms(shown, path):
+        shown.set_verdict(broken)
+    messages = [json.loads(line, parse_constant=pytest.fail) for line in path.read_text().splitlines()]
+    assert {message.get("device_time") for message in messages} == {None}

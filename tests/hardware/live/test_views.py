@@ -145,6 +145,17 @@ def test_the_page_gets_pictures_and_needs_nothing_from_elsewhere():
     assert len(b64decode(picture["picture"])) == info["pixels"] ** 2
 
 
+@pytest.mark.parametrize("value", [1e300, -1e300, 1e10])
+def test_the_page_gets_valid_json_whatever_the_device_sends(value):
+    subject = display()
+    subject.add_frame(frame([0, value, 2.0, 0, 0]), PLAIN)
+    subject.set_verdict(Verdict(0, 0, {"big": float("inf")}, True, {"big": True}, False, False))
+    with web.serve_page(subject, 0) as address, urllib.request.urlopen(f"{address}/pictures") as answer:
+        line = answer.readline().decode().removeprefix("data: ")
+    picture = json.loads(line, parse_constant=pytest.fail)
+    assert (picture["values"], picture["valid"][1]) == ([0, 0, 2, 0, 0], False)
+
+
 def test_a_saturated_sensor_shows_its_limit_and_an_unknown_one_nothing():
     """A dark hole at the sensor that is pressed hardest would hide the press."""
     subject = display()

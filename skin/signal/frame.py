@@ -21,8 +21,9 @@ class Frame(NamedTuple):
         seq: the device's frame number, as sent; None if it sends none.
         t: s, the device's clock, unwrapped, within a segment; the host's if the device sends no time.
         t_host: s, the host's monotonic clock (``time.monotonic``), never before the frame before.
-        values: (S,), float64, as sent (raw counts, or N from a recording).
-        valid: (S,), bool: False for stuck and dead channels.
+        values: (S,), float64, as sent (raw counts, or N from a recording). Never NaN: where the device sent
+            no number, the channel's last value, 0 before its first.
+        valid: (S,), bool: False for stuck and dead channels, and where the device sent no number.
         segment: number of restarts, reconnections and cuts so far; a window should not span two segments.
         lost: number of frames known to be missing just before this one.
         after: interruption before this frame; empty if there is none.
@@ -72,6 +73,7 @@ class Counters:
         gaps: interruptions by missing frames.
         lost: missing frames, according to frame numbers.
         resets: restarts of the device.
+        invalid: values in good frames for which the device sent no number, such as ``nan`` or ``ovf``.
         weak: frames accepted without a CRC, which may have wrong values.
     """
 
@@ -84,3 +86,4 @@ class Counters:
     lost: int = 0
     resets: int = 0
     weak: int = 0
+    invalid: int = 0

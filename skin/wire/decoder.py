@@ -46,6 +46,7 @@ class Decoder:
         self.header: Header | None = None
         self._order, self._clock = SequenceTracker(), HostClock()
         self._all_valid = np.ones(sensors or 0, dtype=bool)
+        self._latest = np.zeros(sensors or 0)
         self._begin()
 
     def _begin(self) -> None:
@@ -110,6 +111,8 @@ class Decoder:
         self.sensors = self.frame_format.sensors
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
+        if len(self._latest) != self.sensors:
+            self._latest = np.zeros(self.sensors)
         return True
 
     def _frame(self, piece: bytes, now: float) -> Frame | None:
@@ -157,7 +160,15 @@ class Decoder:
         self._synchronous, self._missing = True, 0
         if after and after != "gap":
             self._clock.restart()
-        return Frame(raw.seq, t, self._clock(t, now), raw.values, self._all_valid, segment, lost, after)
+        values, valid = (raw.values, self._all_valid) if raw.finite else self._masked(raw)
+        self._latest = values
+        return Frame(raw.seq, t, self._clock(t, now), values, valid, segment, lost, after)
+
+    def _masked(self, raw: RawFrame) -> tuple[np.ndarray, np.ndarray]:
+        """Return values without NaN, (S,), and which of them the device sent, (S,), bool."""
+        valid = np.isfinite(raw.values)
+        self.counters.invalid += len(valid) - int(np.count_nonzero(valid))
+        return np.where(valid, raw.values, self._latest), valid
 
 
 class _Quality:

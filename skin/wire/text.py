@@ -33,7 +33,7 @@ _SEPARATORS = (b",", b";", b"\t")
 INVALID = frozenset(
     (b"", b"-", b"--", b"nan", b"inf", b"-inf", b"ovf", b"err", b"error", b"na", b"n/a", b"null", b"none")
 )
-"""Fields that firmware sends instead of a value that it could not read, in lower case; also an empty field."""
+"""Fields, in lower case, that firmware sends instead of a value that it could not read; also an empty one."""
 
 
 class Line(NamedTuple):
@@ -94,7 +94,7 @@ def parse_line(line: bytes) -> Line:
     """Parse a line without its end; fields are separated by comma, semicolon, tab or blanks.
 
     Raises:
-        FrameError: ``checksum`` is wrong or unknown, or a field is neither a ``number`` nor one of ``INVALID``.
+        FrameError: ``checksum`` is wrong or unknown, or a field is no ``number`` and not one of ``INVALID``.
     """
     body, check = _verified(line)
     if b"_" in body:  # valid in Python's grammar only

@@ -29,6 +29,7 @@ class Frame(NamedTuple):
         after: interruption before this frame; empty if there is none.
         saturated: (S,), bool: the channel is at its limit, so the force is at least its value; None: no
             channel is.
+        polarity: (S,), float64: -1 where the value falls with force, else 1; None: 1 for all.
     """
 
     seq: int | None
@@ -40,6 +41,7 @@ class Frame(NamedTuple):
     lost: int = 0
     after: After = ""
     saturated: np.ndarray | None = None
+    polarity: np.ndarray | None = None
 
     def behind(self, dropped: "Frame") -> "Frame":
         """Return this frame with the previous one, which was dropped, counted as lost."""

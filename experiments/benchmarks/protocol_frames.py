@@ -30,7 +30,7 @@ def binary_frame(number: int, clock: int, values: list[float], kind: int) -> byt
 
 
 def invalid_frame(number: int, clock: int, values: list[float], kind: int, rng: Random) -> bytes:
-    """Return an invalid frame with a correct CRC: of unknown kind, of another length, or with NaN."""
+    """Return an invalid frame with a correct CRC: of unknown kind, of another length, or with a value NaN."""
     body, trouble = bytearray(_body(number, clock, values, kind)), rng.randrange(5)
     if trouble == 0:
         body[0] = rng.choice((0, 0x5A, 0xFF))

@@ -135,7 +135,8 @@ def compare(device: AbstractSimulated, bench: BenchData, scale: float | None) ->
     noise = generator(Stream.NOISE, device.seed, Stream.TEST, 4)
     true, time = torch.from_numpy(bench.true)[None].float(), torch.from_numpy(said.time).float()
     felt = device.imperfection.raw(true, device.constants, noise, time)[0].double().numpy()
-    recorded = said.raw * (1.0 if scale is None else scale)
+    signs = 1.0 if known is None else known.signs
+    recorded = said.raw * ((1.0 if scale is None else scale) * signs)
     idle = bench.idle
     simulated, recorded = (values - np.nanmedian(values[idle], axis=0) for values in (felt, recorded))
     valid = ~device.constants.dead.numpy() & np.isfinite(recorded[idle]).any(axis=0)

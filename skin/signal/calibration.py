@@ -17,7 +17,10 @@ from skin.safe_loading import TEXT, parse_yaml, read_file
 from skin.sensors import MOST
 
 FORMAT = 1
-_KEYS = ("format", "sha256", "count", "scale", "zero", "sensors", "broken", "ranges", "about")
+_KEYS = (
+    *("format", "sha256", "count", "scale", "zero", "polarity", "channels", "sensors", "broken", "ranges"),
+    "about",
+)
 QUANTITIES = {
     "gain": 1.0,
     "offset": 0.0,
@@ -48,6 +51,9 @@ class Calibration:
         scale: N per raw unit of the session; 1 where that is N.
         zero: raw units that stand for 0 N before offsets: a raw value is (raw - zero) scale, N.
         about: origin of the calibration; any JSON data.
+        polarity: 1 or -1 per sensor: -1 where the raw value falls with force. Readings in N rise with force
+            either way. Empty: 1 for all.
+        channels: the device's channel, from 0, of every sensor of the layout. Empty: they have the same order.
 
     Raises:
         InputError: an unknown name, different lengths, or a number out of range.
@@ -59,6 +65,8 @@ class Calibration:
     scale: float = 1.0
     zero: float = 0.0
     about: Mapping[str, Any] = field(default_factory=dict)
+    polarity: Sequence[int] = ()
+    channels: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         _known(self.sensors, QUANTITIES, "sensors")
@@ -81,6 +89,7 @@ class Calibration:
                 f"a calibration of {len(self)} sensors breaks sensors 0 to {len(self) - 1} and has a scale "
                 f"above 0, got sensors {wrong}, scale {self.scale}, zero {self.zero}"
             )
+        self._check_wiring()
 
     def __len__(self) -> int:
         return len(next(iter(self.sensors.values())))
@@ -89,8 +98,28 @@ class Calibration:
         return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < len(self)
 
     def newtons(self, raw: np.ndarray) -> np.ndarray:
-        """Return raw values in N, with offsets and gains, like the readings of a simulated device."""
-        return (raw - self.zero) * self.scale
+        """Return raw values (..., S), in the layout's order, in N, with offsets and gains.
+
+        They are like the readings of a simulated device: they rise with force.
+        """
+        return (raw - self.zero) * (self.scale * self.signs)
+
+    @property
+    def signs(self) -> np.ndarray:
+        """The polarity of every sensor, (S,), float64: 1 or -1."""
+        return np.array(self.polarity, dtype=float) if self.polarity else np.ones(len(self))
+
+    def _check_wiring(self) -> None:
+        """Raise InputError unless polarity and channels fit the number of sensors."""
+        if self.polarity and (len(self.polarity) != len(self) or not set(self.polarity) <= {1, -1}):
+            raise InputError(
+                f"polarity must be 1 or -1 for each of {len(self)} sensors, got {list(self.polarity)}"
+            )
+        if self.channels and sorted(self.channels) != list(range(len(self))):
+            raise InputError(
+                f"channels must hold each of 0 to {len(self) - 1} once, the channel of every sensor, got "
+                f"{list(self.channels)}"
+            )
 
     def corrected(self, raw: np.ndarray) -> np.ndarray:
         """Return the true readings of raw values, (..., S), N: no offset, gain 1; NaN for broken sensors."""
@@ -190,9 +219,11 @@ def _calibration(stored: Mapping[str, Any]) -> Calibration:
     broken, ranges, about = (stored.get(name) or {} for name in ("broken", "ranges", "about"))
     if not isinstance(about, dict):
         raise InputError(f"about must be settings by name, got {about!r}")
-    return Calibration(
-        sensors, broken, ranges, float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0)), about
-    )
+    scale, zero = float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0))
+    wiring = [stored.get("polarity") or (), stored.get("channels") or ()]
+    if not all(isinstance(part, list | tuple) for part in wiring):
+        raise InputError("polarity and channels must be lists")
+    return Calibration(sensors, broken, ranges, scale, zero, about, *wiring)
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
@@ -205,6 +236,14 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     lines = ["# Forces in N, times in s. device.calibration takes this file.", f"format: {FORMAT}"]
     lines += [f"count: {len(calibration)}", f"scale: {calibration.scale!r}  # N per raw unit"]
     lines.append(f"zero: {calibration.zero!r}  # raw units at 0 N, before offsets")
+    if calibration.polarity:
+        lines.append(
+            f"polarity: {json.dumps(list(calibration.polarity))}  # -1: the raw value falls with force"
+        )
+    if calibration.channels:
+        lines.append(
+            f"channels: {json.dumps(list(calibration.channels))}  # the device's channel of every sensor"
+        )
     for group, values in groups.items():
         lines.append(f"{group}:" + ("" if values else " {}"))
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]

@@ -21,13 +21,15 @@ class Frame(NamedTuple):
         seq: the device's frame number, as sent; None if it sends none.
         t: s, the device's clock, unwrapped, within a segment; the host's if the device sends no time.
         t_host: s, the host's monotonic clock (``time.monotonic``), never before the frame before.
-        values: (S,), float64, as sent (raw counts, or N from a recording).
-        valid: (S,), bool: False for stuck and dead channels.
+        values: (S,), float64, as sent (raw counts, or N from a recording). Never NaN: where the device sent
+            no number, the channel's last value, 0 before its first.
+        valid: (S,), bool: False for stuck and dead channels, and where the device sent no number.
         segment: number of restarts, reconnections and cuts so far; a window should not span two segments.
         lost: number of frames known to be missing just before this one.
         after: interruption before this frame; empty if there is none.
         saturated: (S,), bool: the channel is at its limit, so the force is at least its value; None: no
             channel is.
+        polarity: (S,), float64: -1 where the value falls with force, else 1; None: 1 for all.
     """
 
     seq: int | None
@@ -39,6 +41,7 @@ class Frame(NamedTuple):
     lost: int = 0
     after: After = ""
     saturated: np.ndarray | None = None
+    polarity: np.ndarray | None = None
 
     def behind(self, dropped: "Frame") -> "Frame":
         """Return this frame with the previous one, which was dropped, counted as lost."""
@@ -89,6 +92,7 @@ class Counters:
         gaps: interruptions by missing frames.
         lost: missing frames, according to frame numbers.
         resets: restarts of the device.
+        invalid: values in good frames for which the device sent no number, such as ``nan`` or ``ovf``.
         weak: frames accepted without a CRC, which may have wrong values.
     """
 
@@ -101,3 +105,4 @@ class Counters:
     lost: int = 0
     resets: int = 0
     weak: int = 0
+    invalid: int = 0

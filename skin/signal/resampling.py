@@ -18,7 +18,8 @@ class Resampled(NamedTuple):
     """A window of a stream at the rate of a model.
 
     Attributes:
-        values: (T, S), the largest valid value of each interval, in the unit of the frames; 0 without one.
+        values: (T, S), the largest valid value of each interval, in the unit of the frames; the smallest where
+            values fall with force; 0 without one.
         valid: (T, S), bool: the interval has a valid value.
         saturated: (T, S), bool: a valid value of the interval is at the sensor's limit.
         gap: whether frames are missing in the window.
@@ -40,8 +41,9 @@ def resample(
     end: float,
     interval: float,
     window: int,
+    polarity: np.ndarray | None = None,
 ) -> Resampled:
-    """Return the maximum of each sensor over each of the ``window`` intervals before ``end``.
+    """Return the value of most force of each sensor over each of the ``window`` intervals before ``end``.
 
     Invalid values do not count. An interval without frames is invalid: nothing is interpolated. Frames on the
     edge between two intervals could fall in either: give an ``end`` halfway between two frames.
@@ -54,7 +56,9 @@ def resample(
         end: of the window, s.
         interval: s.
         window: T.
+        polarity: (S,), -1 where values fall with force; their minimum is taken. None: the maximum of all.
     """
+    values = values if polarity is None else values * polarity
     age = np.floor((end - time) / interval)
     inside = np.flatnonzero((age >= 0) & (age < window))
     place = window - 1 - age[inside].astype(np.int64)
@@ -68,7 +72,8 @@ def resample(
         highest[some] = np.maximum.reduceat(known, begins[some], axis=0)
         limited[some] = np.logical_or.reduceat(good & saturated[inside], begins[some], axis=0)
     found = np.isfinite(highest)
-    return Resampled(np.where(found, highest, 0.0), found, limited)
+    strongest = np.where(found, highest, 0.0)
+    return Resampled(strongest if polarity is None else strongest * polarity, found, limited)
 
 
 def check_rate(found: float, rate: float, setting: str | None = None) -> None:
@@ -98,6 +103,7 @@ class Window:
 
     A faster stream is reduced by the maximum over each interval of the model. A device that is slower by up
     to 5 % gives one frame to each interval. Another segment of the device's clock begins an empty window.
+    Of sensors whose values fall with force, the minimum is taken instead: frames carry their polarity.
 
     Args:
         frames: T.
@@ -108,6 +114,7 @@ class Window:
     def __init__(self, frames: int, rate: float, sensors: int) -> None:
         self.frames, self.rate, self.sensors = frames, rate, sensors
         self._period = 0.0
+        self._polarity: np.ndarray | None = None
         self._clear(4 * frames)
 
     def clear(self) -> None:
@@ -144,6 +151,7 @@ class Window:
         here, self._end = self._end, self._end + 1
         self._times[here], self._lost[here] = frame.t, max(frame.lost, int(frame.after == "gap"))
         self._values[here], self._valid[here] = frame.values, frame.valid
+        self._polarity = frame.polarity
         self._saturated[here] = False if frame.saturated is None else frame.saturated
 
     def read(self, partial: bool = False) -> Resampled | None:
@@ -188,6 +196,7 @@ class Window:
             end,
             interval,
             self.frames,
+            self._polarity,
         )
         # A loss before the window's first frame is not in the window.
         inside = times[part] > end - self.frames * interval

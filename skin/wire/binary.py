@@ -26,7 +26,10 @@ _TYPE: dict[int, np.dtype] = {1: np.dtype("<u2"), 2: np.dtype("<i2"), 3: np.dtyp
 
 
 class Payload(NamedTuple):
-    """Content of a binary frame: its number, the device's clock (microseconds) and the values, (S,)."""
+    """Content of a binary frame: its number, the device's clock (microseconds) and the values, (S,).
+
+    Values of type f32 may be NaN or infinite.
+    """
 
     seq: int
     t_us: int
@@ -52,7 +55,7 @@ def decode_frame(data: bytes) -> Payload:
     """Decode the bytes between two zeros.
 
     Raises:
-        FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum``, ``fields`` or ``number``.
+        FrameError: ``structure`` (no COBS, too short, unknown type), ``checksum`` or ``fields``.
     """
     body = unstuff(data)
     if len(body) < _HEAD.size + _TAIL.size or body[0] != _MAGIC or body[1] not in _TYPE:
@@ -63,10 +66,7 @@ def decode_frame(data: bytes) -> Payload:
     kind = _TYPE[number]
     if len(body) != _HEAD.size + count * kind.itemsize + _TAIL.size:
         raise FrameError("fields", (len(body) - _HEAD.size - _TAIL.size) // kind.itemsize)
-    values = np.frombuffer(body, kind, count, _HEAD.size).astype(np.float64)
-    if number == 3 and not np.isfinite(values).all():
-        raise FrameError("number")
-    return Payload(seq, t_us, values)
+    return Payload(seq, t_us, np.frombuffer(body, kind, count, _HEAD.size).astype(np.float64))
 
 
 def encode_comment(text: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """Conversion of a device's values to newtons."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ class UnitConversion:
     """Converts values of a device to N: gain 1, 0 without touch.
 
     Attributes:
-        scale: (S,), N per unit of the device.
+        scale: (S,), N per unit of the device; negative where the value falls with force.
         zero: (S,), values of the untouched skin, in the device's unit.
         broken: (S,), bool: sensors without valid readings according to the calibration, or without a zero.
         noise: (S,), N, standard deviation of a frame of the untouched skin; None: unknown.
@@ -53,18 +54,21 @@ def unit_conversion(
     Args:
         sensors: S.
         baseline: (S,), in the device's unit; None: the calibration's offsets, or 0.
-        scale: N per unit; None: that of the calibration, or 1 if the header has the unit N.
+        scale: N per unit, negative if values fall with force; None: that of the calibration, or 1 if the
+            header has the unit N.
         calibration: of this device.
         header: of the device; None if it sends none.
 
     Raises:
-        InputError: the scale is unknown, or the calibration has another number of sensors.
+        InputError: the scale is unknown, negative beside a calibration, or the calibration has another number
+            of sensors.
     """
     if calibration is not None:
         calibration.fits(sensors)
-        known = calibration.values()
-        per_unit = (calibration.scale if scale is None else scale) / known["gain"]
-        offset = calibration.zero + known["offset"] / calibration.scale
+        check_scale(scale, calibration)
+        known, signs = calibration.values(), calibration.signs
+        per_unit = (calibration.scale if scale is None else scale) * signs / known["gain"]
+        offset = calibration.zero + signs * known["offset"] / calibration.scale
         return UnitConversion(per_unit, offset if baseline is None else baseline, known["dead"])
     if scale is None:
         if header is None or header.unit != "N":
@@ -76,3 +80,19 @@ def unit_conversion(
         scale = 1.0
     zero = np.zeros(sensors) if baseline is None else baseline
     return UnitConversion(np.full(sensors, scale), zero, np.zeros(sensors, dtype=bool))
+
+
+def check_scale(scale: float | None, calibration: Calibration | None) -> None:
+    """Raise InputError unless a scale, N per unit, can be used with a calibration, or without one."""
+    if scale is None:
+        return
+    if not math.isfinite(scale) or scale == 0:
+        raise InputError(
+            f"device.scale is N per count and must not be 0, got {scale}: as in device.scale=0.039, or "
+            "device.scale=-0.039 if values fall with force"
+        )
+    if calibration is not None and scale < 0:
+        raise InputError(
+            f"device.scale must be above 0 beside a calibration, which has the polarity of every channel, got "
+            f"{scale}: leave out device.scale"
+        )

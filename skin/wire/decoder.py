@@ -1,5 +1,7 @@
 """Decode bytes into frames, without input or output."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from skin.errors import InputError
@@ -33,6 +35,8 @@ class Decoder:
     Args:
         sensors: S; None: taken from the header or from eight lines.
         format: ``auto``, ``text`` or ``binary``.
+        channels: the device's channel, from 0, of every sensor; empty: frames keep the device's order.
+        polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
 
     Attributes:
         counters: numbers of frames and errors; kept by :meth:`restart`.
@@ -40,12 +44,21 @@ class Decoder:
         header: of the device; None until it sends one.
     """
 
-    def __init__(self, sensors: int | None = None, format: Format = "auto") -> None:
+    def __init__(
+        self,
+        sensors: int | None = None,
+        format: Format = "auto",
+        channels: Sequence[int] = (),
+        polarity: Sequence[int] = (),
+    ) -> None:
         self.sensors, self.format = sensors, format
         self.counters, self.quality = Counters(), _Quality()
         self.header: Header | None = None
         self._order, self._clock, self._counted = SequenceTracker(), HostClock(), FrameClock()
         self._all_valid = np.ones(sensors or 0, dtype=bool)
+        self._latest = np.zeros(sensors or 0)
+        self._channels = np.array(channels) if len(channels) else None
+        self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
         self._begin()
 
     def _begin(self) -> None:
@@ -111,6 +124,8 @@ class Decoder:
         self.sensors = self.frame_format.sensors
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
+        if len(self._latest) != self.sensors:
+            self._latest = np.zeros(self.sensors)
         return True
 
     def _frame(self, piece: bytes, now: float) -> Frame | None:
@@ -161,7 +176,24 @@ class Decoder:
         self._synchronous, self._missing = True, 0
         if after and after != "gap":
             self._clock.restart()
-        return Frame(raw.seq, t, self._clock(t, now), raw.values, self._all_valid, segment, lost, after)
+        if self._channels is not None:
+            raw = raw._replace(values=raw.values[self._channels])
+        values, valid = (raw.values, self._all_valid) if raw.finite else self._masked(raw)
+        self._latest = values
+        frame = Frame(raw.seq, t, self._clock(t, now), values, valid, segment, lost, after)
+        return frame if self._polarity is None else self._oriented(frame, self._polarity)
+
+    def _oriented(self, frame: Frame, polarity: np.ndarray) -> Frame:
+        """Return a frame with its polarity; a channel whose values fall with force has its limit at 0 counts."""
+        at_limit = (polarity < 0) & (frame.values <= 0)
+        counted = self.header is not None and self.header.bits is not None
+        return frame._replace(polarity=polarity, saturated=at_limit if counted else None)
+
+    def _masked(self, raw: RawFrame) -> tuple[np.ndarray, np.ndarray]:
+        """Return values without NaN, (S,), and which of them the device sent, (S,), bool."""
+        valid = np.isfinite(raw.values)
+        self.counters.invalid += len(valid) - int(np.count_nonzero(valid))
+        return np.where(valid, raw.values, self._latest), valid
 
 
 class _Quality:

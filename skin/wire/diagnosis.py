@@ -42,6 +42,7 @@ class PortMonitor:
             "lost": stats.lost,
             "skipped": stats.skipped,
             "resets": stats.resets,
+            "invalid values": stats.invalid,
         }
         errors = "".join(f", {count} {name}" for name, count in counts.items() if count)
         reasons = ", ".join(f"{count} {reason}" for reason, count in stats.bad)
@@ -55,10 +56,16 @@ class PortMonitor:
         if not self._frames:
             return "nothing received"
         values = np.stack([frame.values for frame in self._frames])
-        middle = np.median(values, axis=0)
-        noise = _SPREAD * np.median(np.abs(values - middle), axis=0)
-        states = self._skin.channels or ("ok",) * len(middle)
-        rows = zip(values.min(axis=0), middle, values.max(axis=0), noise, states, strict=True)
+        valid = np.stack([frame.valid for frame in self._frames])
+        states = self._skin.channels or ("ok",) * values.shape[1]
+        # Of a channel that is never valid, the values that it repeats.
+        kept = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
+        middle = [float(np.median(row)) for row in kept]
+        noise = [_SPREAD * float(np.median(np.abs(row - mid))) for row, mid in zip(kept, middle, strict=True)]
+        words = [_state(*pair) for pair in zip(states, valid.mean(axis=0), strict=True)]
+        rows = zip(
+            [row.min() for row in kept], middle, [row.max() for row in kept], noise, words, strict=True
+        )
         return "\n".join(
             [
                 f"header: {self._header()}",
@@ -75,3 +82,8 @@ class PortMonitor:
         if header is None:
             return "none"
         return encode_header(header, "none").decode().removeprefix("# skin ").strip()
+
+
+def _state(state: str, share: float) -> str:
+    """Return the state of a channel in words, with the share of its invalid values where there are any."""
+    return state if share == 1 else f"{state}, invalid in {1 - share:.0%}"

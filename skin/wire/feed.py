@@ -131,7 +131,9 @@ class WireFeed:
         if frame.after not in ("", "gap"):
             self._health.restart()
         valid, saturated = self._health.check(frame.values, frame.t)
-        return frame._replace(valid=valid, saturated=saturated)
+        if frame.saturated is not None:
+            saturated = saturated | frame.saturated
+        return frame._replace(valid=valid & frame.valid, saturated=saturated & frame.valid)
 
     def _say(self, now: float) -> None:
         fresh = self._decoder.counters.bad - self._said

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import isfinite, nan
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ from skin.errors import InputError
 from skin.signal.frame import Check, FrameError
 from skin.wire.binary import decode_comment, decode_frame
 from skin.wire.sequence import frames_ahead
-from skin.wire.text import Header, Line, parse_header, parse_line
+from skin.wire.text import Header, Line, ends_with_separator, parse_header, parse_line
 
 Format = Literal["auto", "text", "binary"]
 
@@ -22,11 +23,19 @@ _STEP = 1000  # frames that may be missing between two consecutive lines
 
 
 class RawFrame(NamedTuple):
-    """Content of one frame: seq (or None), the device's clock (microseconds, or None), values (S,)."""
+    """Content of one frame.
+
+    Attributes:
+        seq: number of the frame, or None.
+        t_us: the device's clock, microseconds, or None.
+        values: (S,); NaN or infinite where the device sent no number.
+        finite: whether all values are numbers.
+    """
 
     seq: int | None
     t_us: float | None
     values: np.ndarray
+    finite: bool = True
 
 
 class FrameFormat(Protocol):
@@ -56,11 +65,17 @@ class FrameFormat(Protocol):
 
 @dataclass(frozen=True)
 class TextFormat:
-    """Lines; ``counted``: seq and t_us stand before the values."""
+    """Lines.
+
+    Attributes:
+        counted: seq and t_us stand before the values.
+        trailing: every line ends with a separator, so no line means an empty field by it.
+    """
 
     sensors: int
     counted: bool
     check: Check
+    trailing: bool = False
     name: ClassVar[str] = "text"
     delimiter: ClassVar[bytes] = b"\n"
 
@@ -69,17 +84,19 @@ class TextFormat:
         line = piece.removesuffix(b"\r")
         if not line or line.startswith(b"#"):
             return None
-        fields, check = parse_line(line)
+        fields, check, finite = parse_line(line)
         if check != self.check:
             raise FrameError("checksum")
-        if len(fields) != self.sensors + 2 * self.counted:
-            raise FrameError("fields", len(fields) - 2 * self.counted)
+        if (missing := self.sensors + 2 * self.counted - len(fields)) != 0:
+            if missing != 1 or self.trailing or not ends_with_separator(line):
+                raise FrameError("fields", len(fields) - 2 * self.counted)
+            fields, finite = [*fields, nan], False
         if not self.counted:
-            return RawFrame(None, None, np.array(fields))
+            return RawFrame(None, None, np.array(fields), finite)
         seq, t_us = fields[:2]
-        if seq < 0 or t_us < 0 or seq % 1:
+        if not (seq >= 0 and t_us >= 0) or seq % 1:
             raise FrameError("number")
-        return RawFrame(int(seq), t_us, np.array(fields[2:]))
+        return RawFrame(int(seq), t_us, np.array(fields[2:]), finite)
 
     def comment(self, piece: bytes) -> bytes | None:
         """Return the comment line; None if it is not a comment."""
@@ -102,7 +119,7 @@ class BinaryFormat:
         seq, t_us, values = decode_frame(piece)
         if len(values) != self.sensors:
             raise FrameError("fields", len(values))
-        return RawFrame(seq, t_us, values)
+        return RawFrame(seq, t_us, values, bool(np.isfinite(values).all()))
 
     def comment(self, piece: bytes) -> bytes | None:
         """Return the text of a comment; None if it is not a comment."""
@@ -167,10 +184,16 @@ def stopped_clock_error(frames: int, t_us: float) -> InputError:
     )
 
 
+def _numeric(line: Line) -> bool:
+    """Return whether more than half of the fields are numbers; only such lines show a format."""
+    return line.finite or 2 * sum(map(isfinite, line.fields)) > len(line.fields)
+
+
 def _still(run: Sequence[Line]) -> bool:
     """Return whether the first column counts while the next one, the time, is constant."""
     run = [line for line in run if len(line.fields) > 2]
-    if len(run) < _LINES_UNKNOWN or len({line.fields[1] for line in run}) > 1:
+    times = {line.fields[1] for line in run}
+    if len(run) < _LINES_UNKNOWN or len(times) > 1 or not all(map(isfinite, times)):
         return False
     return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
 
@@ -181,7 +204,7 @@ def _lines(data: bytes) -> list[Line]:
     for piece in data.split(b"\n")[1:-1]:
         with suppress(FrameError):
             found.append(parse_line(piece.removesuffix(b"\r")))
-    return found
+    return [line for line in found if _numeric(line)]
 
 
 def _binary_counts(data: bytes) -> list[int]:
@@ -204,12 +227,16 @@ def _detect_text(data: bytes, sensors: int | None, other: int | None) -> Detecti
         except FrameError:
             run = []
             continue
+        if not _numeric(read):
+            run = []
+            continue
         if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
             run = []
         run = [*run[1 - _LINES_UNKNOWN :], read] if read.fields else []
         expected = sensors or (header.n if header else None)
         if frame_format := _judge(run, expected, learn=sensors is None):
-            return DetectionResult(frame_format, None, header)
+            found = replace(frame_format, trailing=ends_with_separator(line))
+            return DetectionResult(found, None, header)
         if len(run) >= _LINES:
             other = len(read.fields) - 2 * _all_count(run[-_LINES:])
     return DetectionResult(None, other, header)

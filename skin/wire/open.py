@@ -83,6 +83,8 @@ def open_skin(
     opener: Callable[[], ByteStream] | None = None,
     device: "Streamed | None" = None,
     baseline: np.ndarray | None = None,
+    channels: Sequence[int] = (),
+    polarity: Sequence[int] = (),
     **settings: Any,
 ) -> Skin:
     """Open a skin; use it in a ``with`` statement.
@@ -94,6 +96,8 @@ def open_skin(
         opener: opens the stream of bytes instead of ``port``, and again after each disconnection.
         device: the device that ``simulated`` plays.
         baseline: (S,), from an earlier tare.
+        channels: the device's channel of every sensor, as in a calibration; empty: the same order.
+        polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
         settings: as in :class:`PortSettings`.
 
     Raises:
@@ -108,7 +112,7 @@ def open_skin(
     elif opener is None and port.endswith((".parquet", ".csv")):
         connect = _player(_recorded(port, sensors, chosen.realtime))
     else:
-        decoder = Decoder(sensors, chosen.format)
+        decoder = Decoder(sensors, chosen.format, channels, polarity)
         watched = chosen.reconnect and port.startswith("socket://")
         silence = (chosen.silence if watched else None) or inf
         connect = _wire(

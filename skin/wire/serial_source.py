@@ -10,7 +10,7 @@ import numpy as np
 from skin.errors import InputError
 from skin.signal.calibration import Calibration, read_calibration
 from skin.wire.announcement import AnnouncementListener
-from skin.wire.conversion import UnitConversion, unit_conversion
+from skin.wire.conversion import UnitConversion, check_scale, unit_conversion
 from skin.wire.format_detection import Format
 from skin.wire.open import PortSettings, open_skin
 from skin.wire.skin import Skin
@@ -29,7 +29,7 @@ class SerialSettings:
     Attributes:
         port, baudrate, format, limits, timeout, backoff, silence: as in :func:`skin.wire.open.open_skin`.
         tare: duration of the tare, s.
-        scale: N per unit.
+        scale: N per unit; negative if values fall with force.
         calibration: calibration file.
     """
 
@@ -64,8 +64,7 @@ class SerialSource(SerialSettings):
     def __post_init__(self) -> None:
         if not self.tare >= 0:
             raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")
-        if self.scale is not None and not self.scale > 0:
-            raise InputError(f"device.scale is N per count and must be above 0, got {self.scale}")
+        check_scale(self.scale, self._known)
         PortSettings(**self._settings)  # checks them
         if self._known is not None:
             self._known.fits(self.sensors)
@@ -85,7 +84,16 @@ class SerialSource(SerialSettings):
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
         listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
         sensors = range(self.sensors)
-        return open_skin(self.port, sensors, opener=listener, reconnect=reconnect, **self._settings), listener
+        wiring = {"channels": self._known.channels if self._known else (), "polarity": self.polarity}
+        skin = open_skin(self.port, sensors, opener=listener, reconnect=reconnect, **wiring, **self._settings)
+        return skin, listener
+
+    @property
+    def polarity(self) -> Sequence[int]:
+        """1 or -1 per sensor, -1 where the value falls with force; empty: 1 for all."""
+        if self._known is not None:
+            return self._known.polarity
+        return [-1] * self.sensors if self.scale is not None and self.scale < 0 else ()
 
     def source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""

@@ -47,6 +47,7 @@ class Stats:
     lost: int = 0
     resets: int = 0
     weak: int = 0
+    invalid: int = 0
     format: str = ""
     check: str = ""
     trouble: str = ""

@@ -8,7 +8,7 @@ import binascii
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from math import isfinite
+from math import isfinite, nan
 from operator import xor
 from typing import NamedTuple
 
@@ -28,11 +28,26 @@ def xor8(data: bytes) -> int:
     return reduce(xor, data, 0)
 
 
+_SEPARATORS = (b",", b";", b"\t")
+
+INVALID = frozenset(
+    (b"", b"-", b"--", b"nan", b"inf", b"-inf", b"ovf", b"err", b"error", b"na", b"n/a", b"null", b"none")
+)
+"""Fields, in lower case, that firmware sends instead of a value that it could not read; also an empty one."""
+
+
 class Line(NamedTuple):
-    """The numbers of a line, and the kind of its checksum."""
+    """The numbers of a line, and the kind of its checksum.
+
+    Attributes:
+        fields: NaN where a field is one of ``INVALID``, or a number that is too large for a float.
+        check: kind of checksum.
+        finite: whether every field is a number.
+    """
 
     fields: list[float]
     check: Check
+    finite: bool = True
 
 
 @dataclass(frozen=True)
@@ -79,18 +94,36 @@ def parse_line(line: bytes) -> Line:
     """Parse a line without its end; fields are separated by comma, semicolon, tab or blanks.
 
     Raises:
-        FrameError: ``checksum`` is wrong or unknown, or a field is no finite ``number``.
+        FrameError: ``checksum`` is wrong or unknown, or a field is no ``number`` and not one of ``INVALID``.
     """
     body, check = _verified(line)
+    if b"_" in body:  # valid in Python's grammar only
+        raise FrameError("number")
+    words = _split(body.lstrip().rstrip(b" \r"))
     try:
-        if b"_" in body:  # valid in Python's grammar only
-            raise ValueError
-        fields = [float(field) for field in _split(body.strip())]
+        fields = [float(word) for word in words]
+    except ValueError:
+        fields = [nan]
+    if all(map(isfinite, fields)):
+        return Line(fields, check)
+    return Line([_field(word) for word in words], check, False)
+
+
+def ends_with_separator(line: bytes) -> bool:
+    """Return whether a separator ends the line: its last field is empty, or firmware always writes one."""
+    return line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r")[-1:] in _SEPARATORS
+
+
+def _field(word: bytes) -> float:
+    """Return the number of a field; NaN where it says that there is none."""
+    word = word.strip()
+    if word.lower() in INVALID:
+        return nan
+    try:
+        value = float(word)
     except ValueError:
         raise FrameError("number") from None
-    if not all(map(isfinite, fields)):
-        raise FrameError("number")
-    return Line(fields, check)
+    return value if isfinite(value) else nan
 
 
 def parse_header(line: bytes) -> Header | None:
@@ -132,7 +165,7 @@ def _checked(text: str, check: Check) -> bytes:
 
 
 def _split(body: bytes) -> list[bytes]:
-    for separator in (b",", b";", b"\t"):
+    for separator in _SEPARATORS:
         if separator in body:
             return body.removesuffix(separator).split(separator)
     return body.split()

@@ -130,7 +130,7 @@ def test_two_seconds_of_receiving_are_enough_but_a_slow_start_is_none():
         (b"3,3000,1,2,3\n", "fields"),
         (b"3,3000,1,2,3,4,5\n", "fields"),
         (b"3,3000,1,x,3,4\n", "number"),
-        (b"3,3000,1,nan,3,4\n", "number"),
+        (b"nan,3000,1,2,3,4\n", "number"),
         (b"-3,3000,1,2,3,4\n", "number"),
         (b"3.5,3000,1,2,3,4\n", "number"),
         (b"3,3000,1,2,3,4*0000\n", "checksum"),

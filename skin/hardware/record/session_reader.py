@@ -215,8 +215,10 @@ class _Reading:
     def _window(self, gesture: RecordedGesture) -> Resampled:
         about = self.stored.about
         window = Window(about.get("window", 30), about.get("rate", 10.0), self._sensors)
+        falling = self._conversion is not None and (self._conversion[1].scale < 0).any()
+        polarity = np.sign(self._conversion[1].scale) if self._conversion and falling else None
         for frame in (*self._before, *gesture.frames):
-            window.add(frame)
+            window.add(frame._replace(polarity=polarity))
         self._before.extend(gesture.frames)
         return window.since(gesture.begin)
 

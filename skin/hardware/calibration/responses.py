@@ -1,0 +1,153 @@
+"""How much every channel responds to every press, and how well a prediction explains that."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from skin.hardware.calibration import _channel
+from skin.hardware.calibration.bench_data import BenchData
+
+_STEPS = 8  # means over the loading of a press
+_BEFORE = 20  # idle frames before a press, from which its rest is taken
+_FEW = 5
+_SURE, _VISIBLE, _STEP = 6.0, 1.5, 1.5  # standard errors, noise and steps above which a channel responds
+_LIMITS = np.geomspace(0.9, 300.0, 40)  # largest prediction of a channel over its limit
+_TINY = 1e-6  # of the largest prediction: less is 0
+_STRONGER = 20.0  # times the median gain: more is no sensor's
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Responses of all channels, mean over the steps of a press while its force rises.
+
+    Attributes:
+        measured: (F, S), change against the rest before the press, in the session's unit.
+        force: (F,), of the gauge, N.
+        press: (F,), number of the press.
+        error: (S,), standard error of ``measured``.
+        responding: (S,), bool: the channel leaves its noise in at least one press.
+    """
+
+    measured: np.ndarray
+    force: np.ndarray
+    press: np.ndarray
+    error: np.ndarray
+    responding: np.ndarray
+
+    def predicted(self, each: np.ndarray) -> np.ndarray:
+        """Return true readings (F, S), N, of presses that give ``each`` (P, S) per N."""
+        return self.force[:, None] * each[self.press]
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well every channel is explained by the prediction for every sensor.
+
+    Attributes:
+        residual: (channels, sensors), share of a channel's energy that the prediction does not explain with
+            any gain and limit, without that of the noise: 0 to 1.
+        sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
+    """
+
+    residual: np.ndarray
+    sign: np.ndarray
+
+
+def collect_responses(bench: BenchData) -> Responses:
+    """Return the responses of all channels of a session, which do not depend on places or layout."""
+    raw, (force, press) = bench.session.raw, bench.applied
+    idle = np.flatnonzero(bench.idle)
+    rows, forces, numbers, counts = [], [], [], []
+    resting = _middle(raw[idle])
+    for number in range(len(bench.gauge)):
+        frames = np.flatnonzero((press == number) & bench.loading)
+        if not len(frames):
+            continue
+        before = idle[idle < frames[0]][-_BEFORE:]
+        rest = _middle(raw[before]) if len(before) >= _FEW else resting
+        rest = np.where(np.isfinite(rest), rest, resting)
+        for step in np.array_split(frames, min(_STEPS, len(frames))):
+            rows.append(_middle(raw[step]) - rest)
+            forces.append(force[step].mean())
+            numbers.append(number)
+            counts.append(len(step))
+    measured = np.nan_to_num(np.array(rows))
+    noise, step = _noise(bench, idle)
+    error = noise * math.pi / 2 * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
+    floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
+    responding = np.abs(measured).max(axis=0) > floor
+    return Responses(measured, np.array(forces), np.array(numbers), error, responding)
+
+
+def match_channels(responses: Responses, each: np.ndarray) -> Match:
+    """Compare every channel with the prediction for every sensor.
+
+    A channel reads gain times the prediction up to a limit. Both are free, and the gain may be negative; but
+    it may not exceed the median gain of the channels by a factor of 20.
+
+    Args:
+        responses: of the session.
+        each: (P, S), true readings per N of every press.
+    """
+    prediction = responses.predicted(each)
+    largest = np.abs(prediction).max(axis=0)
+    reached = largest > _TINY * largest.max(initial=0.0)
+    shape = prediction / np.where(reached, largest, 1.0)
+    energy = (responses.measured**2).sum(axis=0)
+    unit = responses.measured / np.sqrt(np.where(energy > 0, energy, 1.0))
+    best = np.zeros((unit.shape[1], shape.shape[1]))
+    slope = np.ones_like(best)
+    for limit in _LIMITS:
+        clipped = np.clip(limit * shape, -1.0, 1.0)
+        size = np.sqrt((clipped**2).sum(axis=0))
+        likeness = unit.T @ clipped / np.where(size > 0, size, 1.0)
+        better = np.abs(likeness) > np.abs(best)
+        best = np.where(better, likeness, best)
+        gain = likeness * np.sqrt(energy)[:, None] / np.where(size > 0, size, 1.0) * limit
+        slope = np.where(better, np.abs(gain) / np.where(reached, largest, 1.0), slope)
+    noise = len(responses.measured) * responses.error**2 / np.where(energy > 0, energy, np.inf)
+    residual = np.clip((1 - best**2 - noise[:, None]) / np.clip(1 - noise[:, None], 0.1, 1.0), 0.0, 1.0)
+    residual[:, ~reached] = 1.0
+    typical = slope[responses.responding, residual[responses.responding].argmin(axis=1)]
+    if len(typical):
+        residual[slope > _STRONGER * np.median(typical)] = 1.0
+    return Match(residual, np.where(best < 0, -1.0, 1.0))
+
+
+def find_polarity(responses: Responses, each: np.ndarray) -> np.ndarray:
+    """Return 1 or -1 for every channel, (S,): -1 where it falls with force at its own sensor.
+
+    A channel that does not respond has the polarity of most others.
+    """
+    signs = np.diagonal(match_channels(responses, each).sign)
+    most = -1.0 if signs[responses.responding].sum() < 0 else 1.0
+    return np.where(responses.responding, signs, most)
+
+
+def _middle(values: np.ndarray) -> np.ndarray:
+    """Return the median of each column, (S,); NaN where a column has no number."""
+    known = np.isfinite(values).any(axis=0) if len(values) else np.zeros(values.shape[1], dtype=bool)
+    middle = np.full(values.shape[1], np.nan)
+    if known.any():
+        middle[known] = np.nanmedian(values[:, known], axis=0)
+    return middle
+
+
+def _noise(bench: BenchData, idle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the noise of a frame and the step of the converter, (S,) each; 0 where there is no number."""
+    noise, step = np.zeros(bench.session.raw.shape[1]), np.zeros(bench.session.raw.shape[1])
+    for channel, values in enumerate(bench.session.raw.T):
+        quiet = idle[np.isfinite(values[idle])]
+        if len(quiet) < 10 or np.ptp(values[quiet]) == 0:
+            continue
+        step[channel] = _channel.quantum(values[np.isfinite(values)])
+        noise[channel] = _channel.idle(bench.session.time[quiet], values[quiet], step[channel]).noise
+    return noise, step
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """Return numbers in words, as ``2``, ``2 and 5`` or ``2, 5 and 7``."""
+    words = [str(number) for number in numbers]
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

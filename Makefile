@@ -9,7 +9,8 @@ PART ?= all
 FRESH ?=
 PEERS := .venv-peers
 WHEEL := .venv-wheel
-# A training of a few seconds; ignore the scores.
+# A small training: 16 s of processor time, most of them for the threshold of the alarm; ignore the scores. (What
+# needs it, wheel-check, takes minutes: it installs the wheel with all that it requires.)
 SMOKE := experiment=features simulator=naive data.gestures=400 device.test_gestures=200 evaluation.devices=0 evaluation.layouts=0
 # Marked tests to run. Empty: all.
 MARK ?= not slow

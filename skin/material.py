@@ -123,7 +123,10 @@ def _known() -> str:
 
 def _missing(name: str, young: float | None, poisson: float | None) -> str:
     need = " and ".join(key for key, value in (("young (Pa)", young), ("poisson", poisson)) if value is None)
-    mend = f"give {need}, as in {{name: {name}, young: 100e3, poisson: 0.49}}"
+    mend = (
+        f"give {need}, as in {{'name': {name!r}, 'young': 100e3, 'poisson': 0.49}} in Python "
+        f"or {{name: {name}, young: 100e3, poisson: 0.49}} on the command line"
+    )
     if _key(name) == "ecoflexgel":
         return f"EcoFlex Gel has no constants of its own: the report's measurement was unreliable; {mend}"
     return f"unknown material {name}: {_known()}; or {mend}"

@@ -16,6 +16,13 @@ _COLUMNS = (
     "at a probability of 0.5, `alarm_recall` and `false_alarm_rate` at the threshold of the alarm. `ece` is "
     "the expected calibration error."
 )
+_DRAWN = (
+    "Each gesture is measured by another device, drawn from the ranges above. `alarm_recall` and "
+    "`false_alarm_rate` are means over these devices, quiet and bad ones, with one threshold for all. They "
+    "do not compare with those of a model that is trained and tested on one quiet device. On a quiet device "
+    "this model raises fewer false alarms, and with the threshold for it (`evaluation.profile=mild`) it "
+    "finds more dangerous touches; on a bad device it finds fewer."
+)
 _NETWORK = ("representation", "model", "fusion")
 _LIMITS = (
     "Do not use it to protect people, animals or property. Nothing here is a safety function.",
@@ -44,6 +51,7 @@ def model_card(name: str, record: Mapping[str, Any], config: Mapping[str, Any]) 
         _table("Model", _model(record, config)),
         _table("Training", _training(record, config)),
         _table("Conditions", _conditions(config), "Lengths in m, forces in N, pressures in Pa, times in s."),
+        *([f"## Devices\n\n{_DRAWN}"] if _drawn(config["device"]) else []),
         _metrics(record["metrics"]),
         *(f"{key.removeprefix('cannot_')}: {why}" for key, why in _cannot(record["tags"])),
         _check(record["check"]),
@@ -86,6 +94,11 @@ def _conditions(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "device", _settings(device, "simulator", "contact", "touch", *config["data"])
     if "touch" in config:
         yield "touch", _settings(config["touch"])
+
+
+def _drawn(device: Mapping[str, Any]) -> bool:
+    """Return whether each gesture of the training is measured by a device of its own."""
+    return bool(device.get("randomise", False) or "skins" in device)
 
 
 def _settings(group: Mapping[str, Any], *without: str) -> str:

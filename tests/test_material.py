@@ -41,6 +41,7 @@ def test_any_material_can_be_given_by_its_constants():
     ("given", "says"),
     [
         ("rubber", "unknown material rubber: known materials: EcoFlex 00-30, Dragon Skin 10 Medium"),
+        ("rubber", "'name': 'rubber', 'young': 100e3, 'poisson': 0.49. in Python or .name: rubber"),
         ("EcoFlex Gel", "EcoFlex Gel has no constants of its own.*young .Pa. and poisson"),
         ({"name": "EcoFlex Gel", "young": 1e4}, "give poisson"),
         ({"name": "foam", "yuong": 1e4}, "material has no setting yuong: did you mean young[?]"),

@@ -1,9 +1,9 @@
 """
-Bounds of a fingertip
-=====================
+Local precision of a fingertip
+==============================
 
-How precisely a skin can locate a touch of 5 N, against the thickness of the skin, for regular grids of
-sensors (:doc:`/design`).
+How precisely a skin tells neighbouring touches of 5 N apart, against the thickness of the skin, for regular
+grids of sensors (:doc:`/design`).
 """
 
 from collections import defaultdict
@@ -12,8 +12,8 @@ from dataclasses import fields
 from pathlib import Path
 from tempfile import mkdtemp
 
-from skin.design.bound import Findings
 from skin.design.drawing import draw_sweep
+from skin.design.precision import Findings
 from skin.design.sweep import Step
 from skin.paths import ROOT
 

@@ -2,22 +2,24 @@
 Which skin should I build?
 ==========================
 
-``skin design`` bounds how precisely a skin can locate a fingertip, before anything is built or trained.
-This tutorial calls it from Python for four skins. :doc:`/design` explains the bound and its limits.
+``skin design`` computes how precisely a skin tells neighbouring touches apart, before anything is built or
+trained. This tutorial calls it from Python for four skins. :doc:`/design` explains this local precision.
 """
 
 from pathlib import Path
 from tempfile import mkdtemp
 
 import skin
-from skin.design.bound import Bound
-from skin.design.drawing import draw_bounds
+from skin.design.drawing import draw_precision
+from skin.design.precision import LocalPrecision
 
 # %%
 # Thickness and number of sensors
 # -------------------------------
 # The touches have a force of 5 N. A touch is blind if it raises no sensor above three standard deviations of
-# the noise. The bound is that of the standard deviation of any unbiased estimate of the place.
+# the noise. The local precision is the standard deviation of the place near the true touch, to first order.
+# It is no limit for an estimator: a touch above a single sensor can be located within a few mm, because the
+# other sensors stay silent. The local precision does not count that.
 
 
 def build(thickness: float, count: int) -> tuple[skin.Sheet, skin.Solid]:
@@ -30,13 +32,13 @@ def build(thickness: float, count: int) -> tuple[skin.Sheet, skin.Solid]:
     return body, skin.Solid(body, sensors, divisions=3)
 
 
-bound = Bound(forces=(5.0,), touches=128, margin=0.02)
-print("thickness, mm  sensors  blind, %  bound of the place, mm")
+precision = LocalPrecision(forces=(5.0,), touches=128, margin=0.02)
+print("thickness, mm  sensors  blind, %  local precision, mm")
 for count in (3, 5):
     for thickness in (0.010, 0.025):
         body, simulator = build(thickness, count)
-        (found,) = bound.find(simulator, body)
-        numbers = f"{100 * found.blind_share:8.0f}  {1e3 * found.place_m:22.1f}"
+        (found,) = precision.find(simulator, body)
+        numbers = f"{100 * found.blind_share:8.0f}  {1e3 * found.place_m:19.1f}"
         print(f"{1e3 * thickness:13g}  {count**2:7}  {numbers}")
 
 # %%
@@ -45,8 +47,9 @@ for count in (3, 5):
 #
 # Where on the skin
 # -----------------
-# The map shows the bound for a touch on each cell of the last skin. ``skin design design=place`` chooses
-# positions (:doc:`/placement`).
+# The map shows the local precision for a touch on each cell of the last skin. ``skin design design=place``
+# chooses positions (:doc:`/placement`).
 
 sensors = skin.Grid(rows=5, columns=5, depth=0.0245).sensors(body)
-figure = draw_bounds(body, sensors, {5.0: bound.maps(simulator, body)[0]}, Path(mkdtemp()) / "design.png")
+maps = {5.0: precision.maps(simulator, body)[0]}
+figure = draw_precision(body, sensors, maps, Path(mkdtemp()) / "design.png")

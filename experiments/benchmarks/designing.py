@@ -1,4 +1,4 @@
-"""How long the bound of a skin and the placement of its sensors take."""
+"""How long the local precision of a skin and the placement of its sensors take."""
 
 from functools import partial
 
@@ -7,8 +7,8 @@ from torch import Tensor
 
 from experiments.benchmarks.harness import median_seconds, training_config
 from skin.build import build_device
-from skin.design.bound import Bound
 from skin.design.placement_problem import PlacementProblem
+from skin.design.precision import LocalPrecision
 from skin.design.readings import reading_covariance
 from skin.device.base import AbstractSimulated
 from skin.touch.fingertip import Fingertip
@@ -20,13 +20,14 @@ _STEPS = (1e-6, 1e-6, 1e-6, 1e-3)  # m, m, m, N
 def measure_design(repeats: int) -> dict[str, float]:
     """Return seconds (medians) on the default sheet with ``simulator=solid``, and the share of the bound.
 
-    ``bound_relative_to_differences`` is the time of the bound relative to that of central differences.
+    ``bound_seconds`` is the time of the local precision, and ``bound_relative_to_differences`` its ratio to
+    the time of central differences. ``place_share_of_bound`` is that of the upper bound of the information.
     """
     device = build_device(training_config("simulator=solid", "touch.over_sensors=false")).simulated("design")
-    bound = Bound()
-    seconds = median_seconds(lambda: bound.find(device.model, device.body), repeats)
-    touches = bound.sample(device.body)
-    differences = median_seconds(partial(_differences, device, bound.rim, touches), repeats)
+    precision = LocalPrecision()
+    seconds = median_seconds(lambda: precision.find(device.model, device.body), repeats)
+    touches = precision.sample(device.body)
+    differences = median_seconds(partial(_differences, device, precision.rim, touches), repeats)
     found: list[dict[str, float]] = []
     placing = median_seconds(lambda: found.append(_place(device)), repeats)
     return {

@@ -90,8 +90,8 @@ def embeddings_table(found: Sequence[ProbeResult], names: Sequence[str]) -> list
 def embedding_statements(found: Sequence[ProbeResult], names: Sequence[str]) -> list[str]:
     """Return verdicts on the report's statements about pretrained embeddings (3.2.4), one line each.
 
-    A statement holds if it holds for each embedding. Agree and disagree need two standard errors over at
-    least three seeds; "chance" has a tolerance of two points.
+    A statement holds if it holds for each embedding. Agree and disagree need the margin of at least
+    three seeds; "chance" has a tolerance of two points.
     """
     groups = _groups(found)
     frame = {one.seed: _mean(one, names) for one in groups[("", FRAME)]}
@@ -136,7 +136,7 @@ def _compare(
     word = verdict(claim, difference, by=0.02)
     if difference is None:
         return word, f"{group[0].name} has one layout only ({word})"
-    spread = f" ± {200 * difference.error:.1f}" if difference.seeds > 1 else ""
+    spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
     return word, f"{group[0].name} {100 * difference.mean:+.1f}{spread} points ({word})"
 
 

@@ -7,7 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.studies.comparison import RATIOS, Paired, combine_verdicts, estimate, paired, verdict
+from experiments.studies.comparison import (
+    RATIOS,
+    Estimate,
+    Paired,
+    combine_verdicts,
+    estimate,
+    paired,
+    verdict,
+)
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
 from skin.evaluation.outcomes import decodable, decode
@@ -171,8 +179,8 @@ def _line(chosen: Mapping[str, str], trials: Sequence[Trial]) -> tuple[str, list
     return " ".join(chosen.values()), []
 
 
-def mean_and_error(trials: Sequence[Trial], metric: str) -> tuple[float, float]:
-    """Return the mean of a metric of trials and its standard error; of shares in per cent."""
+def mean_and_margin(trials: Sequence[Trial], metric: str) -> Estimate:
+    """Return the mean of a metric of trials, its standard error and its margin; of shares in per cent."""
     return estimate(values(trials, metric), values(trials, metric, "device"), by_gesture(trials, metric))
 
 

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 from hydra import compose
 
+from experiments.studies.comparison import t_quantile
 from experiments.studies.recorded_runs import Record, read_records
 from experiments.studies.runs import newest_finished, run_command
 from experiments.studies.tables import print_table
@@ -99,7 +100,8 @@ def compare(
 
     On the processor of the recorded training with the same seed, every metric but times must be equal to the
     digit. On another one rounding makes it another draw: its accuracies may differ from the mean of the
-    recorded seeds by two standard errors of that difference, ``2 sd sqrt(1 + 1/n)`` with n seeds.
+    recorded seeds by ``t sd sqrt(1 + 1/n)`` with n seeds, the margin of another draw; t is the quantile of
+    Student's distribution with n - 1 degrees of freedom.
 
     Args:
         committed: seed -> record.
@@ -115,7 +117,7 @@ def compare(
     for name in _COMPARED:
         values = [one["metrics"][name] for one in committed.values() if name in one["metrics"]]
         if len(values) > 1:
-            allowed = 2 * stdev(values) * math.sqrt(1 + 1 / len(values))
+            allowed = t_quantile(len(values)) * stdev(values) * math.sqrt(1 + 1 / len(values))
             found.append(Comparison(name, fmean(values), again.get(name, math.nan), allowed))
     return found
 

@@ -82,12 +82,12 @@ def _confusion(codes: np.ndarray) -> np.ndarray:
 
 
 def confusion_rows(codes: Mapping[str, np.ndarray]) -> list[list[str]]:
-    """Return the two kinds of errors of ``dangerous`` of each row, their difference, and its standard error.
+    """Return both kinds of errors of ``dangerous`` of each row, their difference, its error and margin.
 
     Args:
         codes: row -> outcomes of its runs, (N, B).
     """
-    lines = [["row", "safe_called_dangerous", "dangerous_called_safe", "difference", "error"]]
+    lines = [["row", "safe_called_dangerous", "dangerous_called_safe", "difference", "error", "margin"]]
     for row, each in codes.items():
         wrong = decode(each, "dangerous/accuracy", TOUCH) < 0.5
         dangerous = ~np.isnan(decode(each[0], "dangerous/alarm_recall", TOUCH))
@@ -96,7 +96,7 @@ def confusion_rows(codes: Mapping[str, np.ndarray]) -> list[list[str]]:
         over = kinds[0].mean(axis=0), kinds[1].mean(axis=0)
         found = paired(one, other, gestures=over)
         assert found is not None
-        numbers = (over[0].mean(), over[1].mean(), found.mean, found.error)
+        numbers = (over[0].mean(), over[1].mean(), found.mean, found.error, found.margin)
         lines.append([row, *(f"{number:.4f}" for number in numbers)])
     return lines
 

@@ -29,6 +29,7 @@ COLUMNS = (
     "label",
     "ours",
     "ours_error",
+    "ours_margin",
     "report",
     "device_shift",
     "unseen_layout",
@@ -62,13 +63,14 @@ class Cell:
         found = (run.data.metrics.get(metric) for run in self.runs)
         return [value for value in found if value is not None]
 
-    def error(self, metric: str) -> str:
-        """Return the standard error of a metric of ``same`` over seeds and gestures; empty if unknown."""
+    def uncertainty(self, metric: str) -> tuple[str, str]:
+        """Return error and margin of a metric of ``same`` over seeds and gestures; empty if unknown."""
         by_seed = {str(number): value for number, value in enumerate(self.values(f"same/{metric}"))}
         known = decode(np.stack(self.outcomes), metric, TOUCH) if self.outcomes else None
         if not by_seed or (known is None and len(by_seed) < 2):
-            return ""
-        return f"{estimate(by_seed, {}, None if known is None else known.mean(axis=0))[1]:.6f}"
+            return "", ""
+        _, error, margin = estimate(by_seed, {}, None if known is None else known.mean(axis=0))
+        return f"{error:.6f}", f"{margin:.6f}"
 
     def shift(self, column: str, label: str) -> str:
         """Return the mean over seeds on other devices or layouts; ``cannot`` where the row takes none."""
@@ -107,16 +109,18 @@ def result_rows(
 
     ``ours`` is the mean over seeds of the accuracy on the test gestures, or of what the alarm reaches there
     with the threshold stored with each run; ``failed`` where no run finished, empty where it is
-    undefined. ``ours_error`` is its standard error. The column ``failed`` counts the seeds that are missing,
-    ``budget`` is theirs.
+    undefined. ``ours_error`` is its standard error, ``ours_margin`` half of its 95 % interval. The column
+    ``failed`` counts the seeds that are missing, ``budget`` is theirs.
     """
     lines = []
     for cell in cells:
         for label in LABELS:
             same = cell.values(_metric("same", label))
+            error, margin = cell.uncertainty(ALARM.get(label, f"{label}/accuracy"))
             values = {
                 "ours": _number(same) if cell.runs else "failed",
-                "ours_error": cell.error(ALARM.get(label, f"{label}/accuracy")),
+                "ours_error": error,
+                "ours_margin": margin,
                 "report": _reported(report.get((cell.row, cell.simulator, label))),
                 "device_shift": cell.shift("device_shift", label),
                 "unseen_layout": cell.shift("unseen_layout", label),
@@ -183,10 +187,9 @@ def _reported(value: float | None) -> str:
 
 
 def beside(line: dict[str, str]) -> str:
-    """Return our number ± two standard errors and, in brackets, the report's."""
+    """Return our number ± its margin and, in brackets, the report's."""
     reported = percent(line["report"])
-    twice = str(2 * float(line["ours_error"])) if line["ours_error"] else ""
-    return (percent(line["ours"], twice) or "-") + (f" ({reported})" if reported else "")
+    return (percent(line["ours"], line["ours_margin"]) or "-") + (f" ({reported})" if reported else "")
 
 
 def print_results(lines: Sequence[dict[str, str]], title: str, console: Console | None = None) -> None:

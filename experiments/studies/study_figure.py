@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.studies.outcomes import UNITS, group_trials, heading, mean_and_error
+from experiments.studies.outcomes import UNITS, group_trials, heading, mean_and_margin
 from experiments.studies.study import Study
 from experiments.studies.trials import Trial
 from skin.plot.figures import COLOURS
@@ -23,7 +23,7 @@ def study_figure(study: Study, trials: Sequence[Trial]) -> Figure:
 
 
 def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
-    """Draw every trial of each variant and condition, the mean, and two standard errors.
+    """Draw every trial of each variant and condition, the mean, and its 95 % interval.
 
     Conditions have a line each, or share the line of their variant if there are several of both.
     """
@@ -42,16 +42,16 @@ def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
         apart = 0.8 * ((style + 0.5) / len(conditions) - 0.5) if shared else 0.0
         place = (variants.index(variant) if shared else number) + apart
         colour, marker = COLOURS[style % len(COLOURS)], _MARKERS[style % len(_MARKERS)]
-        mean, error = mean_and_error(each, metric)
+        mean, _, margin = mean_and_margin(each, metric)
         axis.plot(every, [place] * len(every), marker, color=colour, alpha=0.35, ms=4)
         ends = colour if shared else "black"
         label = condition or "no condition" if shared and condition not in labelled else None
         labelled.add(condition)
-        axis.errorbar(mean, place, xerr=2 * error, fmt=marker if shared else "|", color=ends, label=label,
+        axis.errorbar(mean, place, xerr=margin, fmt=marker if shared else "|", color=ends, label=label,
                       ms=4 if shared else 10, capsize=2)  # fmt: skip
     axis.set_yticks(range(len(lines)), lines, fontsize=8)
     axis.set_ylim(len(lines) - 0.5, -0.5)
-    axis.set_xlabel(f"{_label(metric)}: each run, mean and two standard errors")
+    axis.set_xlabel(f"{_label(metric)}: each run, mean and 95 % interval")
     axis.set_title(study.about, fontsize=9, wrap=True)
     if shared:
         drawn.legend(loc="outside right center", fontsize=7)
@@ -60,7 +60,7 @@ def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
 
 
 def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
-    """Draw the mean and two standard errors over the number at the end of a variant's or condition's name.
+    """Draw the mean and its 95 % interval over the number at the end of a variant's or condition's name.
 
     Names of several words before the number, as "arm grid 9", get a panel for each beginning.
     """
@@ -71,7 +71,8 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
         numbered = _NUMBERED.fullmatch(condition if single else variant)
         if numbered and any(metric in one.metrics for one in each):
             key = numbered[1], "" if single else condition
-            every[key].append((int(numbered[2]), *mean_and_error(each, metric)))
+            mean, _, margin = mean_and_margin(each, metric)
+            every[key].append((int(numbered[2]), mean, margin))
     lines = {key: points for key, points in every.items() if len(points) > 1}
     panels = list(dict.fromkeys(name.rpartition(" ")[0] for name, _ in lines)) or [""]
     drawn = Figure(figsize=(7 if len(panels) == 1 else 4 * len(panels), 4.5), layout="constrained")
@@ -80,7 +81,7 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
         _panel(axis, {(parts[2], key): points for (parts, key), points in named.items() if parts[0] == panel})
         axis.set_title(panel, fontsize=9)
         axis.set_xlabel(study.axis or "")
-    drawn.axes[0].set_ylabel(f"{_label(metric)}: mean and two standard errors")
+    drawn.axes[0].set_ylabel(f"{_label(metric)}: mean and 95 % interval")
     drawn.suptitle(study.about, fontsize=9, wrap=True)
     return drawn
 
@@ -89,10 +90,10 @@ def _panel(axis: Axes, lines: dict[tuple[str, str], list[tuple[int, float, float
     """Draw a line per name and condition; the name gives colour and marker, the condition the style."""
     names, conditions = (list(dict.fromkeys(key[part] for key in lines)) for part in (0, 1))
     for (name, condition), points in lines.items():
-        x, y, error = zip(*sorted(points), strict=True)
+        x, y, margins = zip(*sorted(points), strict=True)
         number, label = names.index(name), ", ".join(filter(None, (name, condition)))
         axis.errorbar(
-            x, y, yerr=[2 * one for one in error], label=label, ms=4, capsize=2, lw=1.2,
+            x, y, yerr=margins, label=label, ms=4, capsize=2, lw=1.2,
             color=COLOURS[number % len(COLOURS)], marker=_MARKERS[number % len(_MARKERS)],
             linestyle=_STYLES[conditions.index(condition) % len(_STYLES)],
         )  # fmt: skip

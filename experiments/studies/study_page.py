@@ -15,7 +15,7 @@ from experiments.studies.outcomes import (
     differences,
     group_trials,
     heading,
-    mean_and_error,
+    mean_and_margin,
     values,
 )
 from experiments.studies.study import Study
@@ -27,7 +27,7 @@ from skin.files import write
 
 
 def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list[str]]:
-    """Return a line per variant: mean ± two standard errors over seeds, devices and gestures, in per cent.
+    """Return a line per variant: mean ± margin over seeds, devices and gestures, in per cent.
 
     Where there are conditions, each is a column of the first metric; of a single variant, each is a line.
     """
@@ -51,7 +51,7 @@ def variants_table(trials: Sequence[Trial], metrics: Sequence[str]) -> list[list
 
 
 def differences_table(found: Sequence[Difference], metric: str) -> list[list[str]]:
-    """Return a line per difference, ± two standard errors; none without."""
+    """Return a line per difference, ± margin; none without."""
     head = ["variant", "condition", "difference", "n", "verdict"]
     unit = UNITS.get(metric, "points")
     return [
@@ -78,7 +78,7 @@ def statements_table(outcomes: Sequence[StatementResult]) -> list[list[str]]:
 
 
 def comparison_text(outcome: StatementResult) -> str:
-    """Return every comparison of a statement: the mean over paired seeds ± two standard errors."""
+    """Return every comparison of a statement: the mean over paired seeds ± margin."""
     said, several = outcome.statement, len(outcome.compared) > 1
     unit = "times" if said.claim in RATIOS else UNITS.get(said.metric, "points")
     figures: Mapping[str, str] = {name: _figure(found, unit) for name, found in outcome.compared.items()}
@@ -154,20 +154,20 @@ def _trial(trial: Trial, names: Sequence[str]) -> list[str]:
 
 
 def _cell(trials: Sequence[Trial], metric: str) -> str:
-    """Return the mean and two standard errors."""
+    """Return the mean and its margin."""
     figures = values(trials, metric)
     if not figures:
         return "cannot" if any(one.cannot for one in trials) else ""
-    mean, error = mean_and_error(trials, metric)
+    mean, _, margin = mean_and_margin(trials, metric)
     if metric in ("seconds_per_epoch", "parameters", "self_share"):
         return f"{mean:.{0 if metric == 'parameters' else 2}f}"
-    several = len(figures) > 1 or error > 0
-    return f"{mean:.1f}" + (f" ± {2 * error:.1f}" if several else "")
+    several = len(figures) > 1 or margin > 0
+    return f"{mean:.1f}" + (f" ± {margin:.1f}" if several else "")
 
 
 def _figure(found: Paired | None, unit: str) -> str:
     if found is None:
         return "no paired runs"
     sign, digits = ("" if unit == "times" else "+"), (2 if unit in ("s", "times") else 1)
-    error = "" if math.isinf(found.error) else f" ± {2 * found.error:.{digits}f}"
-    return f"{found.mean:{sign}.{digits}f}{error} {unit}".rstrip()
+    margin = "" if math.isinf(found.margin) else f" ± {found.margin:.{digits}f}"
+    return f"{found.mean:{sign}.{digits}f}{margin} {unit}".rstrip()

@@ -6,6 +6,8 @@
 Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its own with that id.
 """
 
+from collections.abc import Sequence
+
 from omegaconf import DictConfig
 
 from skin.command import command
@@ -51,9 +53,21 @@ def main(config: DictConfig) -> None:
             return
         found = evaluate(learner, device, config.evaluation, point)
         log_report(store, evaluation, found, device.task, {})
-        about = f"Run {title}, evaluated with `{' '.join(given)}`, {len(found.predictions)} gestures."
+        about = describe_evaluation(title, given, len(found.predictions))
         written = publish_evaluation(folder / f"{name}.md", found, device.task, run.info.run_name, about)
         for path in written:
             store.client.log_artifact(evaluation.info.run_id, str(path))
     print_report(found, title)
     print(*written, sep="\n")
+
+
+def describe_evaluation(title: str, given: Sequence[str], count: int) -> str:
+    """Return a sentence about an evaluation of ``count`` gestures.
+
+    Args:
+        title: of the run.
+        given: the overrides; none keep the settings of the run.
+        count: number of gestures.
+    """
+    settings = f"`{' '.join(given)}`" if given else "the settings of the run"
+    return f"Run {title}, evaluated with {settings}, {count} gestures."

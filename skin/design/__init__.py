@@ -1,1 +1,1 @@
-"""What a skin can know, and where to put its sensors."""
+"""How precisely a skin measures a touch, and where to put its sensors."""

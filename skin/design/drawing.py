@@ -1,4 +1,4 @@
-"""Tables and pictures of what a skin can know."""
+"""Tables and pictures of the local precision of a skin."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,26 +12,30 @@ from rich.table import Table
 from torch import Tensor
 
 from skin.body.base import AbstractBody
-from skin.design.bound import Findings
+from skin.design.precision import Findings
 from skin.design.sweep import Step
 from skin.plot.figures import COLOURS, MARKS, save_figure
 from skin.sensors import Sensors
 
+_NOTE = (
+    "The local precision is no limit for an estimator: above a single sensor a touch can be located within a "
+    "few mm,\nbecause the sensors that stay silent inform, too (docs/design.md)."
+)
 _WIDE = ("radius, mm", "reach, mm")  # columns without room in the table of a sweep
 
 
-def print_bounds(found: Sequence[Findings]) -> None:
+def print_precision(found: Sequence[Findings]) -> None:
     """Print one line per force; the reach is the receptive radius."""
     _print([_cells(one) for one in found])
 
 
-def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tensor], path: Path) -> Path:
-    """Draw the bound of the place on the surface for each force, with the sensors, and return the path.
+def draw_precision(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tensor], path: Path) -> Path:
+    """Draw the local precision of the place for each force, with the sensors, and return the path.
 
     Args:
         body: the skin.
         sensors: in it.
-        maps: force, N -> bound on each cell, (H, W), m.
+        maps: force, N -> standard deviation on each cell, (H, W), m.
         path: x.png.
     """
     wide = body.size[0] > 2 * body.size[1]
@@ -40,12 +44,12 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
     size = counts * (panel + np.array([0.2, 0.4])) + np.array([1.4, 0.5])
     figure = Figure(figsize=tuple(size), layout="constrained")
     axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
-    shown = {force: 1e3 * np.asarray(bound) for force, bound in maps.items()}
+    shown = {force: 1e3 * np.asarray(deviation) for force, deviation in maps.items()}
     lowest, highest = min(one.min() for one in shown.values()), max(one.max() for one in shown.values())
     scale = LogNorm(lowest, highest)
     extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
-    for axis, (force, bound) in zip(axes.flat, shown.items(), strict=True):
-        picture = axis.imshow(bound, cmap="viridis_r", norm=scale, extent=extent)
+    for axis, (force, deviation) in zip(axes.flat, shown.items(), strict=True):
+        picture = axis.imshow(deviation, cmap="viridis_r", norm=scale, extent=extent)
         x, y = 1e3 * sensors.positions[:, :2].T
         axis.plot(x, y, "o", color="white", markeredgecolor="black", markersize=4)
         axis.set_title(f"{force:g} N")
@@ -55,7 +59,7 @@ def draw_bounds(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tenso
         axis.set_ylabel("y, mm")
     steps = (1, 2, 5) if highest > 5 * lowest else range(1, 10)
     figure.colorbar(
-        picture, ax=axes, label="bound of the place, mm", format="%g", ticks=LogLocator(subs=steps)
+        picture, ax=axes, label="local precision of the place, mm", format="%g", ticks=LogLocator(subs=steps)
     ).minorticks_off()
     return save_figure(figure, path)
 
@@ -75,7 +79,9 @@ def print_sweep(steps: Sequence[Step]) -> None:
 
 
 def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
-    """Draw the bound of the place against thickness, one line per number of sensors, and return the path.
+    """Draw the local precision of the place against thickness, and return the path.
+
+    There is a line per number of sensors.
 
     Args:
         steps: with the same forces.
@@ -97,7 +103,7 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
         axis.set(title=f"{force:g} N", xlabel="thickness, mm", yscale="log")
         axis.yaxis.set_major_formatter("{x:g}")
         axis.grid(which="both", alpha=0.3)
-    axes[0].set_ylabel("bound of the place, mm")
+    axes[0].set_ylabel("local precision of the place, mm")
     axes[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return save_figure(figure, path)
 
@@ -116,7 +122,8 @@ def _cells(one: Findings) -> dict[str, str]:
 
 
 def _print(rows: Sequence[dict[str, str]]) -> None:
-    table = Table(*rows[0], title="Bounds of a fingertip (median over touches)")
+    table = Table(*rows[0], title="Local precision of a fingertip (median over touches)")
     for row in rows:
         table.add_row(*row.values())
     Console().print(table)
+    print(_NOTE)

@@ -1,9 +1,13 @@
-"""The Cramer-Rao bound: how precisely readings determine where and how hard a fingertip presses.
+"""The local precision: how precisely readings determine where and how hard a fingertip presses.
 
 With independent noise of the readings and Gaussian priors, the inverse of J' R^-1 J + P is the covariance
 of the parameters given the readings, to first order (Van Trees, Detection, Estimation, and Modulation
 Theory, 2.4). J are the derivatives of the readings, R the variances of the noise, P the inverse variances
 of the priors.
+
+This is no limit for estimators. It describes touches near the true one, and only through the slopes of the
+readings: a sensor that stays silent has no slope, yet it tells that the touch is not near it. The exact
+posterior uses that. Above a single sensor it is several times narrower.
 """
 
 from collections.abc import Iterator
@@ -95,8 +99,8 @@ def _parts(
         yield found[0], torch.stack(slopes, dim=-1)
 
 
-def covariance_bound(sensitivity: Sensitivity, noise: Noise, priors: Tensor) -> Tensor:
-    """Return the bound of the covariance of an estimate of the parameters, (B, 4, 4), m and N.
+def local_covariance(sensitivity: Sensitivity, noise: Noise, priors: Tensor) -> Tensor:
+    """Return the covariance of the parameters given the readings, to first order, (B, 4, 4), m and N.
 
     Args:
         sensitivity: of the touches.

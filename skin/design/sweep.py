@@ -1,4 +1,4 @@
-"""The bound against the thickness of the skin and the number of sensors."""
+"""The local precision against the thickness of the skin and the number of sensors."""
 
 import csv
 import sys
@@ -15,7 +15,7 @@ from rich.progress import track
 
 from skin.body.base import Layer
 from skin.build import Skin, build_skin
-from skin.design.bound import Bound, Findings
+from skin.design.precision import Findings, LocalPrecision
 from skin.errors import InputError
 from skin.files import whole
 from skin.layout.base import Footprint
@@ -52,8 +52,8 @@ class Step:
 
 @checked("design")
 @dataclass(frozen=True, kw_only=True)
-class Sweep(Bound):
-    """Computes the bound of one layer for several thicknesses and regular grids of sensors.
+class Sweep(LocalPrecision):
+    """Computes the local precision of one layer for several thicknesses and regular grids of sensors.
 
     Args:
         material: of the layer, as in ``body.layers``.

@@ -1,4 +1,7 @@
-"""The interface of simulators: differentiable maps from surface pressure to true sensor readings."""
+"""The interface of simulators: maps from surface pressure to true sensor readings.
+
+Readings are differentiable with respect to pressure and shear, not to moduli, thicknesses or positions.
+"""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple

@@ -218,14 +218,17 @@ def _ratios(body: AbstractBody, poisson: Mapping[str, float]) -> list[float]:
     names = {layer.material.name for layer in body.layers}
     if unknown := sorted(set(poisson) - names - {material.name for material in MATERIALS}):
         raise InputError(
-            f"simulator.poisson names {unknown[0]}, but the body is made of {', '.join(sorted(names))}"
+            f"poisson (simulator.poisson) names {unknown[0]}, but the body is made of "
+            f"{', '.join(sorted(names))}"
         )
     ratios = [float(poisson.get(layer.material.name, layer.material.poisson)) for layer in body.layers]
     for layer, ratio in zip(body.layers, ratios, strict=True):
         if not -1 < ratio < 0.5:
+            name = layer.material.name
             raise InputError(
-                f"{layer.material.name} has Poisson's ratio {ratio:g}, but no isotropic solid is beyond "
-                f"-1 < nu < 0.5: give simulator.poisson={{{layer.material.name}: 0.49}}, or simulator=fem"
+                f"{name} has Poisson's ratio {ratio:g}, but no isotropic solid is beyond -1 < nu < 0.5: "
+                f"in Python give poisson={{{name!r}: 0.49}} to Solid or use PlatesAndBeams; "
+                f"on the command line give 'simulator.poisson={{{name}: 0.49}}' or simulator=fem"
             )
     return ratios
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from skin.commands.evaluate import describe_evaluation
 from skin.recording_file import read_recording, write_recording
 
 SMALL = [
@@ -26,6 +27,16 @@ def metrics(folder):
         ]
     database.close()
     return [{key: value for key, value in one.items() if key.endswith("/accuracy")} for one in found]
+
+
+@pytest.mark.parametrize(
+    ("given", "settings"),
+    [([], "the settings of the run"), (["profile=rough", "device.seed=7"], "`profile=rough device.seed=7`")],
+)
+def test_the_page_says_with_what_a_run_was_evaluated(given, settings):
+    assert describe_evaluation("gru (ab12)", given, 96) == (
+        f"Run gru (ab12), evaluated with {settings}, 96 gestures."
+    )
 
 
 @pytest.fixture(scope="module")

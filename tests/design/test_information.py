@@ -1,11 +1,11 @@
-"""The bound follows from correct derivatives, and estimates reach it."""
+"""The local precision follows from correct derivatives, and estimates have it where three sensors respond."""
 
 import numpy as np
 import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.design.information import Noise, Sensitivity, covariance_bound, sensitivity
+from skin.design.information import Noise, Sensitivity, local_covariance, sensitivity
 from skin.layout.grid import Grid
 from skin.simulator.fem import PlatesAndBeams
 from skin.simulator.naive import Naive
@@ -65,7 +65,7 @@ def test_the_sensitivity_of_another_force_follows_from_that_of_one_newton():
     torch.testing.assert_close(scaled.slopes, direct.slopes)
 
 
-def test_without_a_reading_the_bound_is_the_prior_and_sensors_that_clip_tell_nothing():
+def test_without_a_reading_the_covariance_is_that_of_the_priors_and_sensors_that_clip_tell_nothing():
     priors = torch.tensor([0.03, 0.04, 0.002, 2.0], dtype=torch.float64)
     slopes = torch.ones(2, 3, 4, dtype=torch.float64)
     readings = torch.full((2, 3), 5.0, dtype=torch.float64)
@@ -73,17 +73,17 @@ def test_without_a_reading_the_bound_is_the_prior_and_sensors_that_clip_tell_not
         (Sensitivity(0 * readings, 0 * slopes), Noise(0.05)),
         (Sensitivity(readings, slopes), Noise(0.05, clip=5.0)),
     ):
-        torch.testing.assert_close(covariance_bound(none, noise, priors)[0], torch.diag(priors.square()))
+        torch.testing.assert_close(local_covariance(none, noise, priors)[0], torch.diag(priors.square()))
 
 
-def test_more_frames_and_known_gains_lower_the_bound():
+def test_more_frames_and_known_gains_lower_the_variance():
     readings = torch.ones(1, 1, dtype=torch.float64)
     slopes = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], dtype=torch.float64)
     priors = torch.tensor([1.0, 1.0, 1.0, 1e6], dtype=torch.float64)
 
     def force(**settings):
-        bound = covariance_bound(Sensitivity(readings, slopes), Noise(0.1, **settings), priors)
-        return bound[0, 3, 3].sqrt().item()
+        variances = local_covariance(Sensitivity(readings, slopes), Noise(0.1, **settings), priors)
+        return variances[0, 3, 3].sqrt().item()
 
     assert force() == pytest.approx(0.1)  # one sensor that reads the force itself
     assert force(frames=4) == pytest.approx(0.05)
@@ -120,7 +120,7 @@ def estimate(simulator, fingertip, readings, start, noise, centre, priors):
 
 
 @pytest.mark.slow
-def test_the_most_probable_place_has_the_error_of_the_bound():
+def test_the_most_probable_place_has_the_local_precision():
     """200 touches that raise three sensors above five standard deviations, four noises each."""
     body, force, draws = sheet(THICK), 20.0, 4
     sensors = Grid(5, 5, depth=0.0195).sensors(body)
@@ -132,13 +132,13 @@ def test_the_most_probable_place_has_the_error_of_the_bound():
     assert len(given) == 200
     centre = torch.tensor([0.06, 0.06, 0.008, force], dtype=torch.float64)
     priors = torch.tensor([0.12 / 12**0.5, 0.12 / 12**0.5, 0.008 / 12**0.5, force / 2], dtype=torch.float64)
-    bound = covariance_bound(felt, noise, priors).diagonal(dim1=1, dim2=2)
+    variances = local_covariance(felt, noise, priors).diagonal(dim1=1, dim2=2)
     generator = torch.Generator().manual_seed(3)
     true = given.repeat_interleave(draws, 0)
     scatter = torch.randn(len(true), len(sensors), generator=generator, dtype=torch.float64)
     readings = felt.readings.repeat_interleave(draws, 0) + scatter * noise.frame / noise.frames**0.5
     found = estimate(simulator, fingertip, readings, true, noise, centre, priors)
     error = (found - true).square().unflatten(0, (200, draws)).mean(1)
-    place = (error[:, :2].mean(1) / bound[:, :2].mean(1)).sqrt()
+    place = (error[:, :2].mean(1) / variances[:, :2].mean(1)).sqrt()
     assert 0.9 < place.median() < 1.3
-    assert 0.9 < (error[:, 3] / bound[:, 3]).sqrt().median() < 1.3
+    assert 0.9 < (error[:, 3] / variances[:, 3]).sqrt().median() < 1.3

@@ -5,8 +5,10 @@ import torch
 
 from skin.build import build_device
 from skin.config import validate_config
+from skin.device import skins
 from skin.errors import InputError
 from skin.recording import GEOMETRY
+from skin.rng import generator
 
 SMALL = (
     "device=skins", "device.count=2", "device.test_skins=1", "device.skins.length=[0.08,0.1]",
@@ -43,6 +45,28 @@ def test_test_skins_are_not_training_skins(device):
     sizes = {skin.body.size for skin in device.training_skins}
     assert not sizes & {skin.body.size for skin in device.unseen_skins}
     assert len(device.touches("test")) == 32
+
+
+def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
+    """With skin_seed=0 and data_seed=0, one stream used to do both for skin e and epoch e."""
+    fresh, used = build_device(validate_config(configured(*SMALL))), []
+
+    def noted(stream, *key):
+        used.append((stream, *key))
+        return generator(stream, *key)
+
+    monkeypatch.setattr(skins, "generator", noted)
+    assert fresh.training_skins
+    assert fresh.unseen_skins
+    defining = set(used)
+    used.clear()
+    for epoch in range(fresh.count):
+        fresh.touches("train", epoch)
+    for split in ("validation", "holdout", "test"):
+        fresh.touches(split)
+    assert len(defining) == fresh.count + fresh.test_skins
+    assert used
+    assert not defining & set(used)
 
 
 def test_a_blank_device_prepares_no_skin(configured):

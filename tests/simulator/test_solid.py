@@ -175,8 +175,16 @@ def test_what_no_solid_can_be(settings, reason):
 
 def test_the_measured_ratio_of_dragon_skin_is_refused_by_name():
     body = Sheet([0.12, 0.12], [12, 12], [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}])
-    with pytest.raises(InputError, match=r"Dragon Skin 10 Medium has Poisson's ratio 0\.54"):
+    with pytest.raises(InputError, match=r"Dragon Skin 10 Medium has Poisson's ratio 0\.54") as caught:
         solid(sensors((0.06, 0.06, 0.0)), body)
+    python, shell = (
+        "poisson={'Dragon Skin 10 Medium': 0.49}",
+        "'simulator.poisson={Dragon Skin 10 Medium: 0.49}'",
+    )
+    assert f"in Python give {python}" in str(caught.value)
+    assert f"on the command line give {shell}" in str(caught.value)
+    given = eval(python.removeprefix("poisson="))
+    assert Solid(body, sensors((0.06, 0.06, 0.005)), divisions=1, poisson=given).transfer.isfinite().all()
 
 
 def test_sensors_move_with_what_slides_over_them():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from experiments.studies.comparison import Paired, combine_verdicts, paired, verdict
+from experiments.studies.comparison import Paired, combine_verdicts, estimate, paired, verdict
 
 
 def test_a_paired_difference_is_that_of_the_paired_t_test():
@@ -19,16 +19,16 @@ def test_a_paired_difference_is_that_of_the_paired_t_test():
 def test_only_common_seeds_count():
     found = paired({"0": 3.0, "1": 5.0, "7": 99.0}, {"1": 4.0, "0": 1.0, "8": 0.0})
     # differences 2 and 1: mean 1.5, deviation 1 / sqrt 2, by sqrt 2
-    assert found == Paired(1.5, pytest.approx(0.5), 2)
+    assert found == Paired(1.5, pytest.approx(0.5), pytest.approx(12.7062 * 0.5), 2)
 
 
 def test_a_ratio_is_taken_seed_by_seed():
     found = paired({"0": 8.0, "1": 30.0}, {"0": 2.0, "1": 5.0}, ratio=True)
-    assert found == Paired(5.0, pytest.approx(1.0), 2)
+    assert found == Paired(5.0, pytest.approx(1.0), pytest.approx(12.7062), 2)
 
 
 def test_one_seed_has_no_known_error_and_none_no_difference():
-    assert paired({"0": 2.0}, {"0": 1.0}) == Paired(1.0, math.inf, 1)
+    assert paired({"0": 2.0}, {"0": 1.0}) == Paired(1.0, math.inf, math.inf, 1)
     assert paired({"0": 2.0}, {"1": 1.0}) is None
 
 
@@ -58,12 +58,12 @@ def test_one_seed_has_no_known_error_and_none_no_difference():
         ("ratio", 10, 21.0, 0.2, "disagree"),
     ],
 )
-def test_a_verdict_needs_two_standard_errors_of_room(claim, by, mean, error, said):
-    assert verdict(claim, Paired(mean, error, 3), by) == said
+def test_a_verdict_needs_the_margin_as_room(claim, by, mean, error, said):
+    assert verdict(claim, Paired(mean, error / 2, 2 * error, 3), by) == said
 
 
 def test_two_seeds_decide_nothing():
-    assert verdict("greater", Paired(50.0, 0.1, 2)) == "undecided"
+    assert verdict("greater", Paired(50.0, 0.1, 0.4, 2)) == "undecided"
     assert verdict("greater", None) == "undecided"
 
 
@@ -103,10 +103,27 @@ def test_the_error_is_that_of_repeated_comparisons(ratio):
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(means), rel=0.12)
 
 
+@pytest.mark.parametrize(("seeds", "touches"), [(1.0, 0.0), (1.0, 10.0), (0.1, 20.0)])
+def test_the_interval_of_three_seeds_covers_the_truth(seeds, touches):
+    """Monte Carlo: two standard errors of three seeds would cover 82 % where seeds differ most."""
+    random = np.random.default_rng(2)
+    covered, narrow, count = 0, 0, 2000
+    for _ in range(count):
+        by_seed = seeds * random.standard_normal((3, 1)) + touches * random.standard_normal((1, 100))
+        mean, error, margin = estimate(
+            dict(enumerate(map(float, by_seed.mean(axis=1)))), {}, by_seed.mean(axis=0)
+        )
+        covered += abs(mean) < margin
+        narrow += abs(mean) < 2 * error
+    assert 0.94 < covered / count < 0.99
+    if not touches:
+        assert narrow / count < 0.85
+
+
 def test_a_variant_on_one_device_is_compared_with_one_on_several():
     seeds = {"0": 3.0, "1": 3.0}, {"0": 1.0, "1": 1.0}
     found = paired(*seeds, across=({"1": 2.0, "2": 3.0, "3": 4.0}, {"": 1.0}))
-    assert found == Paired(2.0, pytest.approx(3**-0.5), 2)
+    assert found == Paired(2.0, pytest.approx(3**-0.5), pytest.approx(4.30265 * 3**-0.5), 2)
 
 
 def test_gestures_that_are_not_the_same_are_not_paired():

@@ -30,12 +30,12 @@ def test_the_same_processor_gives_the_same_digits_except_of_times():
     assert (same.holds, other.holds, none.holds) == (True, False, False)
 
 
-@pytest.mark.parametrize(("again", "holds"), [(0.82, True), (0.775, True), (0.77, False), (0.87, False)])
-def test_another_processor_gives_a_value_within_two_standard_errors(again, holds):
-    """Of seeds at 80, 82 and 84 %: mean 82, deviation 2, error of the difference 2 sqrt(4 / 3) = 2.31."""
+@pytest.mark.parametrize(("again", "holds"), [(0.82, True), (0.73, True), (0.72, False), (0.93, False)])
+def test_another_processor_gives_a_value_within_the_margin_of_another_draw(again, holds):
+    """Of seeds at 80, 82 and 84 %: mean 82, deviation 2, error 2 sqrt(4 / 3) = 2.31; 4.303 of them."""
     (found,) = compare(COMMITTED, 0, {OVERALL: again}, "elsewhere")
     assert found.recorded == pytest.approx(0.82)
-    assert found.allowed == pytest.approx(2 * 0.02 * math.sqrt(4 / 3))
+    assert found.allowed == pytest.approx(4.3027 * 0.02 * math.sqrt(4 / 3), rel=1e-4)
     assert found.holds == holds
 
 

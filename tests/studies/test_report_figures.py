@@ -34,3 +34,6 @@ def test_the_two_kinds_of_errors_are_shares_of_safe_and_of_dangerous_gestures():
     # of which one is wrong in half of the runs.
     runs, safe, missed = 0.25**2 / 2 / 2, 0.25 * 8 / 7 / 8, 3 / 64 * 4 / 3 / 4
     assert float(found["error"]) == pytest.approx(math.sqrt(runs + safe + missed), abs=1e-4)
+    # Student's quantiles of two runs, of eight and of four gestures.
+    margin = math.sqrt(12.706**2 * runs + 2.3646**2 * safe + 3.1824**2 * missed)
+    assert float(found["margin"]) == pytest.approx(margin, abs=1e-4)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.studies.comparison import Uncertainty, estimate
 from experiments.studies.results_table import (
     COLUMNS,
     LABELS,
@@ -62,7 +63,24 @@ def test_the_error_is_also_one_over_gestures():
     (line, *_) = result_rows([cell], {})
     # a standard deviation of 0.125 sqrt(100 / 99) over gestures, by sqrt(100)
     assert (line["ours"], line["ours_error"]) == ("0.875000", "0.012563")
+    # 1.984 standard errors with 99 degrees of freedom
     assert display_rows(result_rows([cell], {}))[1][2] == "87.5 ± 2.5"
+    assert float(line["ours_margin"]) == pytest.approx(1.98422 * 0.012563, abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("row", "overall", "gestures", "margin"),
+    [
+        ("features", (0.9685624987, 0.9671875089, 0.9696249962), 0.0011895, 0.0038),
+        ("sequence_image", (0.8360625058, 0.8515625, 0.8457499892), 0.0020765, 0.0199),
+    ],
+)
+def test_the_margin_of_three_published_seeds_is_that_of_students_distribution(row, overall, gestures, margin):
+    """The published rows: features had ± 0.28 points with two standard errors, sequence_image ± 1.0."""
+    found = estimate(dict(enumerate(overall)), {}, None)
+    assert found.margin == pytest.approx(4.30265 * found.error, rel=1e-5)
+    both = Uncertainty.together(Uncertainty(*found[1:]), Uncertainty(gestures, 1.9606 * gestures))
+    assert both.margin == pytest.approx(margin, abs=5e-5), row
 
 
 def test_a_number_is_rounded_once():
@@ -131,7 +149,7 @@ def test_what_is_undefined_is_no_number():
 
 def test_a_person_reads_ours_with_the_reports_in_brackets(lines):
     head, first, _ = display_rows(list(lines.values()))
-    assert dict(zip(head, first, strict=True))["overall"] == "85.0 ± 10.0 (73.2)"
+    assert dict(zip(head, first, strict=True))["overall"] == "85.0 ± 63.5 (73.2)"
 
 
 def test_csv_has_the_columns_and_reads_back(lines):
@@ -168,7 +186,10 @@ def test_a_table_tells_its_budget():
 
 def test_no_number_is_cut_on_a_narrow_terminal():
     line = dict.fromkeys(COLUMNS, "0.1234") | {"row": "temporal_graph", "simulator": "naive", "failed": "0"}
-    lines = [line | {"label": label, "ours_error": "0.0123", "report": "0.85"} for label in LABELS]
+    lines = [
+        line | {"label": label, "ours_error": "0.0123", "ours_margin": "0.0246", "report": "0.85"}
+        for label in LABELS
+    ]
     seen = io.StringIO()
     print_results(lines, "title", Console(file=seen, width=40))
     text = seen.getvalue()
@@ -176,7 +197,7 @@ def test_no_number_is_cut_on_a_narrow_terminal():
     assert "12.3 ± 2.5 (85.0)" in text
     assert all(head in text for head in ("overall", "recall", "false", "dev.", "lay."))
     # A temporal_graph of one seed, with the report's number, fits 80 columns.
-    line |= {"ours_error": ""}
+    line |= {"ours_error": "", "ours_margin": ""}
     seen = io.StringIO()
     print_results([line | {"label": label} for label in LABELS], "title", Console(file=seen, width=40))
     assert max(map(len, seen.getvalue().splitlines())) <= 80

@@ -57,7 +57,7 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name):
     assert set(study.metrics) <= known or study.measure is not None  # which may have metrics of its own
     for said in study.statements:
         assert set(said.metric.split(" - ")) <= known
-        assert verdict(said.claim, Paired(0.0, 1e9, 3), said.by) == "undecided"
+        assert verdict(said.claim, Paired(0.0, 1e9, 4e9, 3), said.by) == "undecided"
         assert said.by > 0 or said.claim in ("greater", "less")
         assert bool(said.others) != (said.level is not None)
         lines = [

@@ -50,12 +50,12 @@ SAID = Statement("x", "one [sic] beats the other", {"weight": "weight=exp"}, MET
 STUDY = Study("edges", "edges", [0, 1], metrics=METRICS, statements=[SAID])
 
 
-def test_a_line_per_variant_with_mean_and_two_standard_errors():
+def test_a_line_per_variant_with_mean_and_margin():
     head, first, second, third = variants_table(FOUND, METRICS)
-    # of 0.8 and 0.9: mean 0.85, sample deviation 0.1 / sqrt 2, by sqrt 2, twice
+    # of 0.8 and 0.9: mean 0.85, standard error 0.05, and 12.71 of them with one degree of freedom
     assert dict(zip(head, first, strict=True)) | {"big": "", "dynamic": "", "press": "", "dangerous": ""} == {
         "variant": "weight=exp",
-        "overall": "85.0 ± 10.0",
+        "overall": "85.0 ± 63.5",
         "big": "",
         "dynamic": "",
         "press": "",
@@ -81,32 +81,40 @@ def under_conditions(name):
 def test_conditions_are_columns_of_the_first_metric():
     assert variants_table([*under_conditions("a"), *under_conditions("b")], METRICS) == [
         ["variant", "none", "5 dead"],
-        ["a", "85.0 ± 10.0", "85.0 ± 10.0"],
-        ["b", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["a", "85.0 ± 63.5", "85.0 ± 63.5"],
+        ["b", "85.0 ± 63.5", "85.0 ± 63.5"],
     ]
 
 
 def test_conditions_of_a_single_variant_are_lines_of_all_metrics():
     assert variants_table(under_conditions("a"), METRICS[:2]) == [
         ["a", "overall", "big"],
-        ["none", "85.0 ± 10.0", "85.0 ± 10.0"],
-        ["5 dead", "85.0 ± 10.0", "85.0 ± 10.0"],
+        ["none", "85.0 ± 63.5", "85.0 ± 63.5"],
+        ["5 dead", "85.0 ± 63.5", "85.0 ± 63.5"],
     ]
 
 
 @pytest.mark.parametrize(
     ("fields", "compared", "text"),
     [
-        ({}, {"a": Paired(12.345, 0.678, 3)}, "+12.3 ± 1.4 points"),
+        ({}, {"a": Paired(12.345, 0.3, 1.356, 3)}, "+12.3 ± 1.4 points"),
         (
             {},
-            {"a": Paired(-1.0, 0.5, 3), "b": Paired(2.0, 0.5, 3)},
+            {"a": Paired(-1.0, 0.5, 1.0, 3), "b": Paired(2.0, 0.5, 1.0, 3)},
             "-1.0 ± 1.0 points (a); +2.0 ± 1.0 points (b)",
         ),
-        ({}, {"a": Paired(1.0, float("inf"), 1)}, "+1.0 points"),
+        ({}, {"a": Paired(1.0, float("inf"), float("inf"), 1)}, "+1.0 points"),
         ({}, {"a": None}, "no paired runs"),
-        ({"metric": "seconds_per_epoch", "claim": "less"}, {"a": Paired(-0.12, 0.01, 3)}, "-0.12 ± 0.02 s"),
-        ({"metric": "seconds_per_epoch", "claim": "ratio"}, {"a": Paired(4.44, 0.1, 3)}, "4.44 ± 0.20 times"),
+        (
+            {"metric": "seconds_per_epoch", "claim": "less"},
+            {"a": Paired(-0.12, 0.01, 0.02, 3)},
+            "-0.12 ± 0.02 s",
+        ),
+        (
+            {"metric": "seconds_per_epoch", "claim": "ratio"},
+            {"a": Paired(4.44, 0.1, 0.2, 3)},
+            "4.44 ± 0.20 times",
+        ),
     ],
 )
 def test_what_was_measured_has_its_unit(fields, compared, text):
@@ -124,7 +132,7 @@ def test_files_and_terminal_say_the_same(tmp_path):
     text = console.file.getvalue()
     assert all(
         part in text
-        for part in ("85.0 ± 10.0", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
+        for part in ("85.0 ± 63.5", "105621", "weight=stiffness (1 failed)", "[sic]", "undecided")
     )
     assert "…" not in text  # a narrow terminal cuts no number short
     read = list(csv.DictReader((tmp_path / "study_edges.csv").read_text().splitlines()))

@@ -12,14 +12,16 @@ SMALL = (
 
 
 @pytest.mark.slow
-def test_the_bounds_of_nine_sensors(run, tmp_path):
+def test_the_local_precision_of_nine_sensors(run, tmp_path):
     done = run(tmp_path, *SMALL, "simulator=solid", "simulator.divisions=2", "out=x", store=False)
     assert done.returncode == 0, done.stderr
-    assert "Bounds of a fingertip" in done.stdout
+    assert "Local precision of a fingertip" in done.stdout
+    assert "no limit for an estimator" in done.stdout
+    assert "bound" not in done.stdout.lower()
     found = json.loads((tmp_path / "x" / "design.json").read_text())
     assert found["sensors"] == 9
     assert found["settings"]["noise_N"] == 0.05
-    weak, middle, strong = found["bounds"]
+    weak, middle, strong = found["precision"]
     assert [one["force_N"] for one in (weak, middle, strong)] == [1, 5, 20]
     prior = (0.24**2 / 24 + 0.08**2 / 24) ** 0.5  # the root of the mean of both variances
     for name, most in {"place_m": prior, "radius_m": 0.008 / 12**0.5, "force_relative": 0.5}.items():
@@ -29,10 +31,10 @@ def test_the_bounds_of_nine_sensors(run, tmp_path):
     assert (tmp_path / "x" / "design.png").stat().st_size > 10_000
 
 
-def test_a_skin_without_mechanics_has_a_bound_too(run, tmp_path):
+def test_a_skin_without_mechanics_has_a_precision_too(run, tmp_path):
     done = run(tmp_path, *SMALL, "simulator=naive", "out=x", store=False)
     assert done.returncode == 0, done.stderr
-    weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["bounds"]
+    weak, _, strong = json.loads((tmp_path / "x" / "design.json").read_text())["precision"]
     # A touch beside every sensor's cell raises none, however hard it is.
     assert 0.5 < strong["blind_share"] <= weak["blind_share"] < 1
 

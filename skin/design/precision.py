@@ -1,4 +1,8 @@
-"""What a skin can know of a fingertip: the Cramer-Rao bound, blind touches and the receptive radius."""
+"""The local precision of a skin for fingertips, blind touches and the receptive radius.
+
+The local precision describes touches near the true one. It is no limit for estimators
+(:mod:`skin.design.information`).
+"""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +19,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.build import build_skin
-from skin.design.information import Noise, Sensitivity, covariance_bound, sensitivity
+from skin.design.information import Noise, Sensitivity, local_covariance, sensitivity
 from skin.errors import InputError
 from skin.files import json_text, write
 from skin.settings import RISING, checked
@@ -33,15 +37,15 @@ Lengths = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
 
 @dataclass(frozen=True)
 class Findings:
-    """What is known of touches with one force; bounds are standard deviations.
+    """Local precision of touches with one force, as standard deviations.
 
     Attributes:
         force_N: of the touches.
         blind_share: touches that raise no sensor above three standard deviations of the noise of a frame.
-        place_m: bound of the place, the root of the mean variance along x and y, median over touches.
+        place_m: of the place, the root of the mean variance along x and y, median over touches.
         place_90_m: its 90 % quantile.
-        radius_m: median bound of the radius.
-        force_relative: median bound of the force, as a share of it.
+        radius_m: of the radius, median over touches.
+        force_relative: of the force, as a share of it, median over touches.
         receptive_radius_m: radius of the disc with the area over which a touch raises a sensor above three
             standard deviations, median over sensors.
     """
@@ -57,8 +61,8 @@ class Findings:
 
 @checked("design")
 @dataclass(frozen=True, kw_only=True)
-class Bound:
-    """Bounds how precisely a skin locates fingertips and measures their force.
+class LocalPrecision:
+    """Computes how precisely readings determine place, radius and force of fingertips, to first order.
 
     Touches are spread evenly over places, at least ``margin`` from the edges, and over radii (Halton points).
     The priors are the standard deviations of a uniform distribution over the surface and over the radii, and
@@ -94,18 +98,19 @@ class Bound:
         Raises:
             InputError: a skin that cannot be built, or a margin that leaves no place.
         """
-        from skin.design.drawing import draw_bounds, print_bounds
+        from skin.design.drawing import draw_precision, print_precision
 
         skin = build_skin(config)
         simulator = skin.simulator(skin.body, skin.sensors)
         found = self.find(simulator, skin.body)
         maps = dict(zip(self.forces, self.maps(simulator, skin.body), strict=True))
-        print_bounds(found)
+        print_precision(found)
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
-        about = {"sensors": len(skin.sensors), "settings": settings, "bounds": [asdict(one) for one in found]}
+        lines = [asdict(one) for one in found]
+        about = {"sensors": len(skin.sensors), "settings": settings, "precision": lines}
         print(
             write(json_text(about), folder / "design.json"),
-            draw_bounds(skin.body, skin.sensors, maps, folder / "design.png"),
+            draw_precision(skin.body, skin.sensors, maps, folder / "design.png"),
             sep="\n",
         )
 
@@ -121,7 +126,7 @@ class Bound:
         return [self._findings(felt.of_force(force), force, body, area) for force in self.forces]
 
     def _findings(self, felt: Sensitivity, force: float, body: AbstractBody, area: float) -> Findings:
-        place, radius, relative = self._bounds(felt, force, body)
+        place, radius, relative = self._deviations(felt, force, body)
         raised = self._noise.felt(felt.readings)
         reach = (raised.double().mean(0) * area / math.pi).sqrt()
         numbers = (
@@ -134,9 +139,11 @@ class Bound:
         )
         return Findings(force, *map(float, numbers))
 
-    def _bounds(self, felt: Sensitivity, force: float, body: AbstractBody) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the bounds of place, m, radius, m, and force, relative; each (B,)."""
-        covariance = covariance_bound(felt, self._noise, self.priors(force, body))
+    def _deviations(
+        self, felt: Sensitivity, force: float, body: AbstractBody
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the standard deviations of place, m, radius, m, and force, relative; each (B,)."""
+        covariance = local_covariance(felt, self._noise, self.priors(force, body))
         variances = covariance.diagonal(dim1=1, dim2=2)
         return variances[:, :2].mean(1).sqrt(), variances[:, 2].sqrt(), variances[:, 3].sqrt() / force
 
@@ -170,11 +177,11 @@ class Bound:
         return width, height
 
     def maps(self, simulator: AbstractSimulator, body: AbstractBody) -> Tensor:
-        """Return the bound of the place for a touch of mean radius on each cell, (forces, H, W), m."""
+        """Return the local precision of the place on each cell, for the mean radius, (forces, H, W), m."""
         x, y = ((torch.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
         down, across = torch.meshgrid(y, x, indexing="ij")
         rest = torch.tensor([sum(self.radii) / 2, 1.0]).expand(across.numel(), 2)
         touches = torch.cat([torch.stack([across, down], -1).flatten(0, 1), rest], dim=1)
         felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
-        places = [self._bounds(felt.of_force(force), force, body)[0] for force in self.forces]
+        places = [self._deviations(felt.of_force(force), force, body)[0] for force in self.forces]
         return torch.stack(places).unflatten(1, body.shape)

@@ -137,7 +137,9 @@ def load_run(
         raise to_input_error(error) or error from error
 
 
-def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig) -> Trained:
+def load_trained(
+    store: Store, run: Run, config: DictConfig, stored: DictConfig, choose: bool = True
+) -> Trained:
     """Load a finished run with its weights.
 
     Args:
@@ -145,6 +147,7 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
         run: a finished training.
         config: its configuration, changed as :func:`skin.run_overrides.apply_overrides` does.
         stored: its configuration without changes.
+        choose: the threshold of its alarm for single windows; False: it has none, or another is chosen.
 
     Raises:
         InputError: its weights do not fit the configuration.
@@ -155,8 +158,10 @@ def load_trained(store: Store, run: Run, config: DictConfig, stored: DictConfig)
         data = build_data(config, device.blank())
     load_learner(store, run, learner, data)
     known = data.example
-    point = None if "skins" in config.device else choose_for_skin(learner, stored, config)
-    point = point or load_operating_point(run, learner, stored, config.evaluation)
+    point = None
+    if choose:
+        point = None if "skins" in config.device else choose_for_skin(learner, stored, config)
+        point = point or load_operating_point(run, learner, stored, config.evaluation)
     return Trained(device, learner, known.readings.shape[1], known.positions, known.rate, point)
 
 

@@ -16,7 +16,7 @@ error_messages fingerprint labels rng material model sensor_dynamics sensors sou
 config recording body gesture_measures server shard
 command
 files recording_metadata layout summary plausibility outbox
-recording_file touch tracking
+recording_file touch tracking array_cache
 simulator data_set
 contact sensor_geometry skin_distribution
 signal

@@ -51,7 +51,12 @@ def measure_onnx_latency(frames: int = 1000, row: str = ROW, model: str | None =
         exported = ExportedModel(path)
         about = exported.metadata
         engine = Engine(
-            exported.probabilities, about.task, len(about.positions), about.window, about.rate, Detection(_TOUCH)
+            exported.probabilities,
+            about.task,
+            len(about.positions),
+            about.window,
+            about.rate,
+            Detection(_TOUCH),
         )
         found = time_verdicts(device, engine, frames)
         return found | {"start_s": _start(path, len(about.positions))}

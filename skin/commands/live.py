@@ -11,6 +11,7 @@ device= the simulator of the run is used: no hardware is needed. Ctrl-C stops.
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +52,7 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> No
 
     from skin.hardware.live.display import Display, DisplayInfo
     from skin.hardware.live.loop import LiveLoop
+    from skin.hardware.live.watched import check_settings
     from skin.interrupt import ends_on_signal
 
     messages = Console(stderr=True, highlight=False)
@@ -59,24 +61,25 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> No
         from skin.hardware.live.watched import watch_model
 
         check_overrides(config.run, config, given)
-        watched = watch_model(config.run, plain(config)["device"], live, messages.print)
+        device = plain(config)["device"]
+        watch = partial(watch_model, config.run, device, live, messages.print)
     else:
         from skin.console import quiet
         from skin.hardware.live.trained_run import watch_run
 
         quiet()
-        watched = watch_run(config, live, messages.print, given)
+        watch = partial(watch_run, config, live, messages.print, given)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
-        # Opened last, because frames arrive from now on.
-        source = watched.open()
-        skin = open_.enter_context(source.skin)
+        watched = watch(opened=open_)
+        source = watched.source
         display = Display(
             DisplayInfo(watched.title, source.name, watched.positions, watched.size, live.top, watched.span)
         )
         for text in _views(display, config, live, open_):
             messages.print(text)
-        session = LiveLoop(skin, source.tare, watched.engine, display)
+        before = partial(check_settings, watched, live.selftest, messages.print)
+        session = LiveLoop(source.skin, source.tare, watched.settings.build(), display, before)
         open_.callback(lambda: messages.print(f"{session.verdicts} verdicts, {session.line}"))
         session.run(config.seconds)
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from skin.array_cache import folder
 from skin.device._cost import CHANNELS, SOURCE, Captures, read_captures
 from skin.errors import InputError
 from skin.files import whole
 from skin.safe_loading import load_npz
-from skin.simulator._store import folder
 
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 1

@@ -177,6 +177,13 @@ class AbstractSimulated(AbstractDevice):
         """Return touches that belong to no split."""
 
     @abstractmethod
+    def press_readings(self) -> Tensor:
+        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor.
+
+        Row i is of a disc of even pressure around sensor i.
+        """
+
+    @abstractmethod
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the touches of a split, or the whole budget, with the applied force and the parameters.
 

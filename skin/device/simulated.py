@@ -39,6 +39,7 @@ from skin.wire.source import Source
 
 _BATCH = 1024
 _FEW = 10  # gestures
+_DISC = 0.03  # share of the sheet under a press: small, and larger than any footprint
 
 
 @dataclass(kw_only=True, eq=False)
@@ -166,6 +167,18 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def fresh_touches(self, count: int) -> Touches:
         """Return touches that belong to no split, for choosing a threshold after the training."""
         return self.draw(Stream.ALARM, count, self.data_seed)
+
+    @torch.no_grad()
+    def press_readings(self) -> Tensor:
+        """Return the true readings (S, S), N, of a press at the limit of ``dangerous`` on each sensor."""
+        (width, height), footprint = self.size, np.hypot(*self.sensors.footprint)
+        radius = max(np.sqrt(_DISC * width * height / np.pi), footprint / 2)
+        rows, columns = self.body.shape
+        y, x = np.indices((rows, columns)) + 0.5
+        places = np.stack([x * width / columns, y * height / rows])
+        away = self.true_sensors.positions[:, :2, None, None] - places
+        discs = torch.from_numpy(np.hypot(*away.swapaxes(0, 1)) <= radius).float()
+        return self.model(self.sampler.settings.thresholds.pressure * discs).readings
 
     def draw(self, stream: Stream, count: int, *key: int) -> Touches:
         """Return touches of a stream of randomness at a key."""

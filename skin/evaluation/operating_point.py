@@ -38,6 +38,8 @@ class OperatingPoint:
         seed: of the fresh gestures on which it was chosen; None: it was chosen on a validation split.
         dangerous: number of dangerous gestures among those on which it was chosen.
         found: how many of them raise the alarm.
+        rate: of the device, Hz, where the threshold was chosen for the alarm of the live view, which judges
+            many windows of a touch; None: it was chosen for one window of each gesture.
     """
 
     threshold: float
@@ -47,6 +49,7 @@ class OperatingPoint:
     seed: int | None
     dangerous: int = 0
     found: int = 0
+    rate: float | None = None
 
     @classmethod
     def default(cls, target: float) -> "OperatingPoint":
@@ -75,7 +78,8 @@ class OperatingPoint:
         if not self.safe:
             return f"{wanted}: not chosen on any gestures, its false-alarm rate is unknown"
         kind = "safe validation" if self.seed is None else "fresh safe"
-        text = f"{wanted}, chosen on {self.safe} {kind} gestures for {100 * self.target:g} % false alarms"
+        what = "gestures" if self.rate is None else f"touches at {self.rate:.3g} Hz"
+        text = f"{wanted}, chosen on {self.safe} {kind} {what} for {100 * self.target:g} % false alarms"
         if self.dangerous:
             text += f", finds {100 * self.found / self.dangerous:.1f} % of {self.dangerous} dangerous ones"
         return text

@@ -1,6 +1,6 @@
-"""The alarm of a touch: the highest score of the decisions that the live view makes while it lasts."""
+"""The alarm of a touch, as the live view raises it: highest score of the decisions while the touch lasts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -10,18 +10,25 @@ from torch import Tensor
 from torch.nn.functional import max_pool1d, pad
 
 from skin.device.base import AbstractSimulated
+from skin.evaluation.operating_point import LABEL, OperatingPoint, lowest_threshold
+from skin.labels import TOUCH
 from skin.recording import Touches
 from skin.rng import Stream, generator
-from skin.signal.decisions import DECISIONS, RELEASE, as_press, held_frames
+from skin.signal.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown
 from skin.signal.device_sampling import between_frames, draw_constants
+from skin.touch.movie import Movie
 from skin.touch.sampler import balanced
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from skin.evaluation.report import Predictor
 
-_BATCH = 64  # touches
-_WINDOWS = 512  # windows that are classified at once
-_AFTER = 1.0  # s simulated behind the window of a touch
+SAFE = 2000
+"""Safe touches on which a threshold is chosen: where 2 % are wanted, the rate is then 1.4 to 2.7 % (95 %)."""
+_BATCH = 50  # touches
+_WINDOWS = 500  # windows that are classified at once
+_AFTER = 1.0  # s that are simulated behind the window of a touch
 
 
 @dataclass(frozen=True)
@@ -29,116 +36,157 @@ class Watching:
     """How a live view watches a skin.
 
     Attributes:
-        rate: of the device, Hz, rounded to a multiple of the model's.
+        rate: of the device, Hz.
         contact: N above the baseline that count as contact.
         longest: s, longest touch of the training.
-        patience: consecutive decisions that raise the alarm together.
+        patience: s for which decisions must be dangerous before the alarm is raised.
+        column: of ``dangerous`` among the labels of the learner.
+        aligned: a device at the model's rate gives the frames of the model, as the simulator does; otherwise
+            it reads at any phase of their intervals.
     """
 
     rate: float
     contact: float
     longest: float
-    patience: int = 1
-    tail: float = RELEASE
+    patience: float
+    column: int
+    aligned: bool = False
+
+    def decisions(self, rate: float) -> int:
+        """Return how many decisions in a row raise the alarm, for a device of ``rate``, Hz."""
+        return max(1, ceil(self.patience * min(DECISIONS, rate) - 1e-6))
 
 
 @torch.inference_mode()
-def touch_scores(
-    learner: "Predictor", device: AbstractSimulated, watching: Watching, count: int, seed: int
-) -> tuple[Tensor, Tensor]:
-    """Return the highest probability of ``dangerous`` among the decisions of each touch.
+def choose_for_touches(
+    learner: "Predictor",
+    device: AbstractSimulated,
+    watching: Watching,
+    target: float,
+    count: int = SAFE,
+    track: "Callable[[Iterable[int]], Iterable[int]]" = iter,
+) -> OperatingPoint:
+    """Return the threshold at which a share of safe touches raises the alarm of the live view.
 
     Args:
         learner: trained.
         device: simulates and measures the touches; with ``randomise``, each with another device.
         watching: how they are watched.
-        count: B, number of touches, balanced over the labels.
-        seed: of the touches.
-
-    Returns:
-        scores (B,), 0 for a touch without contact, and labels (B, L).
+        target: largest share of safe touches that raise the alarm.
+        count: number of safe touches.
+        track: wraps the batches to show progress.
     """
-    scores, labels = list[Tensor](), list[Tensor]()
-    wanted = balanced(count, generator(Stream.ALARM, seed, 1))
-    for number, first in enumerate(range(0, count, _BATCH)):
-        batch = wanted[first : first + _BATCH]
-        draw = generator(Stream.ALARM, seed, 2, number)
-        movie = device.replace(padded=False).sampler.sample(len(batch), draw, batch)
-        force = device.model.respond(movie, displacement=False).readings
-        windows, touch = decision_windows(device, force, watching, draw)
-        chances = _chances(learner, device, windows)
-        best = torch.zeros(len(batch)).scatter_reduce(0, touch, chances, "amax")
-        scores.append(best)
-        labels.append(movie.labels)
-    return torch.cat(scores), torch.cat(labels)
+    wanted = balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
+    safe = wanted[~wanted[:, TOUCH.names.index(LABEL)]][:count]
+    scores = touch_scores(learner, device, watching, safe, device.data_seed, track)
+    point = OperatingPoint(lowest_threshold(scores, target), target, len(scores), 0, device.data_seed)
+    return replace(point, raised=int(point.alarm(scores).sum()))
 
 
-def decision_windows(
-    device: AbstractSimulated, force: Tensor, watching: Watching, draw: np.random.Generator
-) -> tuple[tuple[Tensor, Tensor], Tensor]:
-    """Return the windows on which the live view decides while touches last.
+@torch.inference_mode()
+def touch_scores(
+    learner: "Predictor",
+    device: AbstractSimulated,
+    watching: Watching,
+    wanted: np.ndarray,
+    seed: int,
+    track: "Callable[[Iterable[int]], Iterable[int]]" = iter,
+) -> Tensor:
+    """Return the score of each touch: it raises the alarm at thresholds below.
 
     Args:
-        device: measures the touches.
-        force: (B, T, S), true readings, N, at the model's rate; the touch begins with the first frame.
-        watching: how they are watched.
-        draw: source of the device, its noise, and when it reads.
+        learner, device, watching: as in :func:`choose_for_touches`.
+        wanted: (B, 4), bool, labels of the touches.
+        seed: of the touches and their devices.
+        track: as there.
 
     Returns:
-        readings (W, T, S), N, and valid (W, T, S); the touch (W,) of each, as an index.
+        (B,), the largest over the decisions of the smallest probability of ``dangerous`` among as many
+        decisions in a row as the patience needs; 0 without contact.
     """
-    batch, window, sensors = force.shape
-    ratio = max(1, round(watching.rate / device.model_rate))
-    rate, after = ratio * device.model_rate, ceil(_AFTER * device.model_rate)
-    imperfection = device.imperfection
-    padded = pad(force, (0, 0, window, after))
-    phase = draw.random(batch)
-    fine = between_frames(padded, device.model_rate, rate, phase)
-    gestures = batch if getattr(device, "randomise", False) else None
-    from dataclasses import replace
+    device = device.replace(padded=False, stream=False)
+    scores = list[Tensor]()
+    for first in track(range(0, len(wanted), _BATCH)):
+        batch, draw = wanted[first : first + _BATCH], generator(Stream.ALARM, seed, 2, first)
+        movie = device.sampler.sample(len(batch), draw, batch)
+        readings, valid, contact = _decision_windows(device, movie, watching, draw)
+        chances = torch.zeros(contact.shape)
+        chances[contact] = _chances(
+            learner, device, watching, readings[contact], valid[contact.nonzero()[:, 0]]
+        )
+        row = watching.decisions(_rate(device, watching))
+        least = -max_pool1d(-pad(chances, (row - 1, 0)), row, 1) if row > 1 else chances
+        scores.append(least.amax(dim=1))
+    return torch.cat(scores)
 
-    imperfection = replace(imperfection, rate=rate)
-    constants = draw_constants(imperfection, sensors, device.model_rate, draw, gestures)
-    readings, valid, _ = imperfection.apply(fine, constants, draw)
-    valid = valid[:, 0]
-    highest = max_pool1d(
-        readings.transpose(1, 2), ratio, 1
-    )  # [..., f]: of the interval that ends at f + ratio
-    # Decisions at the first frame after each tick of a grid that has any phase relative to the touch.
-    step = max(1.0, rate / DECISIONS)
-    ends = [
-        np.arange(window * ratio + step * draw.random(), fine.shape[1] - 1, step).astype(int)
-        for _ in range(batch)
-    ]
-    fewest = min(map(len, ends))
-    end = torch.from_numpy(np.stack([row[:fewest] for row in ends]))  # (B, J)
-    back = ratio * torch.arange(window - 1, -1, -1)
-    place = end[:, :, None] - back - (ratio - 1)  # (B, J, T)
-    row = torch.arange(batch)[:, None, None]
-    windows = highest.transpose(1, 2)[row, place]  # (B, J, T, S)
-    recent = max(1, ceil(watching.tail * device.model_rate - 1e-9))
+
+def _rate(device: AbstractSimulated, watching: Watching) -> float:
+    """Return the rate of the device, rounded to a multiple of the model's, Hz."""
+    return max(1, round(watching.rate / device.model_rate)) * device.model_rate
+
+
+def _decision_windows(
+    device: AbstractSimulated, movie: Movie, watching: Watching, draw: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the windows (B, J, T, S), N, of J decisions about each touch, as the model sees them.
+
+    Returns:
+        windows; valid (B, S); contact (B, J), whether something touches the skin at each decision.
+    """
+    readings, valid = _measured(device, movie, watching, draw)
+    rate, window = _rate(device, watching), device.window
+    ratio = round(rate / device.model_rate)
+    # Each place holds the maximum over the interval of the model that begins there.
+    highest = max_pool1d(readings.transpose(1, 2), ratio, 1).transpose(1, 2)
+    end = _decided(readings.shape, ratio * window, max(1.0, rate / DECISIONS), draw)
+    place = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
+    windows = highest[torch.arange(len(end))[:, None, None], place]
     risen = (windows >= watching.contact) & valid[:, None, None]
-    contact = risen[:, :, -recent:].any(dim=3).any(dim=2)  # (B, J)
-    c3 = risen[:, :, -3:].any(dim=3).any(dim=2)
+    recent = max(1, ceil(RELEASE * device.model_rate - 1e-9))
+    contact = risen[:, :, -recent:].flatten(2).any(dim=2)
     held = held_frames(watching.longest, device.model_rate, window)
-    begun = torch.where(contact, end, 10**9).amin(dim=1, keepdim=True)
-    lasted = (end - begun) / rate + 1 / device.model_rate
-    long = c3 & (lasted * device.model_rate > held + 4)
-    touch, decision = contact.nonzero(as_tuple=True)
-    chosen = windows[touch, decision].clone()
-    late = long[touch, decision].nonzero().flatten().tolist()
-    idle = windows[:, 0]
-    for number in late:
-        chosen[number] = torch.from_numpy(as_press(idle[touch[number]].numpy(), chosen[number].numpy(), held))
-    mask = valid[touch][:, None].expand(chosen.shape)
-    return (chosen * mask, mask), touch
+    begun = torch.where(contact, end, torch.iinfo(end.dtype).max).amin(dim=1, keepdim=True)
+    lasted = (end - begun) / ratio + 1
+    for touch, decision in (contact & (lasted > longest_shown(held, recent, window))).nonzero().tolist():
+        shown = as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
+        windows[touch, decision] = torch.from_numpy(shown)
+    return windows * valid[:, None, None], valid, contact
 
 
-def _chances(learner: "Predictor", device: AbstractSimulated, windows: tuple[Tensor, Tensor]) -> Tensor:
+def _measured(
+    device: AbstractSimulated, movie: Movie, watching: Watching, draw: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
+    force = device.model.respond(movie, displacement=False).readings
+    before, after = device.window, ceil(_AFTER * device.model_rate)
+    padded, rate = pad(force, (0, 0, before, after)), _rate(device, watching)
+    if rate > device.model_rate or not watching.aligned:
+        padded = between_frames(padded, device.model_rate, rate, draw.random(len(padded)))
+    imperfection = replace(device.imperfection, rate=rate)
+    gestures = len(padded) if getattr(device, "randomise", False) else None
+    constants = draw_constants(imperfection, padded.shape[2], device.model_rate, draw, gestures)
+    # A drift is 0 where the touch begins, as in other gestures: the live view follows it without contact.
+    time = torch.arange(padded.shape[1]) / rate - before / device.model_rate
+    readings, valid, _ = imperfection.apply(padded, constants, draw, time)
+    return readings, valid[:, 0]
+
+
+def _decided(shape: torch.Size, first: int, step: float, draw: np.random.Generator) -> Tensor:
+    """Return the frames at which it is decided about each touch, (B, J): the ticks have any phase to it."""
+    begin = first - 1 + step * draw.random(shape[0])
+    count = int((shape[1] - first - step) / step)
+    ends = np.floor(begin[:, None] + step * np.arange(count)).astype(np.int64)
+    return torch.from_numpy(ends)
+
+
+def _chances(
+    learner: "Predictor", device: AbstractSimulated, watching: Watching, readings: Tensor, valid: Tensor
+) -> Tensor:
+    """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
     positions = torch.from_numpy(device.sensors.positions).float()
-    column = device.task.names.index("dangerous")
+    mask = valid[:, None].expand_as(readings)
     parts = [
-        learner.probabilities(Touches(readings, valid, positions, None, device.model_rate))[:, column]
-        for readings, valid in zip(*(part.split(_WINDOWS) for part in windows), strict=True)
+        learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, watching.column]
+        for part in zip(readings.split(_WINDOWS), mask.split(_WINDOWS), strict=True)
     ]
-    return torch.cat(parts) if parts else torch.zeros(0)
+    return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

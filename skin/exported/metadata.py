@@ -40,6 +40,9 @@ class ModelMetadata:
         longest: s, longest touch of the training.
         skin: settings of the body, the layout, the simulator, the touches and the evaluation that the network
             was exported with; None if unknown, as in files of earlier versions.
+        thresholds: rate of a device, Hz -> threshold at which safe touches raise the alarm of the live view
+            as seldom as wanted; None: only ``threshold``, chosen for single windows.
+        presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor; None if unknown.
     """
 
     run: str
@@ -59,6 +62,8 @@ class ModelMetadata:
     learned: bool
     longest: Annotated[float, Gt(0)]
     skin: dict[str, Any] | None = None
+    thresholds: dict[str, float] | None = None
+    presses: list[list[float]] | None = None
 
     @property
     def task(self) -> Task:

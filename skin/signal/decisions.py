@@ -1,4 +1,4 @@
-"""When the alarm is decided, and which window it is decided on: shared by the live view and its simulation."""
+"""When the alarm is decided, and on which window: shared by the live view and its simulation."""
 
 import numpy as np
 
@@ -18,6 +18,20 @@ def held_frames(longest: float, rate: float, window: int) -> int:
         window: T, frames.
     """
     return min(max(1, round(longest * rate)), max(1, window - 2))
+
+
+def longest_shown(held: int, recent: int, window: int) -> int:
+    """Return the frames of a contact up to which the model sees its window as it is.
+
+    A touch as long as the longest of the training lies across one more interval, and its contact ends some
+    frames later.
+
+    Args:
+        held: as :func:`held_frames` gives it.
+        recent: frames without a rise that end a contact.
+        window: T, frames.
+    """
+    return min(held + recent + 1, max(1, window - 2))
 
 
 def as_press(idle: np.ndarray, present: np.ndarray, held: int) -> np.ndarray:

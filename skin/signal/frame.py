@@ -58,7 +58,7 @@ class StreamClock:
         self._latest: float | None = None
 
     def __call__(self, frame: Frame) -> float:
-        """Return the time of a frame, s: the device's clock, shifted by the host's time between two segments."""
+        """Return the time of a frame, s: the device's clock, with the host's time between two segments."""
         if frame.segment != self._segment and self._latest is not None:
             self._shift = self._latest + max(frame.t_host - self._host, 0.0) - frame.t
         self._segment, self._host = frame.segment, frame.t_host

@@ -164,7 +164,11 @@ class Imperfection(ImperfectionSettings):
         return values | {"idle": generator.standard_normal(shape)}
 
     def apply(
-        self, readings: Tensor, constants: Constants, generator: np.random.Generator
+        self,
+        readings: Tensor,
+        constants: Constants,
+        generator: np.random.Generator,
+        time: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the readings of the device, with masks of valid and of saturated ones.
 
@@ -172,13 +176,14 @@ class Imperfection(ImperfectionSettings):
             readings: (B, T, S), true readings, N.
             constants: of this device.
             generator: source of the noise.
+            time: of every frame, (T,), s, at which the drift has come; None: at ``rate`` from 0.
 
         Returns:
             readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
         """
         constants = constants.to(readings.device)
         dead = constants.dead.expand(readings.shape)
-        output, saturated = self._measure(readings, constants, generator)
+        output, saturated = self._measure(readings, constants, generator, time)
         return output.masked_fill(dead, 0.0), ~dead, saturated & ~dead
 
     def raw(

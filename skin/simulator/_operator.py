@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from skin import array_cache
 from skin.body._memory import require_memory
 from skin.sensors import Sensors
-from skin.simulator import _store
 from skin.simulator._assembly import Structure
 from skin.simulator._factors import factorised
 
@@ -88,11 +88,11 @@ def cached(structure: Structure, sensors: Sensors, folder: Path) -> Operator:
         "positions": sensors.positions.tolist(),
         "footprint": sensors.footprint,
     }
-    key = _store.hashed(content, _SOURCES)
+    key = array_cache.hashed(content, _SOURCES)
     shape = (len(sensors), body.cells[0] * body.cells[1])
     shapes = {field.name: shape for field in fields(Operator)}
     path = folder / f"operator-{key}.npz"
-    return Operator(**_store.kept(path, key, shapes, lambda: vars(build(structure, sensors))))
+    return Operator(**array_cache.kept(path, key, shapes, lambda: vars(build(structure, sensors))))
 
 
 def _bytes(structure: Structure, sensors: int) -> float:

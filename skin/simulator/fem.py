@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from skin.array_cache import folder
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.sensors import Sensors
 from skin.settings import checked
 from skin.simulator._assembly import Constraint, Structure
 from skin.simulator._operator import Operator, cached
-from skin.simulator._store import folder
 from skin.simulator._strain import largest, squeeze
 from skin.simulator.base import AbstractSimulator, Response, flatten
 

@@ -11,12 +11,12 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
+from skin import array_cache
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.material import MATERIALS
 from skin.sensors import Sensors
 from skin.settings import checked
-from skin.simulator import _store
 from skin.simulator._elastic import Elastic
 from skin.simulator._footprint import quadrature
 from skin.simulator._hexahedra import Hexahedra
@@ -70,8 +70,8 @@ class Solid(AbstractSimulator):
         super().__init__()
         self.shape, self._area = body.shape, float(np.prod(body.cell))
         self._mesh, self._divisions = hexahedra(body, divisions, poisson or {}), divisions
-        self._folder = _store.folder(cache)
-        self._key = _store.hashed(_content(body, self._mesh), _SOURCES)
+        self._folder = array_cache.folder(cache)
+        self._key = array_cache.hashed(_content(body, self._mesh), _SOURCES)
         rows = self._operator(sensors)
         # (3, rows, cells) -> a pressure's cells times this gives all rows for each axis of the load.
         self.register_buffer("transfer", torch.from_numpy(rows.transpose(0, 2, 1).copy()).float())
@@ -161,14 +161,14 @@ class Solid(AbstractSimulator):
             "normals": sensors.normals.tolist(),
             "footprint": sensors.footprint,
         }
-        key = _store.hashed(about, _SOURCES)
+        key = array_cache.hashed(about, _SOURCES)
         shape = (3, 5 * len(sensors), self.shape[0] * self.shape[1])
 
         def build() -> dict[str, np.ndarray]:
             rows = sp.vstack([reading_rows(self._mesh, sensors), *_motions(self._mesh, sensors)]).tocsr()
             return {"rows": self._elastic.transfer(rows)}
 
-        return _store.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
+        return array_cache.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
 
 
 def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) -> Hexahedra:

@@ -1,5 +1,6 @@
 """State of each channel: ok, saturated (valid, at its limit), stuck, dead, or impossible (out of range)."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,33 @@ _SILENT = 5.0  # s without any change
 _LIVELY = 1.0  # s within which most channels change, if their noise can be seen at all
 _BELOW = 0.01  # share of the range below 0 that an offset explains
 _FAR = 20  # smallest steps of a channel: more than its noise ranges over
+
+
+@dataclass(frozen=True)
+class RawRange:
+    """Values that a device can send.
+
+    Attributes:
+        least, most: of a channel; None: unknown.
+        whole: it sends whole numbers.
+        limits: at which a channel is saturated.
+    """
+
+    least: float | None = None
+    most: float | None = None
+    whole: bool = False
+    limits: Limits = (None, None)
+
+    @property
+    def known(self) -> bool:
+        """Whether the scale can be checked: too large or too small a force would leave the range."""
+        return self.most is not None
+
+    def rounded(self, values: np.ndarray) -> np.ndarray:
+        """Return values as the device would send them."""
+        least = -np.inf if self.least is None else self.least
+        most = np.inf if self.most is None else self.most
+        return np.clip(np.round(values) if self.whole else values, least, most)
 
 
 class ChannelHealth:

@@ -98,7 +98,8 @@ class SerialSource(SerialSettings):
     def source(self) -> Source:
         """Open the port as a stream of frames; wait for an unplugged skin."""
         skin, _ = self.open(reconnect=True)
-        return Source(str(self.port), skin, self.taring(skin))
+        limits = None if self.limits is None else (self.limits[0], self.limits[1])
+        return Source(str(self.port), skin, self.taring(skin), limits)
 
     def taring(self, skin: Skin) -> Tare:
         """Return the tare of an open skin."""

@@ -28,7 +28,7 @@ _AT_LIMIT = 0.5  # share of the time at its limit from which a channel cannot be
 FROZEN = 5.0
 """s without a change after which readings are frozen."""
 EXPECTED = 20
-"""Changes of any channel that noise alone would have caused in that time: without one, readings are frozen."""
+"""Changes of any channel that noise would have caused in that time: without one, readings are frozen."""
 
 
 class Tare:

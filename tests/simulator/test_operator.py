@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skin.array_cache import folder as cache_folder
 from skin.body.sheet import Sheet
 from skin.sensors import Sensors
 from skin.simulator import _operator
 from skin.simulator._assembly import Structure
 from skin.simulator._operator import build, cached
-from skin.simulator._store import folder as cache_folder
 
 ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}
 STRUCTURE = Structure(Sheet([0.04, 0.03], [4, 3], [ECOFLEX]))

@@ -1,8 +1,8 @@
 """Classify a stream of frames, without input or output."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import floor
+from dataclasses import dataclass, fields
+from math import ceil, floor
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from skin.hardware.live.verdict import Debounce, DebounceSettings, Verdict
 from skin.labels import Task
 from skin.settings import checked
 from skin.signal.contact_detection import DRIFT, ContactDetector
-from skin.signal.decisions import DECISIONS, as_press, held_frames
+from skin.signal.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown
 from skin.signal.frame import Frame, StreamClock
 from skin.signal.resampling import Window
 from skin.wire.conversion import UnitConversion
@@ -45,6 +45,28 @@ class Detection:
     drift: NonNegativeFloat = DRIFT
     learned: bool = False
     longest: float = 2.0
+
+
+@dataclass(frozen=True)
+class EngineSettings:
+    """What an :class:`Engine` is built from.
+
+    Attributes:
+        classify, task, sensors, frames, rate, detection, patience, presses: as there.
+    """
+
+    classify: Classify
+    task: Task
+    sensors: int
+    frames: int
+    rate: float
+    detection: Detection
+    patience: DebounceSettings
+    presses: np.ndarray | None = None
+
+    def build(self) -> "Engine":
+        """Return a new engine."""
+        return Engine(**{entry.name: getattr(self, entry.name) for entry in fields(self)})
 
 
 class _Decision(NamedTuple):
@@ -94,8 +116,8 @@ class Engine:
         rate: of the training, Hz.
         detection: settings of the contact detection.
         patience: settings of debouncing.
-        responds: (S, S), bool: whether a dangerous touch on sensor i makes sensor j rise above the threshold;
-            None: each sensor feels what is on itself.
+        presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor: where no valid
+            one rises by the threshold, the place is unknown. None: each sensor feels what is on itself.
 
     Attributes:
         alarm: the latest verdict was dangerous, and the contact has not ended.
@@ -110,7 +132,7 @@ class Engine:
         rate: float,
         detection: Detection,
         patience: DebounceSettings | None = None,
-        responds: np.ndarray | None = None,
+        presses: np.ndarray | None = None,
     ) -> None:
         self.window = Window(frames, rate, sensors)
         self.task = task
@@ -118,8 +140,10 @@ class Engine:
         self._patience = patience or DebounceSettings()
         self._contact = ContactDetector(sensors, rate, detection.threshold, detection.drift)
         self._held = held_frames(detection.longest, rate, frames)
+        self._shown = longest_shown(self._held, ceil(RELEASE * rate - 1e-9), frames)
         self._above = 0.5 if self._patience.above is None else self._patience.above
-        self._responds = np.eye(sensors, dtype=bool) if responds is None else responds.astype(bool)
+        itself = np.eye(sensors, dtype=bool)
+        self._responds = itself if presses is None else itself | (presses >= detection.threshold)
         self._clock, self._freshness = StreamClock(), _Freshness(sensors)
         self._segment: int | None = None
         self._latest: tuple[Frame, float] | None = None
@@ -215,7 +239,7 @@ class Engine:
         self, readings: np.ndarray, valid: np.ndarray, lasted: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the window (T, S) as the model sees it, during a contact of ``lasted`` s."""
-        if lasted * self.window.rate <= self._held:
+        if lasted * self.window.rate <= self._shown:
             return readings, valid
         idle, known = self._idle
         return as_press(idle, readings, self._held), as_press(known, valid, self._held)

@@ -1,5 +1,6 @@
 """Build an engine from a finished run."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.evaluation.report import Predictor
 from skin.exported.metadata import ModelMetadata
-from skin.hardware.live.engine import Classify, Detection, Engine
+from skin.hardware.live.engine import Classify, Detection, Engine, EngineSettings
 from skin.hardware.live.verdict import DebounceSettings
 from skin.recording import Touches
 from skin.signal.contact_detection import DRIFT
@@ -23,10 +24,32 @@ _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
 
 
+def nominal_settings(of: Trained, above: float | None = None) -> EngineSettings:
+    """Return the settings of the engine of a run that it brings itself.
+
+    Args:
+        of: the run.
+        above: threshold of its alarm; None: 0.5.
+
+    Raises:
+        InputError: the device of the run has no streams on which a contact threshold could be tuned.
+    """
+    return EngineSettings(
+        window_classifier(of.learner, of.positions, of.rate),
+        of.device.task,
+        len(of.positions),
+        of.window,
+        of.rate,
+        _detection(of, None),
+        DebounceSettings(above=above),
+        press_readings(of),
+    )
+
+
 def make_engine(
     of: Trained, patience: DebounceSettings, touch: float | None = None, drift: float = 600 * DRIFT
 ) -> Engine:
-    """Return the engine of a run.
+    """Return the engine of a run with its own threshold.
 
     Args:
         of: the run.
@@ -43,16 +66,15 @@ def make_engine(
         if of.point.silent:
             raise InputError(f"{of.point.warning()}: give live.patience.above=0.5, or train another run")
         patience = replace(patience, above=of.point.threshold)
+    shape = len(of.positions), of.window, of.rate
     classify = window_classifier(of.learner, of.positions, of.rate)
-    return Engine(
-        classify,
-        of.device.task,
-        len(of.positions),
-        of.window,
-        of.rate,
-        _detection(of, touch, drift),
-        patience,
-    )
+    detection = _detection(of, touch, drift)
+    return Engine(classify, of.device.task, *shape, detection, patience, press_readings(of))
+
+
+def press_readings(of: Trained) -> np.ndarray | None:
+    """Return the readings (S, S), N, of a press at the limit on each sensor; None: nothing is simulated."""
+    return None if of.device.reference is None else of.device.reference.press_readings().double().numpy()
 
 
 def window_classifier(learner: Predictor, positions: Tensor, rate: float) -> Classify:
@@ -72,7 +94,13 @@ def window_classifier(learner: Predictor, positions: Tensor, rate: float) -> Cla
     return classify
 
 
-def describe(of: Trained, run: str, title: str, touch: float | None = None) -> ModelMetadata:
+def describe(
+    of: Trained,
+    run: str,
+    title: str,
+    touch: float | None = None,
+    thresholds: Mapping[float, float] | None = None,
+) -> ModelMetadata:
     """Return the description of a run for an exported file.
 
     Args:
@@ -80,11 +108,12 @@ def describe(of: Trained, run: str, title: str, touch: float | None = None) -> M
         run: its id.
         title: its name.
         touch: as in :func:`make_engine`.
+        thresholds: rate of a device, Hz -> threshold of the alarm; None: that of ``of`` only.
 
     Raises:
         InputError: as in :func:`make_engine`.
     """
-    task, detection = of.device.task, _detection(of, touch)
+    task, detection, presses = of.device.task, _detection(of, touch), press_readings(of)
     return ModelMetadata(
         run=run,
         title=title,
@@ -102,16 +131,18 @@ def describe(of: Trained, run: str, title: str, touch: float | None = None) -> M
         contact=detection.threshold,
         learned=detection.learned,
         longest=detection.longest,
+        thresholds={f"{rate:g}": value for rate, value in thresholds.items()} if thresholds else None,
+        presses=None if presses is None else presses.round(4).tolist(),
     )
 
 
 def _detection(of: Trained, touch: float | None, drift: float = 600 * DRIFT) -> Detection:
     learned = touch is None and of.device.task.gate is not None
     least = _tuned(of.device, learned) if touch is None else touch
-    return Detection(least, drift / 600, learned, _longest(of))
+    return Detection(least, drift / 600, learned, longest_touch(of))
 
 
-def _longest(of: Trained) -> float:
+def longest_touch(of: Trained) -> float:
     """Return the longest touch that a run was trained on, s; two thirds of its window if unknown."""
     if of.device.reference is not None:
         return of.device.reference.sampler.settings.press[1]

@@ -21,6 +21,7 @@ class LiveSettings:
         drift: N in ten minutes that the baseline may follow without touch.
         verdicts: where JSON lines go: ``stdout``, or a TCP port, 0: any free one; None: nowhere.
         log: file to which alarms are appended; None: no log.
+        selftest: whether simulated dangerous touches must raise the alarm at the start.
         patience: settings of debouncing.
     """
 
@@ -30,6 +31,7 @@ class LiveSettings:
     drift: Annotated[float, Ge(0)]
     verdicts: Literal["stdout"] | Annotated[int, Ge(0), Le(65535)] | None
     log: str | None
+    selftest: bool
     patience: DebounceSettings
 
     @classmethod

@@ -28,8 +28,8 @@ _DELAYS = 2000  # verdicts for the percentile of the delay
 class LiveLoop:
     """Classifies the frames of a skin until the recording ends, the time is over, a view closes, or Ctrl-C.
 
-    What it decides depends on the frames alone (:class:`skin.hardware.live.engine.Engine`), not on the load of
-    the computer, which can only delay it.
+    What it decides depends on the frames alone (:class:`skin.hardware.live.engine.Engine`); the load of the
+    computer can only delay it.
 
     Args:
         skin: open.

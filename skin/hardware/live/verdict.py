@@ -10,7 +10,6 @@ from pydantic import NonNegativeFloat
 from skin.labels import OPPOSITE
 from skin.settings import checked
 
-
 State = Literal["touch", "no touch", "unknown"]
 _NAMED = 3  # sensors
 
@@ -59,7 +58,7 @@ class Verdict:
 
     @property
     def state(self) -> State:
-        """``touch``; ``unknown`` where a dangerous touch could not be felt at some sensor; or ``no touch``."""
+        """``touch``; ``unknown``, where a dangerous touch on a sensor could not be felt; or ``no touch``."""
         return "touch" if self.touched else "unknown" if self.unknown else "no touch"
 
     @property
@@ -92,8 +91,8 @@ class DebounceSettings:
 
     Attributes:
         label: of any label but ``dangerous``, and of touch.
-        alarm: of ``dangerous`` before it is shown; more than 0.03 s would delay the alarm beyond 50 ms after
-            the frame.
+        alarm: of ``dangerous`` before it is shown: two decisions of a device of 20 Hz or more. One alone
+            would raise several times as many false alarms; more than 0.1 s would come too late.
         calm: without ``dangerous`` before the alarm is removed.
         above: probability above which a touch is dangerous; None: the threshold stored with the run.
 
@@ -102,7 +101,7 @@ class DebounceSettings:
     """
 
     label: NonNegativeFloat = 0.15
-    alarm: Annotated[float, Ge(0), Le(0.03)] = 0.02
+    alarm: Annotated[float, Ge(0), Le(0.1)] = 0.1
     calm: NonNegativeFloat = 2.0
     above: Annotated[float, Gt(0), Lt(1)] | None = None
 

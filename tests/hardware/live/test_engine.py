@@ -35,11 +35,11 @@ def frame(t, values, segment=0, valid=None, **more):
     return Frame(None, t, t, values, np.ones(len(values), bool) if valid is None else valid, segment, **more)
 
 
-def engine(window=5, rate=10.0, sensors=4, task=TOUCH, threshold=0.5, longest=2.0, responds=None, **patience):
+def engine(window=5, rate=10.0, sensors=4, task=TOUCH, threshold=0.5, longest=2.0, presses=None, **patience):
     detection = Detection(threshold, learned=task.gate is not None, longest=longest)
     loud = Loud()
     classify = window_classifier(loud, torch.zeros(sensors, 3), rate)
-    subject = Engine(classify, task, sensors, window, rate, detection, DebounceSettings(**patience), responds)
+    subject = Engine(classify, task, sensors, window, rate, detection, DebounceSettings(**patience), presses)
     subject.loud = loud
     return subject
 
@@ -162,9 +162,9 @@ def test_masked_sensors_and_gaps_are_told():
 
 
 def test_a_place_is_known_where_another_sensor_responds():
-    responds = np.eye(4, dtype=bool)
-    responds[1, 2] = True
-    subject = engine(responds=responds)
+    presses = 5.0 * np.eye(4)
+    presses[1, 2], presses[3, 2] = 0.6, 0.4
+    subject = engine(presses=presses)
     frames = [frame(n / 100, np.zeros(4), valid=np.array([True, False, True, False])) for n in range(60)]
     verdict = subject.push(frames, PLAIN)[-1]
     assert (verdict.masked, verdict.unknown, verdict.state) == ((1, 3), (3,), "unknown")

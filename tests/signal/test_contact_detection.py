@@ -92,7 +92,9 @@ def test_a_sensor_that_fails_in_a_contact_does_not_end_it():
     valid[60:160, 1] = False
     said = follow(contact, force, valid=valid)
     assert all(said[40:160])
-    assert not any(said[164:])
+    # Valid again, it must be at rest for a second.
+    assert all(said[160:168])
+    assert not any(said[171:])
 
 
 def test_a_new_tare_ends_a_contact():

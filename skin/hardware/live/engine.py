@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from math import ceil, floor
+from math import ceil, floor, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +83,7 @@ class _Decision(NamedTuple):
         masked: sensors without a valid reading now.
         unknown: sensors at which a dangerous touch could not be felt.
         below: sensors that read below their rest.
+        last: the stream is interrupted behind it.
     """
 
     frame: Frame
@@ -96,6 +97,7 @@ class _Decision(NamedTuple):
     masked: tuple[int, ...]
     unknown: tuple[int, ...]
     below: tuple[int, ...]
+    last: bool
 
 
 class Engine:
@@ -193,7 +195,7 @@ class Engine:
         time, due = self._clock(frame), list[_Decision]()
         if self._interrupted(frame, time):
             # What came last before the interruption would be forgotten undecided.
-            due += self._decide(conversion)
+            due += self._decide(conversion, last=True)
             self.window.clear()
         self._segment, self._latest, self._decided = frame.segment, (frame, time), False
         self.window.add(frame._replace(t=time, segment=0))
@@ -209,7 +211,7 @@ class Engine:
             return False
         return frame.segment != self._segment or time - self._latest[1] > max(_GAP, 3 * self.window.period)
 
-    def _decide(self, conversion: UnitConversion | None) -> list[_Decision]:
+    def _decide(self, conversion: UnitConversion | None, last: bool = False) -> list[_Decision]:
         """Return the decision on the window that ends with the latest frame; none without a conversion."""
         seen = self.window.read(partial=True)
         if self._decided or conversion is None or seen is None or self._latest is None:
@@ -219,11 +221,13 @@ class Engine:
         readings, valid = conversion(seen.values, seen.valid)
         if conversion.noise is not None:
             self._contact.noise = conversion.noise
+        valid = valid & ~self._freshness.stuck
         below = self._contact.falls(readings, valid)
-        valid = valid & ~below & ~self._freshness.stuck
-        readings = np.where(valid, readings, 0.0).astype(np.float32)
         contact = self._contact.update(readings, valid, time)
         risen = bool(self._contact.rises(readings, valid).any())
+        # To the model a sensor below its rest is as one without a reading.
+        valid = valid & ~below
+        readings = np.where(valid, readings, 0.0).astype(np.float32)
         # Unknown history counts as the rest of the sensors that are valid now.
         readings[: seen.before] = self._contact.baseline
         valid[: seen.before] = valid[seen.before :].any(axis=0)
@@ -233,7 +237,7 @@ class Engine:
         which = ~valid[-1], ~self._responds[:, valid[-1]].any(axis=1), below[-1]
         sensors = (tuple(np.flatnonzero(part).tolist()) for part in which)
         shown = self._presented(readings, valid, lasted or 0.0)
-        return [_Decision(frame, time, *shown, contact, risen, lasted, seen.gap, *sensors)]
+        return [_Decision(frame, time, *shown, contact, risen, lasted, seen.gap, *sensors, last)]
 
     def _presented(
         self, readings: np.ndarray, valid: np.ndarray, lasted: float
@@ -288,6 +292,8 @@ class Engine:
         chance = chances.get("dangerous", 0.0)
         # A NaN probability must not make a touch safe.
         dangerous = touched and not chance <= self._above
+        # No second decision can follow the last one before an interruption.
+        period = inf if decision.last and dangerous else period
         raised = self._labels["dangerous"](dangerous, decision.time, period)
         self.alarm = raised or (self.alarm and decision.contact)
         self._peak_probability = max(self._peak_probability, chance) if self.alarm else 0.0

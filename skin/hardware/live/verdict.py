@@ -66,13 +66,10 @@ class Verdict:
         """Where the state is unknown and why, in words; empty where it is known everywhere."""
         if not self.unknown:
             return ""
-        text = f"unknown near {sensor_list(self.unknown)}, without a valid reading"
+        text = f"unknown near {sensor_list(self.unknown)}"
         if self.below:
-            text += (
-                f"; {sensor_list(self.below)} below rest: broken wire, values that fall with force "
-                "(device.scale below 0), or a tare under load"
-            )
-        return text
+            return f"{text}, below rest: a broken wire, device.scale of the wrong sign, or a tare under load"
+        return f"{text}, without a valid reading"
 
     def words(self) -> list[tuple[str, float]]:
         """Return the predicted classes, each with its probability; empty without touch."""

@@ -6,6 +6,7 @@ import re
 import urllib.error
 import urllib.request
 from base64 import b64decode
+from dataclasses import replace
 from threading import Thread
 from time import monotonic, sleep
 
@@ -109,7 +110,7 @@ def test_where_output_is_no_terminal_a_line_tells_each_change(tmp_path):
             subject.set_verdict(verdict, "" if verdict else "taking the baseline: do not touch")
             sleep(0.3)
     said = (tmp_path / "said").read_text().splitlines()
-    assert said[-2:] == ["taking the baseline", "DANGEROUS: small dangerous"]
+    assert said[-2:] == ["unknown: taking the baseline", "DANGEROUS: small dangerous"]
 
 
 def test_the_terminal_shows_the_alarm_and_the_probability():
@@ -201,9 +202,9 @@ def test_the_page_asks_for_a_tare_and_another_site_cannot():
     subject = display()
     with web.serve_page(subject, 0) as address:
         for headers, code in (({}, 403), ({"Origin": "http://evil.example"}, 403), ({"X-Skin": "tare"}, 204)):
-            assert not subject.tare.is_set()
+            assert subject.take_tare() == ""
             assert posted(f"{address}/tare", **headers) == code
-        assert subject.tare.is_set()
+        assert subject.take_tare() == "tare"
         assert fetch(f"{address}/tare")[0] == 405
 
 
@@ -215,12 +216,79 @@ def test_the_operator_types_t_for_a_tare(monkeypatch, tmp_path):
         monkeypatch.setattr("sys.stdin", typed)
         with terminal.show_in_terminal(subject, Console(file=file)):
             os.write(master, b"x\n")
-            assert not subject.tare.wait(0.3)
+            sleep(0.3)
+            assert subject.take_tare() == ""
             os.write(master, b"t\n")
-            assert subject.tare.wait(10)
+            assert requested(subject) == "tare"
+            subject.set_verdict(PRESSED)
+            os.write(master, b"t\n")
+            until(lambda: "tare refused" in subject.state().line)
+            assert subject.take_tare() == ""
+            os.write(master, b"force\n")
+            assert requested(subject) == "forced"
             os.write(master, b"\x04")
             sleep(0.1)
     os.close(master)
+
+
+def until(reached):
+    deadline = monotonic() + 60
+    while not (result := reached()):
+        assert monotonic() < deadline
+        sleep(0.05)
+    return result
+
+
+def requested(subject):
+    return until(subject.take_tare)
+
+
+def test_a_tare_is_refused_under_a_touch_until_it_is_confirmed():
+    subject, events = display(), []
+    subject.listeners.append(events.append)
+    assert subject.request_tare(force=True) != ""  # there is nothing to confirm
+    for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=0.5)):
+        subject.set_verdict(verdict)
+        assert "something touches the skin" in subject.request_tare()
+        assert subject.take_tare() == ""
+        assert subject.request_tare(force=True) == ""
+        assert subject.take_tare() == "forced"
+    subject.set_verdict(None, "the device has stopped sending", alarm=True)
+    assert subject.request_tare() != ""
+    subject.set_verdict(replace(PRESSED, dangerous=False, touched=False))
+    assert subject.request_tare() == ""
+    refused = "tare_refused"
+    assert events == [refused, refused, "tare_forced", refused, "tare_forced", refused, "tare"]
+
+
+def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
+    subject = display()
+    idle = replace(PRESSED, touched=False, dangerous=False)
+    subject.set_verdict(idle)
+    subject.add_frame(frame([0, 0, 6.0, 0, 0]), PLAIN)
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.1))
+    state = subject.state()
+    assert (state.held, state.map[2]) == (False, 6.0)
+    subject.add_frame(frame([0, 0, 0.1, 0, 0]), PLAIN)
+    for verdict in (PRESSED, replace(PRESSED, dangerous=False, contact=None)):
+        subject.set_verdict(verdict)
+        state = subject.state(state.number)
+        assert (state.held, state.map[2], state.values[2]) == (True, 6.0, 0.1)
+    subject.set_verdict(idle)
+    assert subject.state().peak.max() == 0
+
+
+def test_an_unknown_place_is_not_shown_as_no_touch():
+    subject = display()
+    verdict = replace(PRESSED, touched=False, dangerous=False, unknown=(2,), masked=(2,))
+    subject.set_verdict(verdict)
+    sent = web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))
+    assert (sent["verdict"]["state"], sent["unknown"]) == ("unknown", [2])
+    assert "no touch" not in terminal._sentence(subject.state())
+    assert "unknown near sensor 2" in terminal._sentence(subject.state())
+    subject.set_verdict(None, "readings are frozen")
+    assert web.message(subject.state(), SkinPicture(PLACES, SIZE, 8, 4.0))["unknown"] == [0, 1, 2, 3, 4]
+    assert terminal._sentence(subject.state()) == "unknown: readings are frozen"
 
 
 def test_pictures_come_a_little_more_than_thirty_times_a_second():
@@ -285,7 +353,7 @@ ANNOUNCED = "return [...document.querySelectorAll('[role=alert]')].map(one => on
 def test_the_page_announces_an_alarm_and_its_end_once(browser):
     subject = display()
     subject.add_frame(frame([0, 0, 2.0, 0, 0]), PLAIN)
-    subject.set_verdict(None, "filling the window")
+    subject.set_verdict(None, "taking the baseline")
     with web.serve_page(subject, 0) as address:
         browser.open(address)
 

@@ -23,7 +23,7 @@ from skin.wire.text import Header, encode_header, encode_line
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device
 PATIENCE = 300  # s
-LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, DebounceSettings())
+LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, True, DebounceSettings())
 WATCH = """
 import sys
 from skin.cli import main
@@ -106,8 +106,8 @@ def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
 
 
 def test_only_a_skin_at_a_port_is_watched(model):
-    with pytest.raises(InputError, match="add device=serial"):
-        watch_model(str(model), {"seed": 0}, LIVE, print)
+    with pytest.raises(InputError, match="add device=serial"), ExitStack() as opened:
+        watch_model(str(model), {"seed": 0}, LIVE, print, opened)
 
 
 def test_the_settings_of_the_file_and_of_the_command(model):

@@ -68,6 +68,8 @@ class SerialSource(SerialSettings):
         PortSettings(**self._settings)  # checks them
         if self._known is not None:
             self._known.fits(self.sensors)
+            if self._known.values()["dead"].all():
+                raise InputError(f"every sensor is broken in device.calibration={self.calibration}")
 
     @property
     def _settings(self) -> dict[str, Any]:

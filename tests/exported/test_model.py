@@ -29,7 +29,9 @@ def test_one_window_has_one_number_per_label(exported):
     touches = of.device.touches("test")[:1]
     window = touches.readings[0].numpy(), touches.valid[0].numpy()
     np.testing.assert_allclose(
-        ExportedModel(path).probabilities(*(part[None] for part in window))[0], of.learner.probabilities(touches)[0].numpy(), atol=1e-5
+        ExportedModel(path).probabilities(*(part[None] for part in window))[0],
+        of.learner.probabilities(touches)[0].numpy(),
+        atol=1e-5,
     )
 
 

@@ -24,7 +24,8 @@ from skin.wire.text import Header, encode_header, encode_line
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
-RATE, LENGTH, IDLE, GESTURES = 50, 150, 150, 3
+# A window ends with a frame at a tick, so that it is decided on.
+RATE, LENGTH, IDLE, GESTURES = 50, 150, 151, 3
 SCALE, LIMIT = 0.01, 700  # N per count; 612 counts are at rest
 DEAD = 4
 
@@ -139,10 +140,14 @@ def live(learner, stream):
             super().set_verdict(verdict, trouble, alarm)
             if verdict is not None:
                 found[round(verdict.t * RATE)] = asked.windows[-1], verdict
+
+    class Turning(LiveLoop):
+        def _take(self, frames):
+            super()._take(frames)
             turn.set()
 
     with skin:
-        LiveLoop(skin, device.taring(skin), engine, Taking(info)).run()
+        Turning(skin, device.taring(skin), engine, Taking(info)).run()
     listener.close()
     return found
 

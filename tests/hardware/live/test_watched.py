@@ -4,7 +4,8 @@ import json
 import socket
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from threading import Event, Thread
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
+from skin.exported.writer import write_model
 from skin.hardware.live.engine_builder import describe
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.verdict import DebounceSettings
@@ -35,10 +37,9 @@ finally:
 
 
 @pytest.fixture(scope="module")
-def model(configured, tmp_path_factory):
-    """Return the file of a small untrained network with six sensors, whose alarm is above 0.25."""
+def trained(configured):
+    """Return a small untrained network with six sensors, whose alarm is above 0.25, and some touches."""
     from skin.build import build_data, build_device, build_learner
-    from skin.exported.writer import write_model
     from skin.trained import Trained
 
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
@@ -49,9 +50,15 @@ def model(configured, tmp_path_factory):
     learner.build(data)
     known = data.touches("train")
     point = OperatingPoint(0.25, 0.02, 5000, 100, 0)
-    of = Trained(device, learner, device.window, known.positions, device.model_rate, point)
+    return Trained(device, learner, device.window, known.positions, device.model_rate, point), known
+
+
+@pytest.fixture(scope="module")
+def model(trained, tmp_path_factory):
+    """Return the file of the network."""
+    of, known = trained
     path = tmp_path_factory.mktemp("model") / "skin.onnx"
-    write_model(learner.pipeline(of.positions), describe(of, "abc", "small", 0.3), known, path)
+    write_model(of.learner.pipeline(of.positions), describe(of, "abc", "small", 0.3), known, path)
     return path
 
 
@@ -83,7 +90,7 @@ def skin():
 @pytest.mark.slow
 def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
     words = [f"run={model}", "device=serial", f"device.port={skin}", "device.tare=1", "live.verdicts=stdout"]
-    words += ["seconds=15", "live.log=alarms.jsonl"]
+    words += ["seconds=15", "live.log=alarms.jsonl", "live.selftest=false"]  # untrained
     done = subprocess.run(
         [sys.executable, "-c", WATCH, *words],
         cwd=tmp_path,
@@ -110,14 +117,28 @@ def test_only_a_skin_at_a_port_is_watched(model):
         watch_model(str(model), {"seed": 0}, LIVE, print, opened)
 
 
-def test_the_settings_of_the_file_and_of_the_command(model):
-    said = []
-    watched = watch_model(str(model), {"port": "socket://x:1", "labels": "announced"}, LIVE, said.append)
+@pytest.mark.parametrize(("rates", "threshold"), [(None, 0.25), ({20.0: 0.3, 100.0: 0.35, 500.0: 0.4}, 0.35)])
+def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, rates, threshold):
+    """The threshold is the one for the rate of the device, which sends 100 frames a second."""
+    of, touches = trained
+    path, said = tmp_path / "skin.onnx", []
+    described = describe(of, "abc", "small", 0.3, rates)
+    write_model(of.learner.pipeline(of.positions), described, touches, path)
+    with ExitStack() as opened:
+        watched = watch_model(str(path), {"port": skin, "labels": "announced"}, LIVE, said.append, opened)
     assert (watched.title, watched.span, len(watched.positions)) == ("small", 3.0, 6)
-    assert said[-1] == "alarm above 0.2500"
-    other = LiveSettings(0, 4.0, 0.5, 0.2, None, None, DebounceSettings(above=0.75))
-    watch_model(str(model), {"port": "socket://x:1"}, other, said.append)
+    assert said[-1] == f"alarm above {threshold:.4f}"
+    assert ("single windows" in said[-2]) == (rates is None)
+    assert watched.nominal.presses.shape == (6, 6)
+    assert (watched.nominal.presses.argmax(axis=1) == np.arange(6)).all()
+
+
+def test_the_command_replaces_settings_of_the_file(model, skin):
+    said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
+    with ExitStack() as opened:
+        watched = watch_model(str(model), {"port": skin}, other, said.append, opened)
     assert said[-1] == "alarm above 0.7500"
+    assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 
 @pytest.mark.slow

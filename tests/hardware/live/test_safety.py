@@ -1,0 +1,291 @@
+"""Streams of boards that restart, freeze, break or come in bursts: no dangerous touch is hidden or late."""
+
+import socket
+from dataclasses import replace
+from threading import Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.hardware.live.display import Display, DisplayInfo
+from skin.hardware.live.engine import Detection, EngineSettings
+from skin.hardware.live.engine_builder import window_classifier
+from skin.hardware.live.loop import LiveLoop
+from skin.hardware.live.selftest import SelfTest
+from skin.hardware.live.verdict import DebounceSettings
+from skin.labels import TOUCH
+from skin.wire.conversion import UnitConversion
+from skin.wire.health import RawRange
+from skin.wire.serial_source import SerialSource
+from skin.wire.text import Header, encode_header, encode_line
+
+RATE, SENSORS = 100, 9
+SPEED = 8  # times faster than the device's clock says
+HEADER = encode_header(Header(n=SENSORS, rate=RATE, unit="N"))
+COUNTS = encode_header(Header(n=SENSORS, rate=RATE, unit="adc", bits=10))
+SCALE = 0.02  # N per count
+
+
+class Loud:
+    """A touch is dangerous where a reading exceeds 4 N."""
+
+    def probabilities(self, touches):
+        danger = (touches.readings.flatten(1).amax(1) > 4).float()
+        return torch.stack([danger] * 4, dim=1)
+
+
+def settings(**changes):
+    classify = window_classifier(Loud(), torch.zeros(SENSORS, 3), 10.0)
+    shape = SENSORS, 30, 10.0
+    presses = 5.0 * np.eye(SENSORS)
+    return EngineSettings(classify, TOUCH, *shape, Detection(0.3), DebounceSettings(), presses)
+
+
+def force(seconds, *touches):
+    """Return readings (F, S), N, with noise; touches are (begin s, end s, sensor, N)."""
+    values = np.random.default_rng(0).normal(scale=0.02, size=(round(seconds * RATE), SENSORS))
+    for begin, end, sensor, newtons in touches:
+        values[round(begin * RATE) : round(end * RATE), sensor] += newtons
+    return values
+
+
+def lines(values, restart=None, header=HEADER, encode=lambda row: row.round(4)):
+    """Yield the bytes of each frame; the device restarts every ``restart`` s, with its counter and clock."""
+    every = len(values) if restart is None else round(restart * RATE)
+    for number, row in enumerate(values):
+        first = number % every
+        data = b"" if first else header
+        yield data + encode_line(encode(row), first, 10_000 * first)
+
+
+class Watching:
+    """A live view of a stream; ``said`` has (frames sent, verdict or None, reason, alarm)."""
+
+    def __init__(self, stream, speed=SPEED, each=1, acts=(), **source):
+        self.said, self.sent = [], 0
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.thread = Thread(target=self._serve, args=(stream, speed, each), daemon=True)
+        self.thread.start()
+        port = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
+        source = SerialSource(port=port, sensors=SENSORS, rate=10.0, tare=2.0, **source)
+        self.skin, _ = source.open()
+        self.display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
+        self.display.observers.append(self._note)
+        self.acts = list(acts)
+        self.loop = LiveLoop(self.skin, source.taring(self.skin), settings().build(), self.display)
+        with self.skin:
+            self.loop.run()
+        self.thread.join(20)
+        self.server.close()
+
+    def _serve(self, stream, speed, each):
+        client, _ = self.server.accept()
+        begin, waiting = monotonic(), b""
+        with client:
+            for number, data in enumerate(stream, 1):
+                waiting += data
+                if number % each == 0:
+                    client.sendall(waiting)
+                    waiting, self.sent = b"", number
+                    sleep(max(0.0, begin + number / RATE / speed - monotonic()))
+
+    def _note(self, verdict, reason, alarm):
+        on = alarm if verdict is None else verdict.dangerous
+        self.said.append((self.sent / RATE, verdict, reason, on))
+        if self.acts and self.sent / RATE >= self.acts[0][0]:
+            self.acts.pop(0)[1](self.display)
+
+    def states(self, begin, end):
+        """Return the states while the frames of some seconds were sent."""
+        inside = [(verdict, on) for at, verdict, _, on in self.said if begin < at < end]
+        return {"unknown" if verdict is None else verdict.state for verdict, _ in inside}
+
+    def first(self, after):
+        """Return when the first alarm came, s of the stream."""
+        return next((at for at, _, _, on in self.said if on and at >= after), np.inf)
+
+    def kept(self, begin, end):
+        """Return whether the alarm was on all the time."""
+        inside = [on for at, _, _, on in self.said if begin < at < end]
+        return bool(inside) and all(inside)
+
+
+LATE = 0.35  # s of the stream: the delay of a busy computer, at this speed
+
+
+def test_a_press_is_found_though_the_device_restarts_every_two_and_a_half_seconds():
+    seen = Watching(lines(force(22, (8, 18, 4, 6.0)), restart=2.5))
+    assert seen.first(4) <= 8 + 0.5 + LATE
+    assert seen.kept(8 + 0.5 + LATE, 18)
+    assert seen.first(4) >= 8
+
+
+def test_a_tap_after_a_restart_is_found():
+    seen = Watching(lines(force(12, (7.8, 7.9, 4, 6.0)), restart=2.5))
+    assert 7.8 <= seen.first(3) <= 7.8 + 0.3 + LATE
+
+
+def test_frozen_readings_are_unknown():
+    values = force(24)
+    values[600:2100] = values[600]
+    seen = Watching(lines(values))
+    assert seen.states(3, 6) == {"no touch"}
+    assert seen.states(11 + LATE, 21) == {"unknown"}
+    assert seen.states(22.5, 24) == {"no touch"}
+
+
+def test_a_channel_at_its_limit_is_not_tared():
+    """All at the limit: there is no baseline. One: its place is unknown, and a press on others is found."""
+    counts = lambda row: np.clip(np.round(200 + row / SCALE), 0, 1023).astype(int)  # noqa: E731
+    full = np.full((600, SENSORS), 1023.0)
+    seen = Watching(lines(full, header=COUNTS, encode=lambda row: row.astype(int)), scale=SCALE)
+    assert {reason for _, _, reason, _ in seen.said} >= {
+        "no baseline: all channels at the limit or without a value"
+    }
+    assert seen.states(0, 6) == {"unknown"}
+    values = force(12, (6, 7, 4, 6.0))
+    values[:, 2] = 50.0
+    seen = Watching(lines(values, header=COUNTS, encode=counts), scale=SCALE)
+    assert seen.states(4, 5.9) == {"unknown"}
+    assert {verdict.unknown for at, verdict, _, _ in seen.said if verdict and at > 4} == {(2,)}
+    assert "channel 2 at the limit" in seen.loop.line
+    assert 6 <= seen.first(3) <= 6.5 + LATE
+
+
+@pytest.mark.parametrize("broken", [-20.0, -1.5])
+def test_a_broken_wire_does_not_clear_the_alarm(broken):
+    values = force(24, (6, 14, 7, 6.0), (20, 21, 7, 6.0))
+    values[900:1500, 7] = broken
+    seen = Watching(lines(values))
+    assert seen.first(3) <= 6.5 + LATE
+    assert seen.kept(6.5 + LATE, 14)
+    assert "no touch" not in seen.states(6.2 + LATE, 15)
+    assert not seen.kept(19, 20)
+    assert 20 <= seen.first(19.5) <= 20.5 + LATE
+
+
+def test_values_that_fall_with_force_are_unknown_and_told():
+    values = force(12, (6, 8, 4, -6.0), (6, 8, 5, -3.0))
+    seen = Watching(lines(values))
+    assert seen.states(6 + LATE, 8) == {"unknown"}
+    verdict = next(verdict for at, verdict, _, _ in seen.said if verdict and at > 7)
+    assert "device.scale" in verdict.reason
+
+
+@pytest.mark.parametrize("burst", [0.25, 0.5, 1.0])
+def test_bursts_without_a_clock_are_decided_like_single_frames(burst):
+    """A radio bridge: only values, in bursts. The delay of delivery is all that is added."""
+    rows = force(14, (9, 10, 4, 6.0))
+    stream = [(",".join(f"{value:.4f}" for value in row) + "\n").encode() for row in rows]
+    seen = Watching(stream, speed=1, each=round(burst * RATE), scale=1.0)
+    assert 9 <= seen.first(3) <= 9 + burst + 0.1 + 0.25
+    assert "no touch" in seen.states(7, 9)
+    assert not seen.kept(3, 9)
+
+
+def test_silence_is_unknown_after_a_second_and_a_half():
+    def stream():
+        yield from lines(force(4))
+        sleep(3)
+        yield from lines(force(1))
+
+    begin, seen = monotonic(), []
+    watching = Watching(stream(), speed=SPEED)
+    silent = [verdict for _, verdict, reason, _ in watching.said if "stopped sending" in reason]
+    assert silent
+    assert all(verdict is None for verdict in silent)
+    assert monotonic() - begin < 30
+    assert not seen
+
+
+def test_a_tare_under_an_alarm_is_refused_and_hides_nothing():
+    answers = []
+    acts = [(7.0, lambda display: answers.append(display.request_tare()))]
+    seen = Watching(lines(force(14, (6, 12, 4, 6.0))), acts=acts)
+    assert "something touches the skin" in answers[0]
+    assert seen.kept(6.5 + LATE, 12)
+
+
+def test_a_touch_that_begins_after_a_request_is_no_baseline():
+    acts = [(5.0, lambda display: display.request_tare())]
+    seen = Watching(lines(force(16, (5.5, 12, 4, 6.0))), acts=acts)
+    assert seen.kept(6.0 + LATE, 12)
+
+
+def test_a_forced_tare_ends_an_alarm():
+    acts = [(7.0, lambda display: display.request_tare()), (7.2, lambda display: display.request_tare(True))]
+    seen = Watching(lines(force(16, (6, 16, 4, 6.0))), acts=acts)
+    assert seen.kept(6.5 + LATE, 9)
+    assert not seen.kept(11, 16)
+
+
+class TestSelfTest:
+    """The settings of a live view against simulated presses."""
+
+    COUNTED = RawRange(0.0, 1023.0, True, (None, 1023.0))
+
+    def run(self, used=None, conversion=None, device=COUNTED, nominal=None):
+        nominal = nominal or settings()
+        conversion = conversion or UnitConversion(
+            np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool)
+        )
+        said = []
+        SelfTest(4.0 * np.eye(SENSORS), used or nominal, nominal).run(conversion, device, said.append)
+        return said
+
+    def test_nominal_settings_pass(self):
+        assert self.run() == [
+            "self-test: 14 of 14 dangerous presses raise the alarm, 14 with nominal settings"
+        ]
+        assert "its scale is not checked" in self.run(device=RawRange())[0]
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (lambda s: replace_detection(s, threshold=1000.0), "live.touch"),
+            (lambda s: replace_detection(s, drift=1e9 / 600), "live.drift"),
+            (lambda s: replace_patience(s, above=0.9999999), None),
+        ],
+    )
+    def test_settings_that_blind_are_named(self, change, named):
+        used = change(settings())
+        if named is None:
+            self.run(used)
+        else:
+            with pytest.raises(InputError, match=rf"{named} is most likely wrong.*live\.selftest=false"):
+                self.run(used)
+
+    @pytest.mark.parametrize("scale", [1e-9, 1e-300, 1e9, 0.02 / 1e6])
+    def test_a_scale_that_blinds_is_named(self, scale):
+        conversion = UnitConversion(np.full(SENSORS, scale), np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
+        with pytest.raises(InputError, match=r"device\.scale or device\.calibration is most likely"):
+            self.run(conversion=conversion)
+
+    def test_one_sensor_that_can_never_alarm_is_named(self):
+        scale = np.full(SENSORS, SCALE)
+        scale[3] = 1e-9
+        conversion = UnitConversion(scale, np.full(SENSORS, 200.0), np.zeros(SENSORS, bool))
+        with pytest.raises(InputError, match="sensor 3 cannot raise it"):
+            self.run(conversion=conversion)
+
+    def test_masked_sensors_are_counted(self):
+        broken = np.arange(SENSORS) < 2
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
+        with pytest.raises(InputError, match=r"11 of 14 .* the mask of broken sensors"):
+            self.run(conversion=conversion)
+
+    def test_a_model_that_finds_nothing_is_refused(self):
+        nominal = replace_detection(settings(), threshold=1e308)
+        with pytest.raises(InputError, match="the contact threshold of the model"):
+            self.run(nominal=nominal)
+
+
+def replace_detection(of, **changes):
+    return replace(of, detection=replace(of.detection, **changes))
+
+
+def replace_patience(of, **changes):
+    return replace(of, patience=replace(of.patience, **changes))

@@ -45,7 +45,7 @@ class Calibration:
         about: origin of the calibration; any JSON data.
         polarity: 1 or -1 per sensor: -1 where the raw value falls with force. Readings in N rise with force
             either way. Empty: 1 for all.
-        channels: the device's channel, from 0, of every sensor of the layout. Empty: they have the same order.
+        channels: the device's channel, from 0, of every sensor of the layout. Empty: the same order.
 
     Raises:
         InputError: an unknown name, different lengths, or a number out of range.
@@ -205,13 +205,9 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     lines += [f"count: {len(calibration)}", f"scale: {calibration.scale!r}  # N per raw unit"]
     lines.append(f"zero: {calibration.zero!r}  # raw units at 0 N, before offsets")
     if calibration.polarity:
-        lines.append(
-            f"polarity: {json.dumps(list(calibration.polarity))}  # -1: the raw value falls with force"
-        )
+        lines.append(f"polarity: {json.dumps(list(calibration.polarity))}  # -1: falls with force")
     if calibration.channels:
-        lines.append(
-            f"channels: {json.dumps(list(calibration.channels))}  # the device's channel of every sensor"
-        )
+        lines.append(f"channels: {json.dumps(list(calibration.channels))}  # of the device, by sensor")
     for group, values in groups.items():
         lines.append(f"{group}:" + ("" if values else " {}"))
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]

@@ -186,8 +186,9 @@ def read_calibration(path: str | Path) -> Calibration:
         broken = stored.get("broken") or {}
         ranges, about = stored.get("ranges") or {}, stored.get("about") or {}
         scale, zero = float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0))
-        wiring = [stored.get("polarity") or (), stored.get("channels") or ()]
-        return Calibration(sensors, broken, ranges, scale, zero, about, *wiring)
+        polarity, channels = stored.get("polarity") or (), stored.get("channels") or ()
+        polarity = [polarity] * count if isinstance(polarity, int) else polarity
+        return Calibration(sensors, broken, ranges, scale, zero, about, polarity, channels)
     except InputError as error:
         raise InputError(f"{found}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -225,4 +226,5 @@ def _check(name: str, values: Sequence[float]) -> None:
     numbers = all(isinstance(value, int | float) and not math.isnan(value) for value in values)
     if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
         least = "" if name in _SIGNED else " from 0 up"
+        least += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
         raise InputError(f"{name} must be numbers{least}, got {list(values)}")

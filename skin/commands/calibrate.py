@@ -17,6 +17,8 @@ from skin.command import command
 from skin.config import plain
 from skin.errors import InputError
 
+_CONFIRMED = ("places", "channels", "broken")
+
 
 @command("calibrate")
 def main(config: DictConfig) -> None:
@@ -31,14 +33,16 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.hardware.calibration import bench_session, gauge
-    from skin.hardware.calibration.bench_data import build_bench_data
     from skin.hardware.calibration.calibration_report import held_out_summary, print_calibration
     from skin.hardware.calibration.fit import fit_calibration
     from skin.hardware.calibration.held_out import evaluate_held_out
     from skin.hardware.calibration.protocol import write_demo_session
+    from skin.hardware.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
+    from skin.settings import configured
     from skin.signal.calibration import write_calibration
 
     settings = plain(config)["calibrate"]
+    confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
     if settings["demo"]:
         print(write_demo_session(device, settings, config.session))
@@ -46,8 +50,10 @@ def main(config: DictConfig) -> None:
     session = bench_session.read_bench_session(config.session, *shape, settings["unit"])
     rows = None if config.presses is None else gauge.read_gauge(config.presses, *shape, settings["delay"])
     with Console(stderr=True).status("fitting"):
-        found = build_bench_data(device, session, rows)
-        outcome, calibration = evaluate_held_out(found, settings["held_out"]), fit_calibration(found)
+        bench = wired_bench(device, session, rows, confirmed)
+        calibration = fit_calibration(bench)
+        check_usable(calibration)
+        outcome = evaluate_held_out(bench, settings["held_out"])
     print_calibration(calibration, outcome)
     if not outcome.helps:
         print(
@@ -57,4 +63,5 @@ def main(config: DictConfig) -> None:
         sys.exit(1)
     known = {**calibration.about, **held_out_summary(outcome)}
     known |= {"session": config.session, "presses_file": config.presses}
-    print(write_calibration(replace(calibration, about=known), config.out))
+    channels = device_channels(session, confirmed)
+    print(write_calibration(replace(calibration, about=known, channels=channels), config.out))

@@ -1,7 +1,7 @@
 """Presses of a bench session beside their simulation (report, figures 11 and 12)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,9 @@ def read_presses(
     """
     shape = settings["indenter"], settings["radius"]
     said = bench_session.read_bench_session(path, *shape, settings["unit"])
+    calibration = device.imperfection.calibration
+    if calibration is not None and calibration.channels and said.channels is None:
+        said = replace(said, raw=said.raw[:, list(calibration.channels)])
     rows = None if presses is None else gauge.read_gauge(presses, *shape, settings["delay"])
     found = compare(device, build_bench_data(device, said, rows), settings["scale"])
     if not found.presses:

@@ -53,7 +53,7 @@ class Calibration:
         about: origin of the calibration; any JSON data.
         polarity: 1 or -1 per sensor: -1 where the raw value falls with force. Readings in N rise with force
             either way. Empty: 1 for all.
-        channels: the device's channel, from 0, of every sensor of the layout. Empty: they have the same order.
+        channels: the device's channel, from 0, of every sensor of the layout. Empty: the same order.
 
     Raises:
         InputError: an unknown name, different lengths, or a number out of range.
@@ -220,10 +220,11 @@ def _calibration(stored: Mapping[str, Any]) -> Calibration:
     if not isinstance(about, dict):
         raise InputError(f"about must be settings by name, got {about!r}")
     scale, zero = float(stored.get("scale", 1.0)), float(stored.get("zero", 0.0))
-    wiring = [stored.get("polarity") or (), stored.get("channels") or ()]
-    if not all(isinstance(part, list | tuple) for part in wiring):
+    polarity, channels = stored.get("polarity") or [], stored.get("channels") or []
+    polarity = [polarity] * count if isinstance(polarity, int) else polarity
+    if not isinstance(polarity, list) or not isinstance(channels, list):
         raise InputError("polarity and channels must be lists")
-    return Calibration(sensors, broken, ranges, scale, zero, about, *wiring)
+    return Calibration(sensors, broken, ranges, scale, zero, about, polarity, channels)
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
@@ -237,13 +238,9 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     lines += [f"count: {len(calibration)}", f"scale: {calibration.scale!r}  # N per raw unit"]
     lines.append(f"zero: {calibration.zero!r}  # raw units at 0 N, before offsets")
     if calibration.polarity:
-        lines.append(
-            f"polarity: {json.dumps(list(calibration.polarity))}  # -1: the raw value falls with force"
-        )
+        lines.append(f"polarity: {json.dumps(list(calibration.polarity))}  # -1: falls with force")
     if calibration.channels:
-        lines.append(
-            f"channels: {json.dumps(list(calibration.channels))}  # the device's channel of every sensor"
-        )
+        lines.append(f"channels: {json.dumps(list(calibration.channels))}  # of the device, by sensor")
     for group, values in groups.items():
         lines.append(f"{group}:" + ("" if values else " {}"))
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]
@@ -263,6 +260,7 @@ def _check(name: str, values: Sequence[float]) -> None:
     numbers = isinstance(values, Sequence) and all(_is_number(name, value) for value in values)
     if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
         least = "" if name in _SIGNED else " from 0 up"
+        least += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
         shown = str(values)
         raise InputError(f"{name} must be numbers{least}, got {shown[:_SHOWN]}")
 

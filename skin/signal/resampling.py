@@ -18,8 +18,8 @@ class Resampled(NamedTuple):
     """A window of a stream at the rate of a model.
 
     Attributes:
-        values: (T, S), the largest valid value of each interval, in the unit of the frames; the smallest where
-            values fall with force; 0 without one.
+        values: (T, S), the largest valid value of each interval, in the unit of the frames. The smallest
+            where values fall with force; 0 without one.
         valid: (T, S), bool: the interval has a valid value.
         saturated: (T, S), bool: a valid value of the interval is at the sensor's limit.
         gap: whether frames are missing in the window.

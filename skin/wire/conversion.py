@@ -93,6 +93,6 @@ def check_scale(scale: float | None, calibration: Calibration | None) -> None:
         )
     if calibration is not None and scale < 0:
         raise InputError(
-            f"device.scale must be above 0 beside a calibration, which has the polarity of every channel, got "
-            f"{scale}: leave out device.scale"
+            "device.scale must be above 0 beside a calibration, which has the polarity of every channel, "
+            f"got {scale}: leave out device.scale"
         )

@@ -184,7 +184,7 @@ class Decoder:
         return frame if self._polarity is None else self._oriented(frame, self._polarity)
 
     def _oriented(self, frame: Frame, polarity: np.ndarray) -> Frame:
-        """Return a frame with its polarity; a channel whose values fall with force has its limit at 0 counts."""
+        """Return a frame with its polarity; channels whose values fall with force end at 0 counts."""
         at_limit = (polarity < 0) & (frame.values <= 0)
         counted = self.header is not None and self.header.bits is not None
         return frame._replace(polarity=polarity, saturated=at_limit if counted else None)

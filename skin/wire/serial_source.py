@@ -86,8 +86,15 @@ class SerialSource(SerialSettings):
             raise InputError("device=serial needs a port, device.port=/dev/ttyACM0; skin emulate makes one")
         listener = AnnouncementListener(partial(open_stream, self.port, self.baudrate))
         sensors = range(self.sensors)
-        wiring = {"channels": self._known.channels if self._known else (), "polarity": self.polarity}
-        skin = open_skin(self.port, sensors, opener=listener, reconnect=reconnect, **wiring, **self._settings)
+        skin = open_skin(
+            self.port,
+            sensors,
+            opener=listener,
+            reconnect=reconnect,
+            channels=self._known.channels if self._known else (),
+            polarity=self.polarity,
+            **self._settings,
+        )
         return skin, listener
 
     @property

@@ -64,3 +64,28 @@ def test_bad_input_ends_with_2_and_one_sentence(run, tmp_path, arguments, reason
     assert done.returncode == 2
     assert reason in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_path):
+    session, out = tmp_path / "bench.csv", tmp_path / "mine.yaml"
+    files, demo = (f"session={session}", f"out={out}"), "calibrate.demo=true"
+    done = run(tmp_path, "calibrate", *SMALL, *files, demo, "calibrate.places=mirror_y", store=False)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "respond, but not to the presses near their sensors" in done.stderr
+    assert "add calibrate.places=as_given" in done.stderr
+    assert not out.exists()
+    lines = [line.split(",") for line in session.read_text().splitlines()]
+    places = lines[0].index("y_m") if "y_m" in lines[0] else lines[0].index('"y_m"')
+    for line in lines[1:]:
+        line[places] = line[places] and str(0.16 - float(line[places]))
+        line[1], line[2] = line[2], line[1]
+    session.write_text("\n".join(map(",".join, lines)) + "\n")
+    wrong = ["calibrate.places=mirror_y", "calibrate.channels=[1,0,2,3]"]
+    done = run(tmp_path, "calibrate", *SMALL, *files, store=False)
+    assert done.returncode == 2
+    assert all(f"{setting}" in done.stderr for setting in wrong)
+    done = run(tmp_path, "calibrate", *SMALL, *files, *wrong, store=False)
+    assert done.returncode == 0, done.stderr
+    assert read_calibration(out).channels == [1, 0, 2, 3]

@@ -37,6 +37,22 @@ def test_a_file_keeps_polarity_and_channels(tmp_path):
     assert "polarity" not in write_calibration(replace(FALLING, polarity=()), tmp_path / "a.yaml").read_text()
 
 
+def test_a_person_may_write_one_polarity_for_all(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("format: 1\ncount: 3\nsensors: {gain: 1}\npolarity: -1\n")
+    assert read_calibration(path).signs.tolist() == [-1, -1, -1]
+    for line in (
+        "polarity: [[1]]",
+        "polarity: up",
+        "polarity: [1, 1, x]",
+        "channels: 2",
+        "channels: [0, 1, a]",
+    ):
+        path.write_text(f"format: 1\ncount: 3\nsensors: {{gain: 1}}\n{line}\n")
+        with pytest.raises(InputError):
+            read_calibration(path)
+
+
 @pytest.mark.parametrize(
     ("wiring", "reason"),
     [

@@ -37,7 +37,8 @@ def quantum(values: np.ndarray) -> float:
         return 0.0
     steps = np.diff(distinct)
     # Single precision splits a step into two that differ in the last digit.
-    return float(steps[steps > 1e-5 * np.abs(distinct).max()].min())
+    steps = steps[steps > 1e-5 * np.abs(distinct).max()]
+    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
 
 
 def idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:

@@ -1,5 +1,6 @@
 """A bench session: raw readings at the device's own rate, and the force gauge's rows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,6 +28,8 @@ class BenchSession:
         unit: ``N``, or ``adc`` for counts of a converter.
         gauge: rows of the force gauge in the same file; None if they are in another file.
         bits: of the converter; None if unknown.
+        channels: the device's channel of every column, where skin record has put them into the order of the
+            layout; None: columns are in the device's order.
 
     Raises:
         InputError: another unit, or times that do not increase.
@@ -37,6 +40,7 @@ class BenchSession:
     unit: Literal["N", "adc"]
     gauge: Gauge | None = None
     bits: Annotated[int, Ge(1), Le(64)] | None = None
+    channels: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if len(self.time) < 2:
@@ -86,7 +90,7 @@ def read_bench_session(
     rows = gauges.gauge_from_table(table, str(path), indenter, radius) if inside else None
     try:
         known: Any = unit or about.get("unit", "N")
-        return BenchSession(time, raw, known, rows, about.get("bits"))
+        return BenchSession(time, raw, known, rows, about.get("bits"), about.get("channels"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -10,13 +10,13 @@ from skin.errors import InputError
 from skin.hardware.calibration import _channel
 from skin.hardware.calibration._channel import Idle
 from skin.hardware.calibration.bench_data import BenchData
+from skin.hardware.calibration.responses import collect_responses, find_polarity
 from skin.sensor_dynamics import first_order_lag, running_peak
 from skin.signal.calibration import Calibration
 
 _PRESSED = 0.05  # of the largest true reading: less determines no gain
 _SURE = 6.0  # standard errors above 0: less is no answer either
 _LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated
-_DEAD = 0.05  # of the median gain: less is no answer
 
 
 @dataclass
@@ -31,13 +31,16 @@ class _Channel:
     clip: float | None = None
     hysteresis: float | None = None
     broken: str | None = None
+    polarity: float = 1.0
 
 
 def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
     """Fit every channel to the simulated true readings of presses, never to the gauge's force.
 
     Idle frames give offset, drift and noise; the release the time constant; the loading branch the gain and
-    the clip; the unloading branch hysteresis. All but the idle frames are taken from ``presses``.
+    the clip; the unloading branch hysteresis. All but the idle frames are taken from ``presses``. A channel
+    is dead if it never leaves its noise in the whole session, though its sensor was pressed. A channel whose
+    values fall with force has polarity -1.
 
     Args:
         bench: the session.
@@ -48,6 +51,7 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     """
     used = bench.of(range(len(bench.gauge)) if presses is None else presses)
     channels = [_at_rest(bench, number) for number in range(bench.each.shape[1])]
+    _respond(bench, channels)
     driven = np.where(used[:, None], bench.true, 0.0)
     pressed = driven.max(axis=0) >= _PRESSED * driven.max()
     answering = [int(n) for n in np.flatnonzero(pressed) if channels[n].broken is None]
@@ -65,10 +69,6 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
             "no channel responds to a press below its limit: check layout, indenter, the forces and the "
             "session's clock"
         )
-    for number in answering:
-        gain = channels[number].gain
-        if gain is not None and gain < _DEAD * typical:
-            channels[number].broken = "dead"
     return _calibration(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
 
 
@@ -94,8 +94,21 @@ def _at_rest(bench: BenchData, number: int) -> _Channel:
     return _Channel(_channel.idle(bench.session.time[quiet], measured[quiet], step), step)
 
 
+def _respond(bench: BenchData, channels: list[_Channel]) -> None:
+    """Set the polarity of every channel; one that is silent in the whole session is dead."""
+    responses = collect_responses(bench)
+    polarity = find_polarity(responses, bench.each)
+    pressed = bench.true.max(axis=0) >= _PRESSED * bench.true.max()
+    for number, channel in enumerate(channels):
+        channel.polarity = float(polarity[number])
+        if channel.broken is None and pressed[number] and not responses.responding[number]:
+            channel.broken = "dead"
+
+
 def _rest_taken(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
-    return bench.session.raw[:, number] - channel.idle.offset - channel.idle.drift * bench.session.time
+    """Return the change of a channel against its rest, (T,), in the session's unit, above 0 under force."""
+    rest = channel.idle.offset + channel.idle.drift * bench.session.time
+    return channel.polarity * (bench.session.raw[:, number] - rest)
 
 
 def _time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
@@ -141,7 +154,7 @@ def _answer(
     if np.isnan(gain):  # every reading is at the limit
         return
     # A slope within its error may be noise.
-    channel.gain = gain if gain > _SURE * channel.error else 0.0
+    channel.gain = gain if gain > _SURE * channel.error else None
     limit = np.inf if channel.clip is None else 0.9 * channel.clip
     # A gap no larger than the noise is not used.
     down = there & bench.unloading & (measured < limit) & (bend > 0.05 * lagged.max())
@@ -161,9 +174,9 @@ def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Ca
     counts = [channel.idle.offset for channel, live in zip(channels, alive, strict=True) if live]
     zero = 0.0 if bench.session.unit == "N" else float(np.median(counts))
     in_newton: dict[str, list[float | None]] = {
-        "offset": [channel.idle.offset - zero for channel in channels],
+        "offset": [channel.polarity * (channel.idle.offset - zero) for channel in channels],
         "noise": [channel.idle.noise for channel in channels],
-        "drift": [channel.idle.drift for channel in channels],
+        "drift": [channel.polarity * channel.idle.drift for channel in channels],
         "quantum": [channel.quantum for channel in channels],
         "clip": [channel.clip for channel in channels],
         "gain": [channel.gain for channel in channels],
@@ -183,11 +196,13 @@ def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Ca
     error = 2 * scale * float(np.median([channel.error for channel in channels if channel.gain]))
     ranges["gain"] = [max(ranges["gain"][0] - error, 0.0), ranges["gain"][1] + error]
     about = {"unit": bench.session.unit, "presses": len(bench.gauge), "frames": len(bench.session.time)}
-    return Calibration(sensors, broken, ranges, scale, zero, about)
+    polarity = [int(channel.polarity) for channel in channels]
+    known = polarity if min(polarity) < 0 else ()
+    return Calibration(sensors, broken, ranges, scale, zero, about, polarity=known)
 
 
 def _six(value: float | None, scale: float = 1.0) -> float | None:
-    return None if value is None else float(f"{value * scale:.6g}")
+    return None if value is None else float(f"{value * scale:.6g}") + 0.0  # no negative 0
 
 
 def _ranges(sensors: dict[str, list[float | None]], alive: list[bool]) -> dict[str, list[float]]:

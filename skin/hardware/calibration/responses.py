@@ -1,7 +1,6 @@
 """How much every channel responds to every press, and how well a prediction explains that."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,12 @@ from skin.hardware.calibration.bench_data import BenchData
 _STEPS = 8  # means over the loading of a press
 _BEFORE = 20  # idle frames before a press, from which its rest is taken
 _FEW = 5
-_SURE, _VISIBLE, _STEP = 6.0, 1.5, 1.5  # standard errors, noise and steps above which a channel responds
+_SURE, _VISIBLE, _STEP = 5.0, 1.0, 1.5  # standard errors, noise and steps above which a channel responds
+_MAD, _MEDIAN = 1.4826, math.sqrt(math.pi / 2)  # as in _channel: of normal noise
 _LIMITS = np.geomspace(0.9, 300.0, 40)  # largest prediction of a channel over its limit
 _TINY = 1e-6  # of the largest prediction: less is 0
-_STRONGER = 20.0  # times the median gain: more is no sensor's
+_INVERSE = 4.5  # factor on the residual of a channel whose polarity is not that of most
+_STRONGER = 20.0  # times the predicted share of the strongest response: more has another cause
 
 
 @dataclass(frozen=True)
@@ -49,17 +50,19 @@ class Match:
         residual: (channels, sensors), share of a channel's energy that the prediction does not explain with
             any gain and limit, without that of the noise: 0 to 1.
         sign: (channels, sensors), 1 or -1: whether the channel rises or falls with force.
+        expected: (sensors,), largest prediction, share of the largest of all.
     """
 
     residual: np.ndarray
     sign: np.ndarray
+    expected: np.ndarray
 
 
 def collect_responses(bench: BenchData) -> Responses:
     """Return the responses of all channels of a session, which do not depend on places or layout."""
     raw, (force, press) = bench.session.raw, bench.applied
     idle = np.flatnonzero(bench.idle)
-    rows, forces, numbers, counts = [], [], [], []
+    rows, forces, numbers, counts, rests = [], [], [], [], []
     resting = _middle(raw[idle])
     for number in range(len(bench.gauge)):
         frames = np.flatnonzero((press == number) & bench.loading)
@@ -68,6 +71,7 @@ def collect_responses(bench: BenchData) -> Responses:
         before = idle[idle < frames[0]][-_BEFORE:]
         rest = _middle(raw[before]) if len(before) >= _FEW else resting
         rest = np.where(np.isfinite(rest), rest, resting)
+        rests.append(rest)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
             rows.append(_middle(raw[step]) - rest)
             forces.append(force[step].mean())
@@ -75,7 +79,9 @@ def collect_responses(bench: BenchData) -> Responses:
             counts.append(len(step))
     measured = np.nan_to_num(np.array(rows))
     noise, step = _noise(bench, idle)
-    error = noise * math.pi / 2 * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
+    error = noise * _MEDIAN * math.sqrt(1 / float(np.median(counts)) + 1 / _BEFORE)
+    if len(rests) > 2:  # slow noise, which no mean reduces
+        error = np.maximum(error, _MAD * np.nan_to_num(_middle(np.abs(np.diff(rests, axis=0)))))
     floor = np.maximum(np.maximum(_SURE * error, _VISIBLE * noise), _STEP * step)
     responding = np.abs(measured).max(axis=0) > floor
     return Responses(measured, np.array(forces), np.array(numbers), error, responding)
@@ -84,8 +90,8 @@ def collect_responses(bench: BenchData) -> Responses:
 def match_channels(responses: Responses, each: np.ndarray) -> Match:
     """Compare every channel with the prediction for every sensor.
 
-    A channel reads gain times the prediction up to a limit. Both are free, and the gain may be negative; but
-    it may not exceed the median gain of the channels by a factor of 20.
+    A channel reads gain times the prediction up to a limit. Both are free, and the gain may be negative. But
+    a channel that responds strongly is not explained by a sensor that no press reaches.
 
     Args:
         responses: of the session.
@@ -98,22 +104,23 @@ def match_channels(responses: Responses, each: np.ndarray) -> Match:
     energy = (responses.measured**2).sum(axis=0)
     unit = responses.measured / np.sqrt(np.where(energy > 0, energy, 1.0))
     best = np.zeros((unit.shape[1], shape.shape[1]))
-    slope = np.ones_like(best)
     for limit in _LIMITS:
         clipped = np.clip(limit * shape, -1.0, 1.0)
         size = np.sqrt((clipped**2).sum(axis=0))
         likeness = unit.T @ clipped / np.where(size > 0, size, 1.0)
-        better = np.abs(likeness) > np.abs(best)
-        best = np.where(better, likeness, best)
-        gain = likeness * np.sqrt(energy)[:, None] / np.where(size > 0, size, 1.0) * limit
-        slope = np.where(better, np.abs(gain) / np.where(reached, largest, 1.0), slope)
+        best = np.where(np.abs(likeness) > np.abs(best), likeness, best)
     noise = len(responses.measured) * responses.error**2 / np.where(energy > 0, energy, np.inf)
     residual = np.clip((1 - best**2 - noise[:, None]) / np.clip(1 - noise[:, None], 0.1, 1.0), 0.0, 1.0)
-    residual[:, ~reached] = 1.0
-    typical = slope[responses.responding, residual[responses.responding].argmin(axis=1)]
-    if len(typical):
-        residual[slope > _STRONGER * np.median(typical)] = 1.0
-    return Match(residual, np.where(best < 0, -1.0, 1.0))
+    strength = np.abs(responses.measured).max(axis=0)
+    expected = largest / max(largest.max(initial=0.0), 1e-300)
+    impossible = (strength / max(strength.max(initial=0.0), 1e-300))[:, None] > _STRONGER * expected
+    residual = np.where(impossible | ~reached, 1.0, residual)
+    sign = np.where(best < 0, -1.0, 1.0)
+    # Beside a press the surface may rise: a channel that is inverse alone has to fit better.
+    nearest = sign[np.arange(len(sign)), residual.argmin(axis=1)][responses.responding]
+    most = -1.0 if nearest.sum() < 0 else 1.0
+    residual = np.where(sign == most, residual, np.minimum(_INVERSE * residual, 1.0))
+    return Match(residual, sign, expected)
 
 
 def find_polarity(responses: Responses, each: np.ndarray) -> np.ndarray:
@@ -140,14 +147,9 @@ def _noise(bench: BenchData, idle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     noise, step = np.zeros(bench.session.raw.shape[1]), np.zeros(bench.session.raw.shape[1])
     for channel, values in enumerate(bench.session.raw.T):
         quiet = idle[np.isfinite(values[idle])]
+        if np.isfinite(values).any():
+            step[channel] = _channel.quantum(values[np.isfinite(values)])
         if len(quiet) < 10 or np.ptp(values[quiet]) == 0:
             continue
-        step[channel] = _channel.quantum(values[np.isfinite(values)])
         noise[channel] = _channel.idle(bench.session.time[quiet], values[quiet], step[channel]).noise
     return noise, step
-
-
-def listed(numbers: Sequence[int]) -> str:
-    """Return numbers in words, as ``2``, ``2 and 5`` or ``2, 5 and 7``."""
-    words = [str(number) for number in numbers]
-    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

@@ -15,6 +15,7 @@ from skin.hardware.record.session_reader import read_session
 from skin.hardware.record.stored_session import StoredSession
 from skin.recording import concatenate
 from skin.recording_file import write_recording
+from skin.signal.calibration import read_calibration
 from skin.wire.conversion import UnitConversion
 from skin.wire.errors import SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import ContinuousSegmenter, RecordedGesture
@@ -94,7 +95,13 @@ def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
         "window": device.window,
         "labels": device.labels,
         "calibration": device.calibration,
-    }
+    } | _channels(device.calibration)
+
+
+def _channels(calibration: str | None) -> dict[str, Any]:
+    """Return the device's channel of every column, where a calibration puts them into another order."""
+    channels = () if calibration is None else read_calibration(calibration).channels
+    return {"channels": list(channels)} if channels else {}
 
 
 def convert_session(device: AbstractWired, path: Path) -> tuple[Path, int]:

@@ -84,3 +84,8 @@ def test_a_limit_is_found_where_only_the_first_step_is_below_it():
     gain, _, limit = clip_and_gain(true, np.minimum(1.6 * true, 10.0) + noise(8, 0.05), 0.05)
     assert gain == pytest.approx(1.6, rel=0.01)
     assert limit == pytest.approx(10, rel=0.01)
+
+
+def test_values_that_differ_in_the_last_digit_alone_have_no_step():
+    values = np.where(np.arange(100) % 2, 512.0, np.nextafter(np.float32(512), np.float32(600)))
+    assert quantum(values) == 0

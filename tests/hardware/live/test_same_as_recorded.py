@@ -146,6 +146,10 @@ def live(learner, stream):
             super()._take(frames)
             turn.set()
 
+        def _wait(self, reason):
+            super()._wait(reason)
+            turn.set()
+
     with skin:
         Turning(skin, device.taring(skin), engine, Taking(info)).run()
     listener.close()

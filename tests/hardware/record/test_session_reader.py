@@ -254,3 +254,19 @@ def test_a_file_with_nothing_beside_it_is_no_session(tmp_path):
     (tmp_path / "x.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match=r"no x\.csv\.json is beside it"):
         read_session(tmp_path / "x.csv")
+
+
+def test_a_channel_whose_values_fall_keeps_its_smallest_value(tmp_path):
+    path = tmp_path / "x.csv"
+    log = SessionLog(path, ABOUT | {"rate": 10.0, "window": 5}, 2)
+    log.conversion(UnitConversion(np.array([0.1, -0.1]), np.array([500.0, 500.0]), np.zeros(2, dtype=bool)))
+    recorded = RecordedGesture(0, None, 0.0, 0)
+    log.begin(recorded, frame(0))
+    for number in range(50):
+        values = 500.0 + np.array([number % 10, -(number % 10)])
+        log.frame(frame(number)._replace(values=values))
+    log.end(recorded)
+    log.close()
+    taken, conversion = read_session(path).gestures[0]
+    readings, _ = conversion(taken.resampled.values, taken.resampled.valid)
+    np.testing.assert_allclose(readings, 0.9, atol=1e-6)

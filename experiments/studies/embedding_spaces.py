@@ -1,7 +1,7 @@
 """Figure 5 of the report, the table of accuracies on embeddings, and verdicts."""
 
 from collections.abc import Callable, Iterable, Sequence
-from statistics import fmean
+from statistics import fmean, stdev
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 
-from experiments.studies.comparison import Uncertainty, combine_verdicts, paired, verdict
+from experiments.studies.comparison import combine_verdicts, paired, verdict
 from experiments.studies.embedding.probe import FRAME, ProbeResult
 from experiments.studies.tables import Page
 from skin.plot.figures import COLOURS, MARKS
@@ -164,10 +164,10 @@ def _title(one: ProbeResult) -> str:
 
 
 def _percent(values: Sequence[float]) -> str:
-    """Return the mean of shares in per cent, with its margin over seeds if there are several."""
+    """Return the mean of shares in per cent, with the deviation over seeds if there are several."""
     if not values or np.isnan(values).any():
         return ""
-    spread = f" ± {100 * Uncertainty.of(values).margin:.1f}" if len(values) > 1 else ""
+    spread = f" ± {100 * stdev(values):.1f}" if len(values) > 1 else ""
     return f"{100 * fmean(values):.1f}{spread}"
 
 

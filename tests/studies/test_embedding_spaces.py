@@ -33,12 +33,12 @@ def three():
     ]
 
 
-def test_the_table_has_means_and_margins(three):
+def test_the_table_has_means_and_deviations(three):
     head, degree, *_ = embeddings_table(three, NAMES)
     assert head[:4] == ["input", "big", "press", "mean"]
     assert degree[0] == "Graph2Vec, degree"
-    assert degree[1:4] == ["55.0 ± 2.5", "45.0 ± 2.5", "50.0 ± 2.5"]
-    assert degree[4:] == ["100.0 ± 0.0", "90.0 ± 2.5", "20.0 ± 0.0"]
+    assert degree[1:4] == ["55.0 ± 1.0", "45.0 ± 1.0", "50.0 ± 1.0"]
+    assert degree[4:] == ["100.0 ± 0.0", "90.0 ± 1.0", "20.0 ± 0.0"]
 
 
 def test_verdicts_follow_the_figures(three):

@@ -56,8 +56,8 @@ def test_finished_runs_are_found_and_judged(run, folder):
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout, "nothing was to be trained"
     page = (folder / "r" / "study_activation.md").read_text()
-    assert "| activation=silu | 81.0 ± 1.2 |" in page
-    assert "+10.2 ± 0.2 points (activation=relu); -10.2 ± 0.2 points (activation=elu) | disagree |" in page
+    assert "| activation=silu | 81.0 ± 2.5 |" in page
+    assert "+10.2 ± 0.5 points (activation=relu); -10.2 ± 0.5 points (activation=elu) | disagree |" in page
     assert len(lines(folder / "r" / "study_activation.csv")) == 9
     assert {path.suffix for path in (folder / "r").iterdir()} == {".md", ".csv", ".png"}
 

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from skin.body.base import AbstractBody
 from skin.config import plain
 from skin.device.base import AbstractDevice
+from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.learner.base import AbstractLearner
 from skin.plausibility import check_plausibility, warn_of_surface
@@ -51,9 +52,17 @@ def build_skin(config: DictConfig) -> Skin:
 
 def _body_and_layout(groups: dict[str, Any], source: str) -> tuple[AbstractBody, AbstractLayout]:
     """Check body, layout and the group of what responds to touches; return the first two."""
-    check_groups({name: groups[name] for name in ("body", "layout", source)})
+    _check_options(groups, "body", "layout", source)
     check_plausibility(groups)
     return instantiate(groups["body"]), instantiate(groups["layout"])
+
+
+def _check_options(groups: dict[str, Any], *names: str) -> None:
+    """Raise InputError where a group names no option, or has settings that its option does not take."""
+    for name in names:
+        if "_target_" not in (groups.get(name) or ()):
+            raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
+    check_groups({name: groups[name] for name in names})
 
 
 def build_device(config: DictConfig) -> AbstractDevice:
@@ -75,7 +84,7 @@ def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
 
     groups = plain(config)
     augmentation = configured(Augmentation, groups["data"]["augment"], "data.augment")
-    check_groups({"representation": groups["representation"]})
+    _check_options(groups, "representation")
     representation = instantiate(groups["representation"])
     return TouchData(
         device,
@@ -97,6 +106,6 @@ def _geometry(config: DictConfig) -> "Tensor":
 
 def build_learner(config: DictConfig) -> AbstractLearner:
     """Return an untrained learner."""
-    learner = plain(config)["learner"]
-    check_groups({"learner": learner})
-    return instantiate(learner, seed=config.seed)
+    groups = plain(config)
+    _check_options(groups, "learner")
+    return instantiate(groups["learner"], seed=config.seed)

@@ -4,6 +4,7 @@ Other packages add verbs in the entry-point group ``skin.verbs``: name = module 
 """
 
 import ast
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -11,6 +12,8 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
+
+from skin import interrupt
 
 
 def verbs() -> dict[str, str]:
@@ -44,7 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     elif _source(known[verb]) is None:
         sys.exit(_refused(f"skin {verb} needs files that an installed package lacks: clone the repository"))
     else:
-        import_module(known[verb]).main(rest)
+        try:
+            import_module(known[verb]).main(rest)
+        except SystemExit as end:
+            if end.code == 128 + signal.SIGTERM and arguments is None:
+                interrupt.leave(end.code)
+            raise
 
 
 def _help(known: Mapping[str, str]) -> str:

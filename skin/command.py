@@ -18,13 +18,16 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import validate_config
-from skin.error_messages import JobInputError, to_input_error
+from skin.config import refuse_null_groups, validate_config
+from skin.error_messages import JobInputError, one_line, to_input_error
+from skin.errors import InputError
 from skin.paths import CONF
 from skin.server import check_server
 from skin.shard import left_out
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
+# What Hydra raises on overrides such as layout=[[1]] or model=1, before a command starts.
+_WORDS = (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[..., None]]:
@@ -46,6 +49,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             if HydraConfig.get().mode == RunMode.MULTIRUN and left_out():
                 return None
             try:
+                refuse_null_groups(config)
                 checked = validate_config(config)
                 if checked.tracking is not None:
                     check_server(checked.tracking.uri)
@@ -65,6 +69,8 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                 _run(job, name, sys.argv[1:] if words is None else words)
             except Exception as error:
                 refused = to_input_error(error)
+                if refused is None and not started and isinstance(error, _WORDS):
+                    refused = InputError(f"the configuration cannot be composed: {one_line(error)}")
                 if refused is None or "HYDRA_FULL_ERROR" in os.environ:
                     raise
                 print(refused, file=sys.stderr)

@@ -17,6 +17,7 @@ from skin.error_messages import one_line
 from skin.errors import InputError
 from skin.fingerprint import config_hash
 
+_TOO_LARGE = 2**63
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
 
@@ -133,17 +134,35 @@ def validate_config(config: DictConfig) -> DictConfig:
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
     assert isinstance(whole, DictConfig)
-    # NaN would pass most comparisons.
-    for name in _not_numbers(OmegaConf.to_container(whole)):
-        raise InputError(f"{name} is nan: give a number")
+    # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
+    for name, reason in _not_numbers(OmegaConf.to_container(whole)):
+        raise InputError(f"{name} is {reason}: give a number")
     OmegaConf.set_readonly(whole, True)
     return whole
 
 
-def _not_numbers(value: Any, name: str = "") -> Iterator[str]:
-    """Yield the names of settings that are NaN."""
+def refuse_null_groups(config: DictConfig) -> None:
+    """Raise InputError where a group of a composed configuration was replaced by null.
+
+    Args:
+        config: as Hydra composes it; groups that a command does not have are missing in it.
+    """
+    groups = {
+        name for name, hint in Config.__annotations__.items() if "dict" in str(hint) or "skin." in str(hint)
+    }
+    for name in sorted(groups & set(config)):
+        if config[name] is None:
+            raise InputError(
+                f"{name}=null leaves nothing to use: give settings or an option, or leave it out"
+            )
+
+
+def _not_numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the names of settings that are NaN or too large, with what they are."""
     if isinstance(value, float) and isnan(value):
-        yield name
+        yield name, "nan"
+    elif isinstance(value, int) and abs(value) >= _TOO_LARGE:
+        yield name, "too large"
     elif isinstance(value, dict | list):
         for key, one in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _not_numbers(one, f"{name}.{key}" if name else str(key))

@@ -23,6 +23,8 @@ _DISK = frozenset(
         errno.ENOTDIR,
     )
 )
+# What a class raises that gets a setting which it cannot use and whose range it does not declare.
+_UNFIT = (ArithmeticError, AttributeError, LookupError, ValueError)
 
 
 class JobInputError(InputError, CompactHydraException):
@@ -54,9 +56,9 @@ def to_input_error(error: Exception) -> InputError | None:
         return cause
     reason = cause or error
     if isinstance(reason, TypeError) and "argument" not in str(reason):
-        return None
+        return InputError(one_line(error)) if isinstance(error, InstantiationException) else None
     if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
-        return None
+        return InputError(one_line(error)) if isinstance(cause, _UNFIT) else None
     return InputError(one_line(reason))
 
 

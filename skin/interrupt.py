@@ -1,11 +1,14 @@
 """Handle Ctrl-C and SIGTERM: the command ends without a traceback, and resources are closed."""
 
+import os
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from threading import Event, Thread
 from types import FrameType, TracebackType
 
+_PATIENCE = _LAST = 1.0  # s
 _usual = sys.excepthook
 
 
@@ -18,19 +21,68 @@ def _handle(kind: type[BaseException], error: BaseException, trace: TracebackTyp
 sys.excepthook = _handle
 
 
-@contextmanager
-def ends_on_signal() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread."""
+def leave(code: int) -> None:
+    """End the process after everything was closed, without waiting for threads that still compute."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
-    def leave(number: int, frame: FrameType | None) -> None:
+
+@contextmanager
+def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
+    """Turn SIGTERM into SystemExit, so that resources are closed; only in the main thread.
+
+    Python handles a signal between two of its own steps, and a solve or a batch of a network is one step that
+    may take ten seconds. If it takes longer than a second, the process ends at once, as if it were killed.
+
+    Args:
+        last: called in another thread before such an end; it has a second.
+    """
+    answered = Event()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        answered.set()
         raise SystemExit(128 + number)
 
     try:
-        before = signal.signal(signal.SIGTERM, leave)
+        before = signal.signal(signal.SIGTERM, end)
     except ValueError:
         yield
         return
     try:
-        yield
+        with _watched(answered, last):
+            yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _watched(answered: Event, last: Callable[[], object] | None) -> Iterator[None]:
+    """End the process where a signal is not answered while the block runs."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    # The interpreter writes the numbers of signals at once, whatever the main thread does.
+    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    watch = Thread(target=_watch, args=(read, answered, last), name="skin-signals", daemon=True)
+    watch.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(write)
+
+
+def _watch(read: int, answered: Event, last: Callable[[], object] | None) -> None:
+    with open(read, "rb", buffering=0) as signals:
+        while numbers := signals.read(64):
+            if signal.SIGTERM in numbers and not answered.wait(_PATIENCE):
+                if last is not None:
+                    ending = Thread(target=_try, args=(last,), daemon=True)
+                    ending.start()
+                    ending.join(_LAST)
+                os._exit(128 + signal.SIGTERM)
+
+
+def _try(last: Callable[[], object]) -> None:
+    with suppress(Exception):  # there is nobody to tell
+        last()

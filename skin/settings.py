@@ -76,6 +76,8 @@ def check_settings(
             near = get_close_matches(key, known, 1)
             meant = f": did you mean {near[0]}?" if near else ":"
             raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(known)}")
+        if key in hints and _takes_made(hints[key]) and isinstance(value, str | int | float | list):
+            raise InputError(f"{name}.{key}={str(value)[:_LONG]} must be an option with its settings")
         if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
             default = _written(parameters[key].default)
             example = f": as in {name}.{key}={default}" if default else ""
@@ -132,6 +134,8 @@ def check_groups(config: Mapping[str, Any]) -> None:
         InputError: as :func:`check_settings`, or a class that cannot be imported.
     """
     for name, part in _parts(config, ""):
+        if not isinstance(part.get("_partial_", False), bool):
+            raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
         # The model is inside the learner, but is set by the name of its group.
         inner = name.split(".")[-1]
         shown = inner if inner in _INNER else name
@@ -175,6 +179,11 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
         if target.__module__.startswith("skin."):
             raise
         return {}  # annotations of others may need names that exist for type checkers only
+
+
+def _takes_made(hint: Any) -> bool:
+    """Return whether an annotation is that of a factory, which Hydra makes of the settings of an option."""
+    return any(get_origin(part) is Callable for part in (hint, *get_args(hint)))
 
 
 def _plain(hint: Any) -> bool:

@@ -146,7 +146,7 @@ class Store:
                 self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
         try:
-            with ends_on_signal():
+            with ends_on_signal(lambda: self.client.set_terminated(run.info.run_id, status)):
                 yield run
             status = "FINISHED"
         except Exception as error:

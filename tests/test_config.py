@@ -7,13 +7,18 @@ import sys
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
+from hypothesis import given
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from omegaconf.errors import ReadonlyConfigError
 
 from skin.build import build_device, build_learner
+from skin.command import command
 from skin.config import fingerprint, plain, validate_config
 from skin.errors import InputError
+from skin.evaluation.operating_point import check_evaluation
 from skin.paths import CONF, ROOT
+from tests.damage import DAMAGED_FILES
 
 GROUPS = ("body", "layout", "simulator", "contact", "device", "representation", "model", "fusion", "learner")
 ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -189,3 +194,103 @@ def test_a_verb_composes_only_what_it_needs(verb, least):
     groups = {"touch", "body", "layout", "simulator", "contact", "device", "data", "representation", "model"}
     groups |= {"fusion", "learner"}
     assert len(groups & set(config)) == least
+
+
+ODD = [
+    "null",
+    "true",
+    "-1",
+    "0",
+    "1",
+    "1e300",
+    "-1e-320",
+    ".inf",
+    "-.inf",
+    ".nan",
+    "nan",
+    "1000000000",
+    "9999999999999999999999",
+    "''",
+    "x",
+    "[]",
+    "[1]",
+    "[1,2]",
+    "[1,2,3]",
+    "[null]",
+    "[-1,.inf]",
+    "{}",
+    "{a:1}",
+    "[[1]]",
+    "'{x'",
+    "'${x}'",
+    "../x",
+    "/dev/zero",
+    "0.5",
+    "[x,y]",
+    "[1e300,1e300]",
+    "[0,0]",
+    "${seed}",
+    "${nosuch}",
+    "1,2",
+]
+
+
+def names(value, before=""):
+    """Return the names of all settings and groups of a configuration."""
+    if not isinstance(value, dict):
+        return []
+    below = [name for key, part in value.items() for name in names(part, f"{before}{key}.")]
+    return [f"{before}{key}" for key in value if key != "_target_"] + below
+
+
+def built(word):
+    """Compose the configuration of a training with an override, and build its parts, as a command does."""
+
+    def task(config):
+        build_device(config)
+        build_learner(config)
+        check_evaluation(config.evaluation)
+
+    task.__module__ = "skin.commands.train"  # where Hydra looks for its help
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.exit", lambda code: None)
+        patch.setattr("logging.config.dictConfig", lambda *_: None)
+        command("train")(task)([word, "simulator=naive", "hydra.output_subdir=null", "hydra.run.dir=."])
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "evaluation=null",
+        "trainer=null",
+        "contact._partial_=../x",
+        "device.contact=''",
+        "representation=2147483648",
+        "layout=[[1]]",
+        "layout=[]",
+        "device.stuck=99999999999999999999999999",
+        "device.touch=-1",
+        "model.width=1e300",
+    ],
+)
+def test_settings_that_nobody_means_cost_one_sentence(word, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    built(word)
+    message = capsys.readouterr().err
+    assert len(message.splitlines()) == 1, message
+    assert "Traceback" not in message
+
+
+@pytest.mark.slow
+def test_every_setting_works_or_is_refused_whatever_it_is_set_to(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = OmegaConf.to_container(compose("train", ["simulator=naive"]))
+    settings_of = [name for name in names(config) if not name.startswith(("hydra", "tracking"))]
+
+    @DAMAGED_FILES
+    @given(st.sampled_from(settings_of), st.sampled_from(ODD))
+    def try_it(name, value):
+        built(f"{name}={value}")
+
+    try_it()

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+from time import monotonic
 
 import pytest
 
@@ -38,3 +39,37 @@ def test_other_errors_keep_their_traceback():
         check=False,
     )
     assert (done.returncode, "Traceback" in done.stderr) == (1, True)
+
+
+BUSY = """
+import hashlib
+from skin.interrupt import ends_on_signal
+try:
+    with ends_on_signal(lambda: print("last", flush=True)):
+        print("busy", flush=True)
+        {}
+finally:
+    print("closed", flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("step", "lines"),
+    [
+        # A library in the middle of its work, which Python cannot interrupt.
+        ("hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)", ["busy", "last"]),
+        ("__import__('time').sleep(60)", ["busy", "closed"]),
+    ],
+    ids=["native", "python"],
+)
+def test_sigterm_is_answered_within_seconds_whatever_the_process_does(step, lines):
+    line = [sys.executable, "-c", BUSY.format(step)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout.readline() == "busy\n"
+        start = monotonic()
+        process.terminate()
+        said = process.stdout.read().split()
+        process.wait()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert ["busy", *said] == lines
+    assert monotonic() - start < 10

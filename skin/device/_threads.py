@@ -22,10 +22,14 @@ def in_threads(work: Callable[[int], _T], count: int) -> list[_T]:
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
+    pool, ended = ThreadPoolExecutor(threads), False
     try:
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(work, range(count)))
+        return list(pool.map(work, range(count)))
+    except (SystemExit, KeyboardInterrupt):
+        ended = True  # who ends a command need not wait for the batches that are being drawn
+        raise
     finally:
+        pool.shutdown(wait=not ended, cancel_futures=True)
         torch.set_num_threads(threads)
 
 

@@ -77,6 +77,8 @@ class GestureSettings:
         """Return the settings of a configuration; missing ones keep their default."""
         if isinstance(given, GestureSettings):
             return given
+        if given is not None and not isinstance(given, Mapping):
+            raise InputError(f"touch must be settings by name, got {given!r}")
         values = dict(given or {})
         limits = values.pop("thresholds", {})
         if not isinstance(limits, Thresholds):

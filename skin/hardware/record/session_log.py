@@ -6,12 +6,11 @@ invalid channels. Unit, layout and start time are in ``x.csv.json``. Whole lines
 valid up to its last complete frame if the program is interrupted.
 
 The reader skips damaged lines: see :func:`skin.hardware.record.session_reader.read_session`. Events have
-checksums. The line that begins a gesture repeats the invalid and saturated channels, and refers to the unit
-conversion by the checksum of its line, so that a lost line never gives a gesture the baseline of another.
+checksums, and that which ends a gesture has those of its frames. The line that begins a gesture repeats the
+invalid and saturated channels, and refers to the unit conversion by the checksum of its line, so that a lost
+line never gives a gesture the baseline of another.
 """
 
-import json
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,8 +20,8 @@ import numpy as np
 
 from skin import files
 from skin.errors import InputError
-from skin.hardware.record.line_writer import LineWriter, encode_event
-from skin.hardware.record.session_reader import read_session
+from skin.hardware.record.line_writer import LineWriter, encode_event, line_sum
+from skin.hardware.record.session_reader import read_session, write_about
 from skin.hardware.record.stored_session import StoredSession
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion
@@ -47,31 +46,35 @@ class SessionLog:
     def __init__(self, path: Path, about: Mapping[str, Any], sensors: int) -> None:
         self._marked: dict[str, list[int]] = {"invalid": [], "saturated": []}
         self._segment, self._anchor = -1, 0.0
+        self._sums: list[str] = []  # of the frames since the last beginning of a gesture
         self._conversion_checksum: str | None = None
         header = ",".join(["time", "seq", *(f"raw_{number:02d}" for number in range(sensors))]) + "\n"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            stored = self._resume(path, about, header)
-            self._about = stored.about if stored else dict(about) | {"started_unix": time.time()}
-            if stored is None:
-                files.write(json.dumps(self._about) + "\n", path.with_name(path.name + ".json"))
+            begun = _is_begun(path, header)
+            if not begun:
+                self._about = dict(about) | {"started_unix": time.time()}
+                write_about(self._about, path)
                 files.write(header, path)
         except OSError as error:
             raise files.unwritable(path, error, "out=FILE.csv") from error
         self._lines = LineWriter(path)
+        try:
+            stored = self._resume(path, about) if begun else None
+        except BaseException:
+            self._lines.close()
+            raise
+        if stored is not None:
+            self._about = stored.about
         self.done = set(stored.gestures) if stored else set()
         self._last = stored.end if stored else -1.0
 
-    @staticmethod
-    def _resume(path: Path, about: Mapping[str, Any], header: str) -> StoredSession | None:
-        """Return the existing session; None if there is at most a header."""
-        whole = path.read_bytes() if path.exists() else b""
-        if header.encode().startswith(whole):
-            return None
+    def _resume(self, path: Path, about: Mapping[str, Any]) -> StoredSession:
+        """Return the existing session."""
         stored = read_session(path)
         check_session(path, stored.about, about)
         # An incomplete last line, after a power cut, would damage the next one.
-        os.truncate(path, whole.rfind(b"\n") + 1)
+        self._lines.cut(path.read_bytes().rfind(b"\n") + 1)
         return stored
 
     def mark(self, event: str, **what: Any) -> None:
@@ -89,10 +92,12 @@ class SessionLog:
         begin = round(self._time(frame) - (frame.t - gesture.begin), 9)
         known = {"number": gesture.number, "time": begin, "labels": gesture.labels}
         self.mark("begin", **known, meaning=self._conversion_checksum, **self._marked)
+        self._sums = []
 
     def end(self, gesture: RecordedGesture) -> None:
         """Write that a gesture is over, and flush the file to the disk."""
-        self.mark("broken" if gesture.broken else "end", number=gesture.number, lost=gesture.lost)
+        event, sums = "broken" if gesture.broken else "end", "".join(self._sums)
+        self.mark(event, number=gesture.number, lost=gesture.lost, frames=sums)
         self._lines.sync()
         if not gesture.broken:
             self.done.add(gesture.number)
@@ -110,7 +115,9 @@ class SessionLog:
                 self._marked[event] = channels
         self._last = self._time(frame)
         values = ",".join(f"{value:.9g}" for value in frame.values.tolist())
-        self._lines.add(f"{self._last:.9f},{'' if frame.seq is None else frame.seq},{values}")
+        line = f"{self._last:.9f},{'' if frame.seq is None else frame.seq},{values}"
+        self._sums.append(line_sum(line))
+        self._lines.add(line)
 
     @property
     def time(self) -> float:
@@ -129,6 +136,16 @@ class SessionLog:
             self._anchor = time.time() - ago - self._about["started_unix"] - frame.t
             self._anchor = max(self._anchor, self._last + 1e-3 - frame.t)
         return frame.t + self._anchor
+
+
+def _is_begun(path: Path, header: str) -> bool:
+    """Return whether a file has more than a header."""
+    if not path.exists():
+        return False
+    if not path.is_file():
+        raise InputError(f"{path} is no regular file: give another out=")
+    with path.open("rb") as file:
+        return not header.encode().startswith(file.read(len(header) + 1))
 
 
 def check_session(path: Path, about: Mapping[str, Any], now: Mapping[str, Any]) -> None:

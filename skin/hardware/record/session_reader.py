@@ -1,17 +1,21 @@
 """Read a session, skipping damaged lines."""
 
-import json
 import logging
 from collections import deque
+from functools import partial
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from skin import files
+from skin.checksum import sha256
 from skin.errors import InputError
-from skin.hardware.record.line_writer import decode_event
+from skin.hardware.record.line_writer import decode_event, line_sum
 from skin.hardware.record.stored_session import StoredSession
+from skin.safe_loading import parse_json, read_file, regular
+from skin.sensors import MOST
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
 from skin.wire.conversion import UnitConversion
@@ -24,6 +28,9 @@ _IN_EVENTS = b' #"[]{}:\0'  # not in frames; after a power cut any line may cons
 _SPOILT = 2  # damaged bytes in a line that still counts as a frame
 _SLACK = 1e-6  # s: times are rounded
 _BEFORE = 512  # frames
+_DIGITS = 8  # of the checksum of a line
+_LINE = 1 << 20  # bytes: a frame of the most sensors has a fifth of it
+_LONGEST = 100_000  # frames of a window
 _STARTS = ("cut", "reset", "reconnect")
 _BAD = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 
@@ -32,8 +39,8 @@ def read_session(path: Path) -> StoredSession:
     """Read a session; warn of damaged lines and gestures.
 
     An incomplete line at the end and incomplete gestures are left out. A damaged line is skipped and counted.
-    Within a gesture, a damaged frame counts as lost. If the line may have been an event, or if the line with
-    the unit conversion is damaged, the gesture is left out.
+    Within a gesture, a damaged frame counts as lost, also one that only its checksum shows. If the line may
+    have been an event, or if the line with the unit conversion is damaged, the gesture is left out.
 
     Raises:
         InputError: no such file, or not a session of skin record.
@@ -43,8 +50,9 @@ def read_session(path: Path) -> StoredSession:
         raise InputError(f"{path} is no session of skin record: no {beside.name} is beside it")
     try:
         reading = _Reading(_about(beside))
+        regular(path)
         with path.open("rb") as file:
-            for number, line in enumerate(file, 1):
+            for number, line in enumerate(iter(partial(file.readline, _LINE), b""), 1):
                 if line.endswith(b"\n"):
                     reading.line(number, line[:-1])
     except FileNotFoundError as error:
@@ -63,16 +71,39 @@ def read_session(path: Path) -> StoredSession:
 
 def _about(beside: Path) -> dict[str, Any]:
     """Return the metadata of a session; an error of _BAD if they are invalid."""
-    about = json.loads(beside.read_text(encoding="utf-8"))
+    about = parse_json(read_file(beside))
+    if isinstance(about, dict) and about.pop("sum", None) not in (None, _about_sum(about)):
+        raise ValueError("its checksum is not that of its content")
     if not isinstance(about, dict) or not {"positions", "started_unix"} <= set(about):
         raise ValueError("it has no positions or no started_unix")
     places = np.array(about["positions"], dtype=float)
     numbers = [about["started_unix"], *(about[name] for name in ("window", "rate") if name in about)]
-    if places.ndim != 2 or not places.size or not np.isfinite(places).all():
-        raise ValueError("positions are no rows of numbers")
+    if places.ndim != 2 or not 1 <= len(places) <= MOST or not np.isfinite(places).all():
+        raise ValueError(f"positions are not 1 to {MOST} rows of numbers")
     if not all(isinstance(value, int | float) and 0 < value < inf for value in numbers):
         raise ValueError("started_unix, window and rate must be numbers above 0")
+    if "window" in about and not (isinstance(about["window"], int) and about["window"] <= _LONGEST):
+        raise ValueError(f"window must be a whole number of at most {_LONGEST} frames")
     return about
+
+
+def write_about(about: dict[str, Any], path: Path) -> None:
+    """Write the metadata of a session beside it, with their checksum.
+
+    Args:
+        about: JSON data.
+        path: of the session.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    files.write(
+        files.json_line(about | {"sum": _about_sum(about)}) + "\n", path.with_name(path.name + ".json")
+    )
+
+
+def _about_sum(about: dict[str, Any]) -> str:
+    return sha256(files.json_line(about, sort_keys=True).encode())
 
 
 class _Reading:
@@ -97,6 +128,7 @@ class _Reading:
         self._before: deque[Frame] = deque(maxlen=_BEFORE)
         self._missing = 0
         self._spoilt, self._doubtful = 0, False
+        self._sums: dict[int, str] = {}  # id of a frame of the gesture -> checksum of its line
         # The last two frames, each with the number of its line, to check that time increases.
         self._last: list[tuple[int, Frame]] = []
 
@@ -151,6 +183,8 @@ class _Reading:
         self._last = [*self._last[-1:], (number, frame)]
         self.stored.frames, self.stored.end = self.stored.frames + 1, frame.t
         (self._before if self._gesture is None else self._gesture.frames).append(frame)
+        if self._gesture is not None:
+            self._sums[id(frame)] = line_sum(text)
 
     def _in_time(self, frame: Frame) -> None:
         """Check that time increases; of two contradicting frames, drop the one that does not fit."""
@@ -180,7 +214,7 @@ class _Reading:
             case "begin":
                 self._begin(content)
             case "end":
-                self._end(int(content["number"]), int(content["lost"]))
+                self._end(int(content["number"]), int(content["lost"]), content.get("frames"))
             case "gap":
                 # The device's clock restarts; a gesture may begin with the next frame.
                 if content["after"] in _STARTS:
@@ -205,6 +239,7 @@ class _Reading:
         if not isfinite(content["time"]) or not set((labels or {}).values()) <= {0, 1}:
             raise ValueError("no gesture")
         self._gesture, self._spoilt = RecordedGesture(number, labels, float(content["time"]), 0), 0
+        self._sums = {}
         # Older sessions do not refer to a conversion.
         meant = content.get("meaning")
         if self._conversion is None or (self._doubtful if meant is None else meant != self._conversion[0]):
@@ -222,11 +257,20 @@ class _Reading:
         self._before.extend(gesture.frames)
         return window.since(gesture.begin)
 
-    def _end(self, number: int, lost: int) -> None:
+    def _drop_changed(self, gesture: RecordedGesture, sums: str) -> None:
+        """Drop frames that look whole but are not those that were recorded; they count as lost."""
+        written = {sums[start : start + _DIGITS] for start in range(0, len(sums), _DIGITS)}
+        kept = [frame for frame in gesture.frames if self._sums[id(frame)] in written]
+        self._spoilt += len(gesture.frames) - len(kept)
+        gesture.frames[:] = kept
+
+    def _end(self, number: int, lost: int, frames: str | None) -> None:
         gesture, self._gesture = self._gesture, None
         # Another number: the line of an end or a beginning is damaged.
         if gesture is None or gesture.number != number or self._conversion is None:
             return
+        if frames is not None:  # older sessions have none
+            self._drop_changed(gesture, frames)
         inside = [
             frame.t
             for frame in gesture.frames

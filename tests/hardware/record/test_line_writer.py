@@ -232,3 +232,31 @@ def test_an_event_with_another_digit_is_told_from_the_right_one():
     assert decode_event(line) == ({"event": "begin", "number": 3, "labels": {"big": 1}, "time": 0.5}, token)
     with pytest.raises(ValueError, match="checksum"):
         decode_event(line.replace('"big": 1', '"big": 0'))
+
+
+def test_a_hard_link_is_the_same_file(tmp_path):
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    with locked(first):
+        log = SessionLog(first, ABOUT, 2)
+        log.conversion(UnitConversion(np.ones(2), np.zeros(2), np.zeros(2, bool)))
+        log.frame(frame(0))
+        os.link(first, second)
+        os.link(tmp_path / "first.csv.json", tmp_path / "second.csv.json")
+        with (
+            pytest.raises(InputError, match=r"second\.csv is being recorded by another process"),
+            locked(second),
+        ):
+            pass
+        with pytest.raises(InputError, match=r"second\.csv is being recorded by another process"):
+            SessionLog(second, ABOUT, 2)
+        log.frame(frame(1))
+        log.close()
+    with locked(second):
+        SessionLog(second, ABOUT, 2).close()
+    assert read_session(first).frames == 2
+
+
+def test_a_device_is_no_session(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match="is no regular file"):
+        SessionLog(tmp_path / "pipe.csv", ABOUT, 2)

@@ -36,6 +36,7 @@ from skin.errors import InputError
 from skin.files import whole
 from skin.interrupt import ends_on_signal
 from skin.outbox import OutboxClient
+from skin.run_table import TAGS, table_link, tag_experiment
 from skin.server import check_server, is_server
 from skin.source import source_tags
 
@@ -168,12 +169,18 @@ def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
     """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
     if (found := client.get_experiment_by_name(name)) is None:
         try:
-            return client.create_experiment(name, artifact_location=location)
+            return client.create_experiment(name, artifact_location=location, tags=TAGS)
         except MlflowException as error:
             if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                 raise
             return _experiment(client, name, location)
+    tag_experiment(client, found)
     return str(found.experiment_id)
+
+
+def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
+    """Print the link to the runs of ``mlflow.db`` in the current folder, at a server that shows them."""
+    print(f"runs: {table_link(address, Store.open(Tracking(None, None, 'skin', True, None)).experiment)}")
 
 
 def _where() -> str:

@@ -13,7 +13,7 @@ errors interrupt paths option
 trust earlier_settings
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body gesture_measures server shard
+config recording body gesture_measures server shard run_table
 command
 files safe_loading recording_metadata layout summary plausibility outbox
 recording_file touch tracking

@@ -12,8 +12,9 @@ import pytest
 from skin import tracking
 from skin.config import Tracking
 from skin.paths import ROOT
+from skin.run_table import TAGS
 from skin.source import source_tags
-from skin.tracking import Store
+from skin.tracking import Store, print_table_link
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -146,3 +147,25 @@ def test_processes_that_start_at_once_share_one_new_database(tmp_path):
         done = list(pool.map(start, range(2)))
     assert [one.returncode for one in done] == [0, 0], done[-1].stderr
     assert len({one.stdout for one in done}) == 1
+
+
+def test_the_experiment_has_the_tags_of_the_run_table(store):
+    tags = store.client.get_experiment(store.experiment).tags
+    assert tags["mlflow.experimentKind"] == "custom_model_development"
+    view = json.loads(tags["mlflow.sharedViewState.skin"])
+    assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
+
+
+def test_an_experiment_of_an_earlier_version_gets_the_tags(store, settings):
+    for name in TAGS:
+        store.client.delete_experiment_tag(store.experiment, name)
+    assert not store.client.get_experiment(store.experiment).tags
+    assert Store.open(settings).client.get_experiment(store.experiment).tags == TAGS
+
+
+def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    print_table_link("http://127.0.0.1:1")
+    assert capsys.readouterr().out == (
+        "runs: http://127.0.0.1:1/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=skin\n"
+    )

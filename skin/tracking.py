@@ -15,10 +15,11 @@ import platform
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import psutil
 from alembic.util import CommandError
@@ -72,7 +73,7 @@ class Store:
             InputError: the database is none, belongs to another version of MLflow, or cannot be written; or
                 the server does not answer.
         """
-        uri = settings.uri or f"sqlite:///{Path.cwd() / 'mlflow.db'}"
+        uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
         artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
         remote = is_server(uri)
         check_server(uri)
@@ -210,12 +211,17 @@ def is_gone(process: str) -> bool | None:
         return None
 
 
+def database_uri(path: Path) -> str:
+    """Return the URI of a SQLite database, in which ``%`` and ``?`` have a meaning."""
+    return "sqlite:///" + str(path).replace("%", "%25").replace("?", "%3F")
+
+
 def _make(path: Path, artifacts: Path) -> None:
     """Create a database atomically: an incomplete one could not be opened again."""
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
 
     with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
-        SqlAlchemyStore(f"sqlite:///{partial}", str(artifacts)).engine.dispose()
+        SqlAlchemyStore(database_uri(partial), str(artifacts)).engine.dispose()
 
 
 @contextmanager
@@ -224,7 +230,7 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
     if not uri.startswith("sqlite:///"):
         yield
         return
-    path = Path(uri.removeprefix("sqlite:///"))
+    path = Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(f"{path}.lock"):
         if not path.exists() or not path.stat().st_size:
@@ -232,4 +238,9 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
         with closing(sqlite3.connect(path)) as connection:
             # Readers and writers at the same time; the mode stays with the file.
             connection.execute("PRAGMA journal_mode=WAL")
+        encoded = Path(uri.removeprefix("sqlite:///")).parent
+        existed = encoded.exists()
         yield
+        if not existed:  # MLflow makes the folder of the URI without decoding it, and leaves it empty
+            with suppress(OSError):
+                os.removedirs(encoded)

@@ -14,6 +14,7 @@ from skin.config import Tracking
 from skin.paths import ROOT
 from skin.run_table import TAGS
 from skin.source import source_tags
+from skin.stored_run import fetch
 from skin.tracking import Store, print_table_link
 
 # MLflow's own business with SQLAlchemy.
@@ -169,3 +170,16 @@ def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys
     assert capsys.readouterr().out == (
         "runs: http://127.0.0.1:1/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=skin\n"
     )
+
+
+@pytest.mark.parametrize("name", ["a%20b", "what? #1"])
+def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
+    folder = tmp_path / name
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    store = Store.open(Tracking(None, None, "skin", True, None))
+    with store.run("here", {}) as run:
+        store.client.log_text(run.info.run_id, "text", "note.txt")
+    assert fetch(store, run, "note.txt", str(tmp_path)).read_text() == "text"
+    assert (folder / "mlflow.db").is_file()
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]

@@ -232,14 +232,14 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
         return
     path = Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
     path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = Path(uri.removeprefix("sqlite:///")).parent
+    existed = encoded.exists()
     with FileLock(f"{path}.lock"):
         if not path.exists() or not path.stat().st_size:
             _make(path, artifacts)
         with closing(sqlite3.connect(path)) as connection:
             # Readers and writers at the same time; the mode stays with the file.
             connection.execute("PRAGMA journal_mode=WAL")
-        encoded = Path(uri.removeprefix("sqlite:///")).parent
-        existed = encoded.exists()
         yield
         if not existed:  # MLflow makes the folder of the URI without decoding it, and leaves it empty
             with suppress(OSError):

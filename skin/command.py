@@ -18,9 +18,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import validate_config
+from skin.config import overrides, validate_config
 from skin.error_messages import JobInputError, to_input_error
 from skin.paths import CONF
+from skin.quick_checks import check_quickly
 from skin.server import check_server
 from skin.shard import left_out
 
@@ -49,6 +50,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                 checked = validate_config(config)
                 if checked.tracking is not None:
                     check_server(checked.tracking.uri)
+                check_quickly(checked, overrides())
                 return task(checked)
             except Exception as error:
                 refused = to_input_error(error)

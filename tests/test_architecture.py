@@ -14,13 +14,14 @@ trust earlier_settings
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
 config recording body gesture_measures server shard run_table
-command
 files safe_loading recording_metadata layout summary plausibility outbox
 recording_file touch tracking
 simulator data_set
 contact sensor_geometry skin_distribution
 signal
 wire representation
+quick_checks
+command
 device fusion
 classifier class_balance
 datamodule

@@ -44,7 +44,7 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
     settings = configured(FineTuning, plain(config)["adapt"], "adapt")
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     parent = find_run(store, config.run)
     stored = load_configuration(store, parent, config.trust)
     target = find_target(parent, stored, config, settings, overrides)
@@ -65,6 +65,7 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
         point = load_operating_point(parent, learner, stored, target.config.evaluation)
     values = {} if others is None else _before(learner, others, point)
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
+    store = Store.open(config.tracking)
     with store.run(name, identity, parent.info.run_id) as run:
         describe(store, run.info.run_id, target.config, touches_hash(touches))
         found = fine_tune(network, data, touches, settings)

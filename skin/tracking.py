@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import unquote
 
 import psutil
@@ -96,8 +96,24 @@ class Store:
         store._close_abandoned()
         return store
 
+    @classmethod
+    def existing(cls, settings: Tracking) -> "Store":
+        """Return the experiment like :meth:`open`; without a database, one without runs, and make no file.
+
+        For a command that may still be refused. The client of such a store cannot be used.
+
+        Raises:
+            InputError: as of :meth:`open`.
+        """
+        uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
+        if uri.startswith("sqlite:///") and not _database(uri).exists():
+            return cls(cast(MlflowClient, None), uri, "", settings.recorded)
+        return cls.open(settings)
+
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
         """Return the runs that have the tags, newest first; ``status`` as MLflow calls it (``FINISHED``)."""
+        if not self.experiment:
+            return []
         terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
         terms += [f"attributes.status = '{status}'"] if status else []
         found = self.client.search_runs(
@@ -216,6 +232,11 @@ def database_uri(path: Path) -> str:
     return "sqlite:///" + str(path).replace("%", "%25").replace("?", "%3F")
 
 
+def _database(uri: str) -> Path:
+    """Return the file of a SQLite database."""
+    return Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
+
+
 def _make(path: Path, artifacts: Path) -> None:
     """Create a database atomically: an incomplete one could not be opened again."""
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
@@ -230,7 +251,7 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
     if not uri.startswith("sqlite:///"):
         yield
         return
-    path = Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
+    path = _database(uri)
     path.parent.mkdir(parents=True, exist_ok=True)
     encoded = Path(uri.removeprefix("sqlite:///")).parent
     existed = encoded.exists()

@@ -16,6 +16,7 @@ from skin.run_table import TAGS
 from skin.source import source_tags
 from skin.stored_run import fetch
 from skin.tracking import Store, print_table_link
+from skin.trained import load_run
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -183,3 +184,35 @@ def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
     assert fetch(store, run, "note.txt", str(tmp_path)).read_text() == "text"
     assert (folder / "mlflow.db").is_file()
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]
+
+
+def test_a_store_without_a_database_has_no_runs_and_makes_no_file(tmp_path):
+    store = Store.existing(Tracking(f"sqlite:///{tmp_path}/m.db", None, "skin", True, None))
+    assert store.find("FINISHED", fingerprint="a") == []
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_database_is_opened(settings, store):
+    assert Store.existing(settings).experiment == store.experiment
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "run=latest"],
+        ["live", "run=none"],
+        ["export", "run=latest", "out=x.onnx"],
+        ["train", "simulator=fem", "body=arm", "layout=grid"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_refused_command_leaves_no_database(words, run, tmp_path):
+    done = run(tmp_path, *words, store=False)
+    assert done.returncode == 2, done.stderr
+    assert not list(tmp_path.glob("mlflow.db*"))
+
+
+def test_a_pretrained_model_needs_no_database(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_run("any_skin").window == 30
+    assert not list(tmp_path.glob("mlflow.db*"))

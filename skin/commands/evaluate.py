@@ -29,7 +29,7 @@ def main(config: DictConfig) -> None:
     from skin.trained import load_trained
 
     quiet()
-    store, folder = Store.open(config.tracking), results(config.out)
+    store, folder = Store.existing(config.tracking), results(config.out)
     run = find_run(store, config.run)
     stored, given = load_configuration(store, run, config.trust), overrides()
     config = apply_overrides(stored, config, given)
@@ -40,6 +40,7 @@ def main(config: DictConfig) -> None:
     touches = device.touches("test")  # read before anything is logged, because a port may fail
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
+    store = Store.open(config.tracking)
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         # Evaluations do not overwrite each other's files.
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"

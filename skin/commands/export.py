@@ -58,7 +58,7 @@ def main(config: DictConfig) -> None:
     from skin.trained import choose_for_skin, load_trained
 
     quiet()
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     run = find_run(store, config.run)
     stored = load_configuration(store, run, config.trust)
     whole = apply_overrides(stored, config, overrides())

@@ -24,6 +24,7 @@ from skin.paths import CONF
 from skin.quick_checks import check_quickly
 from skin.server import check_server
 from skin.shard import left_out
+from skin.suggestions import suggest
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
 
@@ -63,13 +64,14 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
 
         def main(words: Sequence[str] | None = None) -> None:
             _log_to_stderr()
+            given = sys.argv[1:] if words is None else words
             try:
-                _run(job, name, sys.argv[1:] if words is None else words)
+                _run(job, name, given)
             except Exception as error:
                 refused = to_input_error(error)
                 if refused is None or "HYDRA_FULL_ERROR" in os.environ:
                     raise
-                print(refused, file=sys.stderr)
+                print(suggest(error, name, given) or refused, file=sys.stderr)
                 sys.exit(1 if started else 2)
 
         return main

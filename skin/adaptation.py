@@ -17,6 +17,7 @@ from skin.evaluation.operating_point import OperatingPoint, choose_operating_poi
 from skin.evaluation.report import evaluate
 from skin.fine_tuning import Adaptation, FineTuning, fine_tune
 from skin.learner.base import AbstractLearner
+from skin.progress import Steps
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_learner, log_report, tags
 from skin.settings import configured
@@ -26,6 +27,16 @@ from skin.tracking import Store
 
 ADAPTED = "adapted"
 """Tag of an adapted run: the id of the run that it was made from."""
+
+
+# Expected seconds of each step, for the share in the progress.
+_STEPS = {
+    "loading the run": 10.0,
+    "reading or simulating the gestures": 15.0,
+    "choosing the threshold of the alarm": 15.0,
+    "fine-tuning": 60.0,
+    "evaluating the result": 40.0,
+}
 
 
 def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -41,10 +52,15 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
         InputError: the run is no network or does not fit the skin, the gestures have no labels, or there are
             fewer than wanted.
     """
+    with Steps(_STEPS) as steps:
+        _adapt(config, overrides, steps)
+
+
+def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
     settings = configured(FineTuning, plain(config)["adapt"], "adapt")
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     parent = find_run(store, config.run)
     stored = load_configuration(store, parent, config.trust)
     target = find_target(parent, stored, config, settings, overrides)
@@ -57,7 +73,11 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
     learner, data = build_learner(target.config), build_data(target.config, target.device.blank())
     load_learner(store, parent, learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
+    steps.begin("reading or simulating the gestures")
+    steps.silent = target.device.wired is not None
     touches, others = choose_gestures(target.device, settings)
+    steps.silent = False
+    steps.begin("choosing the threshold of the alarm")
     # The threshold of a run of drawn skins holds for all of them together.
     if "skins" in stored.device or target.config.evaluation.profile is not None:
         point = choose_operating_point(learner, target.twin, target.config.evaluation)
@@ -65,10 +85,13 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
         point = load_operating_point(parent, learner, stored, target.config.evaluation)
     values = {} if others is None else _before(learner, others, point)
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
+    store = Store.open(config.tracking)
     with store.run(name, identity, parent.info.run_id) as run:
         describe(store, run.info.run_id, target.config, touches_hash(touches))
+        steps.begin("fine-tuning")
         found = fine_tune(network, data, touches, settings)
         log_learner(store, run, learner)
+        steps.begin("evaluating the result")
         if found.better and point is not None:
             point = choose_operating_point(learner, target.twin, target.config.evaluation)
         values |= _validation(found, touches, target.device)

@@ -18,12 +18,14 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import refuse_null_groups, validate_config
+from skin.config import overrides, refuse_null_groups, validate_config
 from skin.error_messages import JobInputError, one_line, to_input_error
 from skin.errors import InputError
 from skin.paths import CONF
+from skin.quick_checks import check_quickly
 from skin.server import check_server
 from skin.shard import left_out
+from skin.suggestions import suggest
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold
 # What Hydra raises on overrides such as layout=[[1]] or model=1, before a command starts.
@@ -53,6 +55,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
                 checked = validate_config(config)
                 if checked.tracking is not None:
                     check_server(checked.tracking.uri)
+                check_quickly(checked, overrides())
                 return task(checked)
             except Exception as error:
                 refused = to_input_error(error)
@@ -65,15 +68,16 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
 
         def main(words: Sequence[str] | None = None) -> None:
             _log_to_stderr()
+            given = sys.argv[1:] if words is None else words
             try:
-                _run(job, name, sys.argv[1:] if words is None else words)
+                _run(job, name, given)
             except Exception as error:
                 refused = to_input_error(error)
                 if refused is None and not started and isinstance(error, _WORDS):
                     refused = InputError(f"the configuration cannot be composed: {one_line(error)}")
                 if refused is None or "HYDRA_FULL_ERROR" in os.environ:
                     raise
-                print(refused, file=sys.stderr)
+                print(suggest(error, name, given) or refused, file=sys.stderr)
                 sys.exit(1 if started else 2)
 
         return main

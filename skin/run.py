@@ -66,7 +66,7 @@ def train(config: DictConfig) -> bool:
     if getattr(rank_zero_only, "rank", 0):
         _join(config)
         return True
-    store, identity = Store.open(config.tracking), tags(config)
+    store, identity = Store.existing(config.tracking), tags(config)
     identity["threads"] = str(torch.get_num_threads())
     finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if finished:
@@ -81,6 +81,7 @@ def train(config: DictConfig) -> bool:
     learner.check(data)
     report_balance(device, shown=PARENT not in os.environ)
     name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
+    store = Store.open(config.tracking)
     again = find_unfinished(store, config.tracking, identity["fingerprint"])
     with (
         store.run(name, identity, os.environ.get(PARENT), again) as run,

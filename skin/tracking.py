@@ -15,10 +15,11 @@ import platform
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from urllib.parse import unquote
 
 import psutil
 from alembic.util import CommandError
@@ -36,6 +37,7 @@ from skin.errors import InputError
 from skin.files import whole
 from skin.interrupt import ends_on_signal
 from skin.outbox import OutboxClient
+from skin.run_table import TAGS, table_link, tag_experiment
 from skin.server import check_server, is_server
 from skin.source import source_tags
 
@@ -71,7 +73,7 @@ class Store:
             InputError: the database is none, belongs to another version of MLflow, or cannot be written; or
                 the server does not answer.
         """
-        uri = settings.uri or f"sqlite:///{Path.cwd() / 'mlflow.db'}"
+        uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
         artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
         remote = is_server(uri)
         check_server(uri)
@@ -94,8 +96,24 @@ class Store:
         store._close_abandoned()
         return store
 
+    @classmethod
+    def existing(cls, settings: Tracking) -> "Store":
+        """Return the experiment like :meth:`open`; without a database, one without runs, and make no file.
+
+        For a command that may still be refused. The client of such a store cannot be used.
+
+        Raises:
+            InputError: as of :meth:`open`.
+        """
+        uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
+        if uri.startswith("sqlite:///") and not _database(uri).exists():
+            return cls(cast(MlflowClient, None), uri, "", settings.recorded)
+        return cls.open(settings)
+
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
         """Return the runs that have the tags, newest first; ``status`` as MLflow calls it (``FINISHED``)."""
+        if not self.experiment:
+            return []
         terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
         terms += [f"attributes.status = '{status}'"] if status else []
         found = self.client.search_runs(
@@ -168,12 +186,18 @@ def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
     """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
     if (found := client.get_experiment_by_name(name)) is None:
         try:
-            return client.create_experiment(name, artifact_location=location)
+            return client.create_experiment(name, artifact_location=location, tags=TAGS)
         except MlflowException as error:
             if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                 raise
             return _experiment(client, name, location)
+    tag_experiment(client, found)
     return str(found.experiment_id)
+
+
+def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
+    """Print the link to the runs of ``mlflow.db`` in the current folder, at a server that shows them."""
+    print(f"runs: {table_link(address, Store.open(Tracking(None, None, 'skin', True, None)).experiment)}")
 
 
 def _where() -> str:
@@ -203,12 +227,22 @@ def is_gone(process: str) -> bool | None:
         return None
 
 
+def database_uri(path: Path) -> str:
+    """Return the URI of a SQLite database, in which ``%`` and ``?`` have a meaning."""
+    return "sqlite:///" + str(path).replace("%", "%25").replace("?", "%3F")
+
+
+def _database(uri: str) -> Path:
+    """Return the file of a SQLite database."""
+    return Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
+
+
 def _make(path: Path, artifacts: Path) -> None:
     """Create a database atomically: an incomplete one could not be opened again."""
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
 
     with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
-        SqlAlchemyStore(f"sqlite:///{partial}", str(artifacts)).engine.dispose()
+        SqlAlchemyStore(database_uri(partial), str(artifacts)).engine.dispose()
 
 
 @contextmanager
@@ -217,8 +251,10 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
     if not uri.startswith("sqlite:///"):
         yield
         return
-    path = Path(uri.removeprefix("sqlite:///"))
+    path = _database(uri)
     path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = Path(uri.removeprefix("sqlite:///")).parent
+    existed = encoded.exists()
     with FileLock(f"{path}.lock"):
         if not path.exists() or not path.stat().st_size:
             _make(path, artifacts)
@@ -226,3 +262,6 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
             # Readers and writers at the same time; the mode stays with the file.
             connection.execute("PRAGMA journal_mode=WAL")
         yield
+        if not existed:  # MLflow makes the folder of the URI without decoding it, and leaves it empty
+            with suppress(OSError):
+                os.removedirs(encoded)

@@ -127,7 +127,7 @@ def load_run(
     Raises:
         InputError: there is no such run, it cannot be loaded, or it does not fit the skin.
     """
-    store = Store.open(Tracking(uri, None, "skin", True, None))
+    store = Store.existing(Tracking(uri, None, "skin", True, None))
     run = find_run(store, name)
     stored = load_configuration(store, run, trust)
     try:

@@ -10,17 +10,18 @@ from skin.paths import CONF, ROOT
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
 errors interrupt paths option safe_loading
-trust earlier_settings checksum
+trust earlier_settings checksum suggestions
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body gesture_measures server shard
-command
+config recording body gesture_measures server shard run_table
 files recording_metadata layout summary plausibility outbox
 recording_file touch tracking array_cache
 simulator data_set
 contact sensor_geometry skin_distribution
 signal
 wire representation
+quick_checks
+command
 device fusion
 classifier class_balance
 datamodule

@@ -1,8 +1,10 @@
 """A sweep tells the time left."""
 
+from time import sleep
+
 import pytest
 
-from skin.progress import SweepProgress, expected_seconds, format_duration
+from skin.progress import Steps, SweepProgress, expected_seconds, format_duration
 
 
 def test_nothing_known_gives_no_estimate():
@@ -49,3 +51,25 @@ def test_the_published_table_tells_where_no_run_does(configured):
     )
     assert two - 5 == pytest.approx(2 * (one - 5))
     assert expected_seconds(Empty(), configured(), known | {"row": "custom"}) is None
+
+
+def test_steps_say_the_share_and_the_time_that_is_left(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("skin.progress.time.monotonic", lambda: now[0])
+    steps = Steps({"load": 10, "evaluate": 30})
+    now[0] += 5
+    assert steps.line() == "load: 12 % done, about 35 s left"
+    now[0] += 1000  # longer than expected
+    assert steps.line().startswith("load: 24 % done")
+    now[0] = 120.0
+    steps.begin("evaluate")
+    now[0] += 30  # a machine of half the speed
+    assert steps.line() == "evaluate: 62 % done, about 30 s left"
+
+
+def test_steps_report_without_a_terminal(capsys):
+    with Steps({"load": 1.0}, pause=0.01):
+        sleep(0.1)
+    assert capsys.readouterr().err.startswith("load: ")
+    sleep(0.05)
+    assert capsys.readouterr().err == ""

@@ -12,8 +12,11 @@ import pytest
 from skin import tracking
 from skin.config import Tracking
 from skin.paths import ROOT
+from skin.run_table import TAGS
 from skin.source import source_tags
-from skin.tracking import Store
+from skin.stored_run import fetch
+from skin.tracking import Store, print_table_link
+from skin.trained import load_run
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -146,3 +149,70 @@ def test_processes_that_start_at_once_share_one_new_database(tmp_path):
         done = list(pool.map(start, range(2)))
     assert [one.returncode for one in done] == [0, 0], done[-1].stderr
     assert len({one.stdout for one in done}) == 1
+
+
+def test_the_experiment_has_the_tags_of_the_run_table(store):
+    tags = store.client.get_experiment(store.experiment).tags
+    assert tags["mlflow.experimentKind"] == "custom_model_development"
+    view = json.loads(tags["mlflow.sharedViewState.skin"])
+    assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
+
+
+def test_an_experiment_of_an_earlier_version_gets_the_tags(store, settings):
+    for name in TAGS:
+        store.client.delete_experiment_tag(store.experiment, name)
+    assert not store.client.get_experiment(store.experiment).tags
+    assert Store.open(settings).client.get_experiment(store.experiment).tags == TAGS
+
+
+def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    print_table_link("http://127.0.0.1:1")
+    assert capsys.readouterr().out == (
+        "runs: http://127.0.0.1:1/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=skin\n"
+    )
+
+
+@pytest.mark.parametrize("name", ["a%20b", "what? #1"])
+def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
+    folder = tmp_path / name
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    store = Store.open(Tracking(None, None, "skin", True, None))
+    with store.run("here", {}) as run:
+        store.client.log_text(run.info.run_id, "text", "note.txt")
+    assert fetch(store, run, "note.txt", str(tmp_path)).read_text() == "text"
+    assert (folder / "mlflow.db").is_file()
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]
+
+
+def test_a_store_without_a_database_has_no_runs_and_makes_no_file(tmp_path):
+    store = Store.existing(Tracking(f"sqlite:///{tmp_path}/m.db", None, "skin", True, None))
+    assert store.find("FINISHED", fingerprint="a") == []
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_database_is_opened(settings, store):
+    assert Store.existing(settings).experiment == store.experiment
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "run=latest"],
+        ["live", "run=none"],
+        ["export", "run=latest", "out=x.onnx"],
+        ["train", "simulator=fem", "body=arm", "layout=grid"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_refused_command_leaves_no_database(words, run, tmp_path):
+    done = run(tmp_path, *words, store=False)
+    assert done.returncode == 2, done.stderr
+    assert not list(tmp_path.glob("mlflow.db*"))
+
+
+def test_a_pretrained_model_needs_no_database(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_run("any_skin").window == 30
+    assert not list(tmp_path.glob("mlflow.db*"))

@@ -77,7 +77,7 @@ def _verdicts(
     from skin.stored_run import find_run, load_configuration, load_learner
     from skin.tracking import Store
 
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     run = find_run(store, config.run)
     trained = load_configuration(store, run, config.trust)
     learner = build_learner(trained)

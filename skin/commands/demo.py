@@ -42,7 +42,7 @@ def _emulated(config: DictConfig) -> Iterator[dict[str, str | float]]:
     from skin.tracking import Store
 
     quiet()
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     stored = load_configuration(store, find_run(store, config.run), config.trust)
     device = build_device(apply_overrides(stored, compose("train"), ["device=simulated"]))
     port = open_port("tcp:0", None)

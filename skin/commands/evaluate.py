@@ -7,6 +7,7 @@ Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its 
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -15,10 +16,28 @@ from skin.config import overrides
 from skin.errors import InputError
 from skin.files import results
 
+if TYPE_CHECKING:
+    from skin.progress import Steps
+
+
+# Expected seconds of each step, for the share in the progress.
+_STEPS = {
+    "loading the run and the threshold of its alarm": 20.0,
+    "reading or simulating the touches": 10.0,
+    "evaluating them": 30.0,
+}
+
 
 @command("evaluate")
 def main(config: DictConfig) -> None:
     """Restore a finished run, evaluate it, and print and log the metrics."""
+    from skin.progress import Steps
+
+    with Steps(_STEPS) as steps:
+        _evaluate(config, steps)
+
+
+def _evaluate(config: DictConfig, steps: "Steps") -> None:
     from skin.console import quiet
     from skin.evaluation.metrics_table import print_report
     from skin.evaluation.report import evaluate
@@ -31,7 +50,7 @@ def main(config: DictConfig) -> None:
     from skin.trained import load_trained
 
     quiet()
-    store, folder = Store.open(config.tracking), results(config.out)
+    store, folder = Store.existing(config.tracking), results(config.out)
     run = find_run(store, config.run)
     stored, given = load_configuration(store, run, config.trust), overrides()
     config = apply_overrides(stored, config, given)
@@ -39,9 +58,14 @@ def main(config: DictConfig) -> None:
         raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
     of = load_trained(store, run, config, stored)
     device, learner, point = of.device, of.learner, of.point
+    steps.begin("reading or simulating the touches")
+    steps.silent = device.wired is not None
     touches = device.touches("test")  # read before anything is logged, because a port may fail
+    steps.silent = False
+    steps.begin("evaluating them")
     title = f"{run.info.run_name} ({run.info.run_id})"
     tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
+    store = Store.open(config.tracking)
     with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
         # Evaluations do not overwrite each other's files.
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"

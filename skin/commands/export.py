@@ -21,6 +21,7 @@ from skin.errors import InputError
 from skin.files import results
 
 if TYPE_CHECKING:
+    from skin.progress import Steps
     from skin.recording import Touches
     from skin.trained import Trained
 
@@ -38,9 +39,26 @@ class ExportSettings:
     touches: Annotated[int, Ge(1)]
 
 
+# Expected seconds of each step, for the share in the progress.
+_STEPS = {
+    "loading the run": 10.0,
+    "choosing the threshold of the alarm": 15.0,
+    "tuning the contact threshold": 10.0,
+    "simulating touches to compare": 10.0,
+    "writing the file and comparing it": 15.0,
+}
+
+
 @command("export")
 def main(config: DictConfig) -> None:
     """Restore a finished run, write its network, and print the path."""
+    from skin.progress import Steps
+
+    with Steps(_STEPS) as steps:
+        _export(config, steps)
+
+
+def _export(config: DictConfig, steps: "Steps") -> None:
     from skin.settings import configured
 
     settings = configured(ExportSettings, plain(config)["export"], "export")
@@ -58,20 +76,24 @@ def main(config: DictConfig) -> None:
     from skin.trained import choose_for_skin, load_trained
 
     quiet()
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     run = find_run(store, config.run)
     stored = load_configuration(store, run, config.trust)
     whole = apply_overrides(stored, config, overrides())
     of = load_trained(store, run, whole, stored)
+    steps.begin("choosing the threshold of the alarm")
     if "skins" in stored.device:
         of = replace(of, point=choose_for_skin(of.learner, stored, whole))
     module = of.learner.pipeline(of.positions)  # refused before anything is simulated
     if advice := simulator_warning(stored):
         print(advice, file=sys.stderr)
+    steps.begin("tuning the contact threshold")
     described = describe(of, run.info.run_id, str(run.info.run_name), settings.touch)
     described = replace(described, skin=describe_skin(whole, of.positions.numpy()))
     path = path or results(None) / f"{str(run.info.run_name).split()[0]}_{run.info.run_id[:8]}.onnx"
+    steps.begin("simulating touches to compare")
     touches = _touches(of, settings.touches)
+    steps.begin("writing the file and comparing it")
     difference = write_model(module, described, touches, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
 

@@ -47,7 +47,7 @@ def main(config: DictConfig) -> None:
     folder = Path(MODELS) / config.name
     if folder.exists():
         raise InputError(f"{folder} exists: delete it, or give the model another name")
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     run = find_run(store, config.run)
     try:
         folder.parent.mkdir(exist_ok=True)

@@ -1,6 +1,7 @@
 """Serial ports and TCP sockets as byte streams."""
 
 import errno
+import os
 import socket
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -40,6 +41,32 @@ def open_stream(port: str, baudrate: int) -> ByteStream:
     return _Socket(port) if port.startswith("socket://") else _Serial(port, baudrate)
 
 
+def check_port(port: str) -> None:
+    """Check that there is something at a port, without opening it: that would restart many boards.
+
+    Args:
+        port: as of :func:`open_stream`. Names of Windows and hosts elsewhere cannot be checked.
+
+    Raises:
+        InputError: there is no such device, or nothing on this machine listens at the address.
+    """
+    if port.startswith("socket://"):
+        _check_address(*_address(port), port)
+    elif os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
+        raise InputError(f"no port {port}: {_existing()}")
+
+
+def _check_address(host: str, number: int, port: str) -> None:
+    """Refuse an address of this machine at which nothing listens: one that could be taken."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except OSError:
+        return  # something listens, or it is another machine
+    raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
+
+
 class _Serial:
     def __init__(self, port: str, baudrate: int) -> None:
         import serial
@@ -62,13 +89,7 @@ class _Serial:
 
 class _Socket:
     def __init__(self, port: str) -> None:
-        try:
-            address = urlsplit(port)
-            host, number = address.hostname, address.port
-        except ValueError:
-            host = number = None
-        if not host or not number:
-            raise InputError(f"{port} is no address: give device.port=socket://HOST:NUMBER")
+        host, number = _address(port)
         try:
             self._socket = socket.create_connection((host, number), timeout=_CONNECT)
         except OSError as error:
@@ -92,6 +113,18 @@ class _Socket:
 
     def close(self) -> None:
         self._socket.close()
+
+
+def _address(port: str) -> tuple[str, int]:
+    """Return host and number of ``socket://host:number``."""
+    try:
+        address = urlsplit(port)
+        host, number = address.hostname, address.port
+    except ValueError:
+        host = number = None
+    if not host or not number:
+        raise InputError(f"{port} is no address: give device.port=socket://HOST:NUMBER")
+    return host, number
 
 
 def _refused(port: str, baudrate: int, error: Exception) -> InputError:

@@ -234,10 +234,24 @@ class Engine:
         if not contact and not risen:
             self._idle = readings, valid
         lasted = None if self._contact.since is None else time - self._contact.since
-        which = ~valid[-1], ~self._responds[:, valid[-1]].any(axis=1), below[-1]
-        sensors = (tuple(np.flatnonzero(part).tolist()) for part in which)
-        shown = self._presented(readings, valid, lasted or 0.0)
-        return [_Decision(frame, time, *shown, contact, risen, lasted, seen.gap, *sensors, last)]
+        unknown = ~self._responds[:, valid[-1]].any(axis=1)
+        readings, known = self._presented(readings, valid, lasted or 0.0)
+        return [
+            _Decision(
+                frame=frame,
+                time=time,
+                readings=readings,
+                valid=known,
+                contact=contact,
+                risen=risen,
+                lasted=lasted,
+                gap=seen.gap,
+                masked=_numbers(~valid[-1]),
+                unknown=_numbers(unknown),
+                below=_numbers(below[-1]),
+                last=last,
+            )
+        ]
 
     def _presented(
         self, readings: np.ndarray, valid: np.ndarray, lasted: float
@@ -310,6 +324,11 @@ class Engine:
         # A word must not stand beside the probability of its opposite.
         self._agreeing |= {name: chances[name] for name in gated if labels[name] == predicted[name]}
         return labels
+
+
+def _numbers(which: np.ndarray) -> tuple[int, ...]:
+    """Return the numbers of the sensors in a mask (S,)."""
+    return tuple(np.flatnonzero(which).tolist())
 
 
 class _Freshness:

@@ -73,7 +73,7 @@ class SelfTest:
         return replace(self.nominal, detection=replace(detection, threshold=threshold))
 
     def find(self, settings: EngineSettings, conversion: UnitConversion, device: RawRange) -> np.ndarray:
-        """Return which of the presses raise the alarm, (P,), bool: a fast one on each sensor, some slow ones."""
+        """Return which presses raise the alarm, (P,), bool: a fast one on each sensor, and some slow ones."""
         engine, raised = settings.build(), list[bool]()
         # Without noise: the frozen frames of a test are no fault of the device.
         conversion = replace(conversion, changing=None)

@@ -54,7 +54,7 @@ def watch_run(
         InputError: there is no such run, it cannot be loaded, or the device cannot be opened.
     """
     torch.set_num_threads(config.tracking.threads or 1)
-    store = Store.open(config.tracking)
+    store = Store.existing(config.tracking)
     run = find_run(store, config.run)
     stored = load_configuration(store, run, config.trust)
     watched = apply_overrides(stored, config, given)

@@ -19,7 +19,7 @@ recording_file touch tracking array_cache
 simulator data_set
 contact sensor_geometry skin_distribution
 signal
-wire representation
+wire representation progress
 quick_checks
 command
 device fusion
@@ -34,7 +34,7 @@ exported
 hardware
 plot
 design
-console progress variants
+console variants
 run generation
 sweep adaptation
 commands

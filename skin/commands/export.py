@@ -8,11 +8,12 @@ The file is compared with the run on simulated or recorded touches first.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, MinLen
 from omegaconf import DictConfig
 
 from skin.command import command
@@ -21,6 +22,9 @@ from skin.errors import InputError
 from skin.files import results
 
 if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from skin.exported.metadata import ModelMetadata
     from skin.progress import Steps
     from skin.recording import Touches
     from skin.trained import Trained
@@ -33,17 +37,21 @@ class ExportSettings:
     Attributes:
         touch: contact threshold, N above the baseline; None: that of the run.
         touches: number of touches on which the file is compared with the run.
+        rates: of devices, Hz, for each of which the threshold of the alarm is chosen.
     """
 
     touch: Annotated[float, Gt(0)] | None
     touches: Annotated[int, Ge(1)]
+    rates: Annotated[list[Annotated[float, Gt(0)]], MinLen(1)]
 
 
+_THRESHOLDS = "choosing the thresholds of the alarm for touches"
 # Expected seconds of each step, for the share in the progress.
 _STEPS = {
     "loading the run": 10.0,
     "choosing the threshold of the alarm": 15.0,
     "tuning the contact threshold": 10.0,
+    _THRESHOLDS: 80.0,
     "simulating touches to compare": 10.0,
     "writing the file and comparing it": 15.0,
 }
@@ -89,6 +97,11 @@ def _export(config: DictConfig, steps: "Steps") -> None:
         print(advice, file=sys.stderr)
     steps.begin("tuning the contact threshold")
     described = describe(of, run.info.run_id, str(run.info.run_name), settings.touch)
+    if "simulator" in stored.device and described.threshold is not None:
+        steps.begin(_THRESHOLDS)
+        described = replace(
+            described, thresholds=_thresholds(of, run, stored, whole, described, settings.rates)
+        )
     described = replace(described, skin=describe_skin(whole, of.positions.numpy()))
     path = path or results(None) / f"{str(run.info.run_name).split()[0]}_{run.info.run_id[:8]}.onnx"
     steps.begin("simulating touches to compare")
@@ -96,6 +109,25 @@ def _export(config: DictConfig, steps: "Steps") -> None:
     steps.begin("writing the file and comparing it")
     difference = write_model(module, described, touches, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
+
+
+def _thresholds(
+    of: "Trained",
+    run: "Run",
+    stored: DictConfig,
+    whole: DictConfig,
+    described: "ModelMetadata",
+    rates: Sequence[float],
+) -> dict[str, float]:
+    """Return the thresholds of the alarm for safe touches, by the rate of the device, Hz."""
+    from skin.hardware.live.trained_run import choose_threshold, watching_of
+    from skin.hardware.live.verdict import DebounceSettings
+
+    thresholds = {}
+    for rate in rates:
+        watching = watching_of(of, described.contact, rate, DebounceSettings().alarm, False)
+        thresholds[f"{rate:g}"] = choose_threshold(of, run, stored, whole, watching, print).threshold
+    return thresholds
 
 
 def _touches(of: "Trained", count: int) -> "Touches":

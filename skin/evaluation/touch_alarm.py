@@ -20,8 +20,6 @@ from skin.touch.movie import Movie
 from skin.touch.sampler import balanced
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from skin.evaluation.report import Predictor
 
 SAFE = 2000
@@ -64,7 +62,6 @@ def choose_for_touches(
     watching: Watching,
     target: float,
     count: int = SAFE,
-    track: "Callable[[Iterable[int]], Iterable[int]]" = iter,
 ) -> OperatingPoint:
     """Return the threshold at which a share of safe touches raises the alarm of the live view.
 
@@ -74,11 +71,10 @@ def choose_for_touches(
         watching: how they are watched.
         target: largest share of safe touches that raise the alarm.
         count: number of safe touches.
-        track: wraps the batches to show progress.
     """
     wanted = balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
     safe = wanted[~wanted[:, TOUCH.names.index(LABEL)]][:count]
-    scores = touch_scores(learner, device, watching, safe, device.data_seed, track)
+    scores = touch_scores(learner, device, watching, safe, device.data_seed)
     point = OperatingPoint(lowest_threshold(scores, target), target, len(scores), 0, device.data_seed)
     return replace(point, raised=int(point.alarm(scores).sum()))
 
@@ -90,7 +86,6 @@ def touch_scores(
     watching: Watching,
     wanted: np.ndarray,
     seed: int,
-    track: "Callable[[Iterable[int]], Iterable[int]]" = iter,
 ) -> Tensor:
     """Return the score of each touch: it raises the alarm at thresholds below.
 
@@ -98,7 +93,6 @@ def touch_scores(
         learner, device, watching: as in :func:`choose_for_touches`.
         wanted: (B, 4), bool, labels of the touches.
         seed: of the touches and their devices.
-        track: as there.
 
     Returns:
         (B,), the largest over the decisions of the smallest probability of ``dangerous`` among as many
@@ -106,7 +100,7 @@ def touch_scores(
     """
     device = device.replace(padded=False, stream=False)
     scores = list[Tensor]()
-    for first in track(range(0, len(wanted), _BATCH)):
+    for first in range(0, len(wanted), _BATCH):
         batch, draw = wanted[first : first + _BATCH], generator(Stream.ALARM, seed, 2, first)
         movie = device.sampler.sample(len(batch), draw, batch)
         readings, valid, contact = _decision_windows(device, movie, watching, draw)

@@ -326,7 +326,7 @@ class Engine:
         return labels
 
 
-def _numbers(which: np.ndarray) -> tuple[int, ...]:
+def _numbers(which: np.ndarray | np.bool) -> tuple[int, ...]:
     """Return the numbers of the sensors in a mask (S,)."""
     return tuple(np.flatnonzero(which).tolist())
 

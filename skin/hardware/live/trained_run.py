@@ -1,6 +1,6 @@
 """A finished run for a live view."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from mlflow.entities import Run
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import track
 
 from skin import array_cache
 from skin.build import build_device
@@ -24,6 +22,7 @@ from skin.evaluation.touch_alarm import Watching, choose_for_touches
 from skin.hardware.live import engine_builder
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched, measured_rate, used_settings
+from skin.progress import Steps
 from skin.run_overrides import apply_overrides
 from skin.signal import decisions, device_sampling, imperfection
 from skin.signal.calibration import Calibration, read_calibration
@@ -31,6 +30,7 @@ from skin.stored_run import find_run, load_configuration, load_operating_point
 from skin.tracking import Store
 from skin.trained import Trained, load_trained, threshold_device
 
+_EXPECTED = 20.0  # s
 _SOURCES = (touch_alarm, operating_point, decisions, device_sampling, imperfection)
 
 
@@ -76,7 +76,8 @@ def watch_run(
     if above is None and LABEL in of.device.task.names:
         rate = measured_rate(source.skin) if source is not None else of.rate
         watching = watching_of(of, nominal.detection.threshold, rate, live.patience.alarm, source is None)
-        point = choose_threshold(of, run, stored, watched, watching, say)
+        with Steps({"choosing the threshold of the alarm": _EXPECTED}):
+            point = choose_threshold(of, run, stored, watched, watching, say)
         if point.silent:
             raise InputError(f"{point.warning()}: give live.patience.above=0.5, or train another run")
         say(point.sentence())
@@ -176,8 +177,3 @@ def imperfections_of(calibration: Calibration) -> dict[str, Any]:
     clip = float(np.median(values["clip"]))
     limit = {"clip": clip} if np.isfinite(clip) else {}
     return left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
-
-
-def _shown(batches: Iterable[int]) -> Iterable[int]:
-    console = Console(stderr=True)
-    return track(batches, "safe touches", console=console, disable=not console.is_terminal, transient=True)

@@ -145,7 +145,7 @@ def choose_threshold(
         say(
             f"choosing the threshold of the alarm on {count} simulated safe touches at {watching.rate:.3g} Hz"
         )
-        point = choose_for_touches(of.learner, device, watching, target, count, _shown)
+        point = choose_for_touches(of.learner, device, watching, target, count)
         return {"point": np.array([point.threshold, point.raised])}
 
     file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"

@@ -31,6 +31,7 @@ _WELL = 0.15  # residual: a channel that is called exchanged has to fit its new 
 _CLEARER = 2.0, 0.1  # another explanation leaves less than half of the residual, less 0.1 of a channel's
 _MOST = 0.25  # share of the responding channels that an explanation may leave, and of unusable sensors
 _PRESSED = 0.2  # of the largest prediction: a sensor with less was not pressed, so it identifies no channel
+_LISTED = 12  # channels in a message
 _FEWEST = 3  # channels that a turn must explain, because two exchanged channels look like a mirrored axis
 
 
@@ -286,6 +287,8 @@ def check_usable(calibration: Calibration) -> None:
 
 
 def listed(numbers: Sequence[int] | np.ndarray) -> str:
-    """Return numbers in words, as ``2``, ``2 and 5`` or ``2, 5 and 7``."""
+    """Return numbers in words, as ``2``, ``2 and 5`` or ``2, 5 and 7``; of many, the first ones."""
     words = [str(number) for number in numbers]
+    if len(words) > _LISTED:
+        words = [*words[: _LISTED - 1], f"{len(words) - _LISTED + 1} others"]
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

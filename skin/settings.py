@@ -76,7 +76,7 @@ def check_settings(
             near = get_close_matches(key, known, 1)
             meant = f": did you mean {near[0]}?" if near else ":"
             raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(known)}")
-        if key in hints and _takes_made(hints[key]) and isinstance(value, str | int | float | list):
+        if key in hints and _takes_made(hints[key]) and _is_nothing_made(hints[key], value):
             raise InputError(f"{name}.{key}={str(value)[:_LONG]} must be an option with its settings")
         if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
             default = _written(parameters[key].default)
@@ -184,6 +184,11 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
 def _takes_made(hint: Any) -> bool:
     """Return whether an annotation is that of a factory, which Hydra makes of the settings of an option."""
     return any(get_origin(part) is Callable for part in (hint, *get_args(hint)))
+
+
+def _is_nothing_made(hint: Any, value: Any) -> bool:
+    """Return whether a value cannot be what Hydra makes; None can where it is allowed."""
+    return isinstance(value, str | int | float | list) or (value is None and NoneType not in get_args(hint))
 
 
 def _plain(hint: Any) -> bool:

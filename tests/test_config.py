@@ -270,6 +270,7 @@ def built(word):
         "layout=[]",
         "device.stuck=99999999999999999999999999",
         "device.touch=-1",
+        "device.simulator=null",
         "model.width=1e300",
     ],
 )

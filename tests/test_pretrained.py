@@ -1,10 +1,14 @@
 """Models that come with the package: complete, small, unaltered, and as good as their cards say."""
 
 import json
+import os
 import shutil
 import subprocess
 
 import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 import skin
 from skin.errors import InputError
@@ -13,6 +17,8 @@ from skin.model_card import model_card
 from skin.paths import ROOT
 from skin.pretrained import CARD, CONFIG, MODELS, RECORD, SUMS, checksums, find_pretrained, is_name
 from skin.safe_loading import load_yaml
+from skin.stored_run import load_configuration
+from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
 
@@ -139,3 +145,61 @@ def test_sha256sum_reads_the_hashes(copied):
     command = ["sha256sum", "--check", "--strict", SUMS]
     done = subprocess.run(command, cwd=copied, capture_output=True, text=True, check=True)
     assert done.stdout.count(": OK") == 4
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """Return the folder of a copy of a model, with few bytes of weights."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / MODELS / "mine"
+    shutil.copytree(ROOT / MODELS / "default_skin", folder)
+    (folder / "weights.pt").write_bytes(b"weights")
+    (folder / SUMS).write_text(checksums(folder, "weights.pt"))
+    return folder
+
+
+@pytest.mark.parametrize("name", [RECORD, CONFIG, CARD, SUMS, "weights.pt"])
+def test_damage_never_passes_for_a_model(model, name):
+    content, whole = (model / name).read_bytes(), find_pretrained("mine")
+
+    @DAMAGED_FILES
+    @given(data=st.data())
+    def try_it(data):
+        (model / name).write_bytes(data.draw(damaged(content)))
+        run = opened(lambda: find_pretrained("mine"))
+        assert run is None or name == SUMS
+        assert run is None or (run.data.tags, run.data.metrics) == (whole.data.tags, whole.data.metrics)
+
+    try_it()
+
+
+@pytest.mark.parametrize("name", [RECORD, pytest.param(CONFIG, marks=pytest.mark.slow)])
+def test_a_model_of_somebody_else_works_or_is_refused(model, name):
+    """Its checksums are right, whatever is in it."""
+    content, store = load_yaml(model / name), None
+
+    @DAMAGED_FILES
+    @given(data=st.data())
+    def try_it(data):
+        changed = data.draw(mutated(content))
+        text = json.dumps(changed) if name == RECORD else yaml.safe_dump(changed, allow_unicode=True)
+        (model / name).write_text(text)
+        (model / SUMS).write_text(checksums(model, "weights.pt"))
+        run = opened(lambda: find_pretrained("mine"))
+        if run is not None and name == CONFIG:
+            opened(lambda: load_configuration(store, run))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("skin.stored_run.fetch", lambda store, run, file, folder: model / file)
+        try_it()
+
+
+def test_weights_without_an_end_are_refused(model):
+    (model / "weights.pt").unlink()
+    os.mkfifo(model / "weights.pt")
+    with pytest.raises(InputError, match="no complete pretrained model: it is no regular file"):
+        find_pretrained("mine")
+    (model / "weights.pt").unlink()
+    (model / "weights.pt").symlink_to("/dev/zero")
+    with pytest.raises(InputError, match="it is no regular file"):
+        find_pretrained("mine")

@@ -101,7 +101,7 @@ def test_the_scripts_of_before_still_run(run, tmp_path, name):
     ("override", "said"),
     [
         ("learner.rounds=20", "Could not override 'learner.rounds'."),
-        ("model=cn", "Could not find 'model/cn'"),
+        ("model=cn", "there is no model=cn: did you mean "),
         ("seed=[", "seed=["),
     ],
 )
@@ -127,7 +127,7 @@ echo "${{COMPREPLY[@]}}"
     ("line", "choices"),
     [
         ("skin exp", {"export"}),
-        ("skin train simul", {"simulator="}),
+        ("skin train simul", {"simulator=", "simulator."}),
         ("skin train simulator=", {"simulator=fem", "simulator=naive", "simulator=solid"}),
         ("skin train simulator=so", {"simulator=solid"}),
         ("skin evaluate touch.ra", {"touch.rate=", "touch.ramp="}),

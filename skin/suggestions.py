@@ -29,7 +29,7 @@ def suggest(error: Exception, name: str, words: Sequence[str]) -> str | None:
     """
     if not isinstance(error, HydraException):
         return None
-    text = str(error)
+    text = str(error).split("Config search path:")[0]
     ambiguous = _AMBIGUOUS.search(text)
     if isinstance(error, OverrideParseException) or ambiguous:
         given = ambiguous[1] if ambiguous else str(getattr(error, "override", ""))

@@ -4,6 +4,7 @@ Other packages add verbs in the entry-point group ``skin.verbs``: name = module 
 """
 
 import ast
+import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
@@ -34,7 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     verb, *rest = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
     known = verbs()
-    if verb in ("-h", "--help"):
+    if verb in ("-sc", "--shell-completion"):
+        _complete(" ".join(rest), known)
+    elif verb in ("-h", "--help"):
         print(_help(known))
     elif verb == "--version":
         from skin import __version__
@@ -64,8 +67,42 @@ def _help(known: Mapping[str, str]) -> str:
         for name, path in sources.items()
         if path
     ]
+    completion = 'Completion in bash: eval "$(skin -sc install=bash)"'
     usage, syntax = "usage: skin VERB [OVERRIDE=VALUE ...]", "Overrides have Hydra's syntax."
-    return "\n".join([usage, "", *lines, "", f"`skin VERB --help` lists the settings of a verb. {syntax}"])
+    return "\n".join(
+        [usage, "", *lines, "", f"`skin VERB --help` lists the settings of a verb. {syntax}", completion]
+    )
+
+
+# Of bash; other shells can load it with bashcompinit.
+_SCRIPT = """\
+_skin() {
+    local choices
+    choices=$(COMP_LINE="${COMP_LINE:0:COMP_POINT}" "${COMP_WORDS[0]}" -sc query=bash 2>/dev/null)
+    COMPREPLY=($(compgen -W "$choices" -- "${COMP_WORDS[COMP_CWORD]}"))
+}
+COMP_WORDBREAKS=${COMP_WORDBREAKS//=}
+complete -o nospace -o default -F _skin skin
+"""
+
+
+def _complete(asked: str, known: Mapping[str, str]) -> None:
+    """Print the script that completes a command line in bash, or the choices for ``COMP_LINE``."""
+    if asked == "install=bash":
+        print(_SCRIPT, end="")
+        return
+    if asked != "query=bash":
+        sys.exit(_refused(f'skin -sc {asked}: give install=bash, as in eval "$(skin -sc install=bash)"'))
+    program, *words = os.environ.get("COMP_LINE", "skin ").split(" ")
+    if len(words) < 2:
+        print(*(name for name in known if name.startswith("".join(words))))
+        return
+    verb, *rest = words
+    if verb not in known:
+        return
+    # Hydra completes groups, options and settings, and knows no verbs.
+    os.environ["COMP_LINE"] = " ".join([program, *rest])
+    import_module(known[verb]).main(["-sc", "query=bash"])
 
 
 def _source(module: str) -> Path | None:

@@ -5,7 +5,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
@@ -21,18 +21,29 @@ class SweepProgress:
 
     Args:
         seconds: earlier duration of each job on some machine, in order; None if unknown.
+        finished: numbers of the jobs that have finished before, and take no time.
+        partial: numbers of the jobs that continue an interrupted run, so that the time they take says nothing
+            about the speed of the machine.
     """
 
-    def __init__(self, seconds: list[float | None]) -> None:
+    def __init__(
+        self,
+        seconds: list[float | None],
+        finished: Collection[int] = (),
+        partial: Collection[int] = (),
+    ) -> None:
         known = [value for value in seconds if value is not None]
         typical = sum(known) / len(known) if known else 1.0
         self._expected = [typical if value is None else value for value in seconds]
+        for number in finished:
+            self._expected[number] = 0.0
+        self._partial = frozenset(partial)
         self._sure = bool(known)
         self._spent = self._done = 0.0
 
     def finish(self, number: int, seconds: float, skipped: bool) -> None:
-        """Record the end of a job; skipped jobs do not count for the machine's speed."""
-        if not skipped:
+        """Record the end of a job; skipped and continued jobs do not count for the machine's speed."""
+        if not skipped and number not in self._partial:
             self._spent += seconds
             self._done += self._expected[number]
         self._expected[number] = 0.0

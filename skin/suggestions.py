@@ -29,14 +29,14 @@ def suggest(error: Exception, name: str, words: Sequence[str]) -> str | None:
     """
     if not isinstance(error, HydraException):
         return None
-    text = str(error)
+    text = str(error).split("Config search path:")[0]
     ambiguous = _AMBIGUOUS.search(text)
     if isinstance(error, OverrideParseException) or ambiguous:
         given = ambiguous[1] if ambiguous else str(getattr(error, "override", ""))
         quoted = quote_value(given)
         return None if quoted is None else f"{given} cannot be read: quote the value, as in {quoted}"
     if unknown := _UNKNOWN.search(text):
-        near = get_close_matches(unknown[1], _names(name, words, unknown[1]), 1)
+        near = get_close_matches(unknown[1], _names(name, words, unknown[1]), 1, 0.8)
         return f"there is no setting or group {unknown[1]}: did you mean {near[0]}?" if near else None
     option, options = _NO_OPTION.search(text), _OPTIONS.search(text)
     if option and options:

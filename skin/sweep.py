@@ -135,8 +135,18 @@ class Sweep(Callback):
         _share_cores(config.hydra.launcher)
         own = [(composed[number], identities[number]) for number in self._own]
         self._progress = SweepProgress(
-            [expected_seconds(store, job, one) if job else None for job, one in own]
+            [expected_seconds(store, job, one) if job else None for job, one in own],
+            self._with_status("FINISHED"),
+            self._with_status("KILLED"),
         )
+
+    def _with_status(self, status: str) -> set[int]:
+        """Return the jobs, by their places in this shard, that a run of this status did at least partly."""
+        if not self._resume or self._store is None:
+            return set()
+        prints = [self._fingerprints[number] for number in self._own]
+        known = {run.data.tags.get("fingerprint") for run in self._store.find(status)}
+        return {place for place, identity in enumerate(prints) if identity and identity in known}
 
     def _choose(self, config: DictConfig, fingerprints: Sequence[str]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""

@@ -1,7 +1,10 @@
 """The command `skin`: its verbs, their help, and what is wrong with what is typed."""
 
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -98,7 +101,7 @@ def test_the_scripts_of_before_still_run(run, tmp_path, name):
     ("override", "said"),
     [
         ("learner.rounds=20", "Could not override 'learner.rounds'."),
-        ("model=cn", "Could not find 'model/cn'"),
+        ("model=cn", "there is no model=cn: did you mean "),
         ("seed=[", "seed=["),
     ],
 )
@@ -109,3 +112,42 @@ def test_what_cannot_be_composed_is_one_sentence(override, said, capsys):
     text = capsys.readouterr().err
     assert said in text
     assert text.count("\n") == 1
+
+
+COMPLETE = """
+eval "$(skin -sc install=bash)"
+COMP_LINE='{line}'; COMP_POINT=${{#COMP_LINE}}; COMP_WORDS=($COMP_LINE); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1))
+_skin
+echo "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("line", "choices"),
+    [
+        ("skin exp", {"export"}),
+        ("skin train simul", {"simulator=", "simulator."}),
+        ("skin train simulator=", {"simulator=fem", "simulator=naive", "simulator=solid"}),
+        ("skin train simulator=so", {"simulator=solid"}),
+        ("skin evaluate touch.ra", {"touch.rate=", "touch.ramp="}),
+        ("skin nosuch a", set()),
+    ],
+)
+def test_bash_completes_verbs_groups_options_and_settings(line, choices):
+    script = COMPLETE.format(line=line)
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        ["bash", "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert set(done.stdout.split()) == choices
+
+
+def test_another_shell_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["-sc", "install=fish"])
+    assert ended.value.code == 2
+    assert "install=bash" in capsys.readouterr().err

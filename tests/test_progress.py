@@ -27,6 +27,19 @@ def test_a_skipped_job_says_nothing_about_speed():
     assert progress.left() == 30
 
 
+def test_jobs_that_finished_before_take_no_time():
+    progress = SweepProgress([10.0, 10.0, None], finished={0, 1})
+    assert progress.left() == 10  # the unknown one like the others, not like jobs that take no time
+
+
+def test_a_continued_job_says_nothing_about_speed():
+    progress = SweepProgress([10.0, 10.0, 20.0], partial={0})
+    progress.finish(0, 1.0, skipped=False)
+    assert progress.left() == 30
+    progress.finish(1, 20.0, skipped=False)
+    assert progress.left() == 40
+
+
 @pytest.mark.parametrize(
     ("duration", "text"), [(0.4, "0 s"), (89, "89 s"), (91, "2 min"), (7200, "120 min"), (9000, "2.5 h")]
 )

@@ -16,7 +16,7 @@ from skin.suggestions import quote_value
         ("device.nois=3", "there is no setting or group device.nois: did you mean device.noise?"),
         ("touch.rat=3", "there is no setting or group touch.rat: did you mean touch.rate?"),
         ("simulator=solit", "there is no simulator=solit: did you mean solid? There are fem, naive, solid"),
-        ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid"),
+        ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
         (
             "out=bench (1).csv",
             """out=bench (1).csv cannot be read: quote the value, as in 'out="bench (1).csv"'""",

@@ -63,7 +63,9 @@ class Subject:
     @property
     def title(self) -> str:
         """The name of the run, for pages and figures."""
-        return f"{self.of.run.info.run_name}, run {self.of.run.info.run_id[:8]}"
+        run = self.of.run
+        # As in the published tables; the id of a run differs between databases.
+        return f"{run.info.run_name}, run {run.data.tags.get('fingerprint', run.info.run_id)[:8]}"
 
     @property
     def learner(self) -> "AbstractLearner":

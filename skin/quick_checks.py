@@ -6,7 +6,6 @@ from typing import Any
 from omegaconf import DictConfig
 
 from skin.config import plain
-from skin.plausibility import check_plausibility
 from skin.settings import check_groups
 from skin.wire.transport import check_port
 
@@ -23,6 +22,9 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         InputError: naming the setting, or the port.
     """
+    # It imports numpy, for which a mistyped setting must not wait.
+    from skin.plausibility import check_plausibility
+
     groups: dict[str, Any] = {
         name: plain(config[name]) for name in _GROUPS if isinstance(config.get(name), DictConfig)
     }

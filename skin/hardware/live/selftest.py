@@ -152,6 +152,7 @@ def _frames(
     low, high = (
         np.inf * sign if limit is None else limit for sign, limit in zip((-1, 1), device.limits, strict=True)
     )
+    polarity = np.sign(conversion.scale)
     for t, row in zip((time + _APART * number).tolist(), values, strict=True):
         saturated = (row <= low) | (row >= high)
-        yield Frame(None, t, t, row, np.isfinite(row), number, 0, "", saturated)
+        yield Frame(None, t, t, row, np.isfinite(row), number, 0, "", saturated, polarity)

@@ -15,6 +15,8 @@ from experiments.studies.subject import Measurement, Subject
 from skin.errors import InputError
 from skin.evaluation.stream_settings import StreamSettings
 
+_COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -125,6 +127,70 @@ class Holds:
         told = (zip(FIELDS, values, strict=True) for values in table[1:])
         lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
         return Measurement({}, Page("\n".join(lines), {"Time to alarm": table}, table))
+
+
+@dataclass(frozen=True)
+class TouchAlarms:
+    """False alarms and recall per touch, as the live view raises alarms, beside those of single windows.
+
+    Thresholds are chosen on other touches of the same device than those that are counted.
+
+    Args:
+        safe, dangerous: number of touches that are counted.
+    """
+
+    safe: Annotated[int, Ge(1)] = 10000
+    dangerous: Annotated[int, Ge(1)] = 2000
+
+    def __call__(self, subject: Subject) -> Measurement:
+        import numpy as np
+
+        from experiments.studies.tables import Page
+        from skin.evaluation.alarm import Reached
+        from skin.evaluation.operating_point import LABEL, choose_operating_point
+        from skin.evaluation.touch_alarm import choose_for_touches, touch_scores
+        from skin.hardware.live import engine_builder
+        from skin.hardware.live.trained_run import watching_of
+        from skin.hardware.live.verdict import DebounceSettings
+        from skin.labels import TOUCH
+        from skin.rng import Stream, generator
+        from skin.touch.sampler import balanced
+
+        of, settings = subject.of.trained, subject.config.evaluation
+        device = subject.device.simulated("touches are simulated")
+        contact = engine_builder.nominal_settings(of).detection.threshold
+        patience = DebounceSettings().alarm
+        aligned = device.rate <= device.model_rate
+        watching = watching_of(of, contact, device.rate, patience, aligned)
+        one = watching_of(of, contact, device.rate, 0.0, aligned)
+        target = settings.false_alarm_rate
+        touch = choose_for_touches(subject.learner, device, watching, target)
+        window = choose_operating_point(subject.learner, device, settings)
+        assert window is not None  # it has the label
+        labels = balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
+        danger = labels[:, TOUCH.names.index(LABEL)]
+        wanted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
+        scores = touch_scores(subject.learner, device, watching, wanted, _COUNTED)
+        single = touch_scores(subject.learner, device, one, wanted[: self.safe], _COUNTED)
+        tests = device.touches("test")
+        chances = subject.learner.probabilities(tests)
+        metrics, lines = dict[str, float](), list[str]()
+        alarms = touch.alarm(scores)
+        found = {
+            "touch": Reached(
+                self.dangerous, int(alarms[self.safe :].sum()), self.safe, int(alarms[: self.safe].sum())
+            ),
+            "window": window.reached(chances, tests.known_labels, of.device.task),
+            "touch_at_window_threshold": Reached(0, 0, self.safe, int(window.alarm(single).sum())),
+        }
+        for name, reached in found.items():
+            low, high = reached.range
+            metrics |= {f"{name}/false_alarm_rate": reached.false_alarm_rate}
+            metrics |= {f"{name}/false_alarm_low": low, f"{name}/false_alarm_high": high}
+            metrics |= {f"{name}/recall": reached.recall} if reached.dangerous else {}
+            lines.append(f"{name}: {reached.sentence()}")
+        metrics |= {"touch/threshold": touch.threshold, "window/threshold": window.threshold}
+        return Measurement(metrics, Page("\n".join(lines), {}, []))
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """A finished run for a live view."""
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -145,7 +146,10 @@ def choose_threshold(
         say(
             f"choosing the threshold of the alarm on {count} simulated safe touches at {watching.rate:.3g} Hz"
         )
+        threads = torch.get_num_threads()
+        torch.set_num_threads(os.cpu_count() or 1)  # nothing is watched yet
         point = choose_for_touches(of.learner, device, watching, target, count)
+        torch.set_num_threads(threads)
         return {"point": np.array([point.threshold, point.raised])}
 
     file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"

@@ -22,7 +22,7 @@ def main(config: DictConfig) -> None:
         given = ["device=serial", *(f"device.{name}={value}" for name, value in port.items()), *overrides()]
         merged = OmegaConf.merge(config, {"device": port})
         assert isinstance(merged, DictConfig)
-        show(merged, given)
+        show(merged, given, own_mechanics=True)
 
 
 @contextmanager

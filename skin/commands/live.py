@@ -31,23 +31,24 @@ def main(config: DictConfig) -> None:
     show(config, overrides())
 
 
-def show(config: DictConfig, given: Sequence[str]) -> None:
+def show(config: DictConfig, given: Sequence[str], own_mechanics: bool = False) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
     Args:
         config: of the command.
         given: settings that replace those of the run, as overrides; ``config`` has their values.
+        own_mechanics: the skin at the port is emulated with the simulator of the run.
     """
     from skin.hardware.live.live_settings import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
     try:
-        _watch(config, live, given)
+        _watch(config, live, given, own_mechanics)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> None:
+def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_mechanics: bool) -> None:
     from rich.console import Console
 
     from skin.hardware.live.display import Display, DisplayInfo
@@ -68,7 +69,7 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str]) -> No
         from skin.hardware.live.trained_run import watch_run
 
         quiet()
-        watch = partial(watch_run, config, live, messages.print, given)
+        watch = partial(watch_run, config, live, messages.print, given, own_mechanics=own_mechanics)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         watched = watch(opened=open_)

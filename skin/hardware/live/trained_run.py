@@ -41,6 +41,7 @@ def watch_run(
     say: Callable[[str], None],
     given: Sequence[str],
     opened: ExitStack,
+    own_mechanics: bool = False,
 ) -> Watched:
     """Return a finished run and the device of a configuration.
 
@@ -50,6 +51,7 @@ def watch_run(
         say: called with each message for the user.
         given: settings that replace those of the run, as overrides; ``config`` has their values.
         opened: closes the device in the end.
+        own_mechanics: the device has the mechanics of the run, though it is at a port.
 
     Raises:
         InputError: there is no such run, it cannot be loaded, or the device cannot be opened.
@@ -69,7 +71,7 @@ def watch_run(
     trained = apply_overrides(stored, config, words)
     title = str(run.info.run_name)
     say(f"loading {title} ({run.info.run_id[:8]})")
-    if advice := engine_builder.simulator_warning(stored, device):
+    if not own_mechanics and (advice := engine_builder.simulator_warning(stored, device)):
         say(advice)
     of = load_trained(store, run, trained, stored, choose=False)
     nominal = engine_builder.nominal_settings(of)

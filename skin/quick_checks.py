@@ -1,12 +1,14 @@
 """Checks of a configuration that need no run, made before anything is loaded."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 from omegaconf import DictConfig
 
 from skin.config import plain
 from skin.settings import check_groups
+from skin.wire.open import PortSettings
 from skin.wire.transport import check_port
 
 _GROUPS = ("body", "layout", "touch", "device", "contact")
@@ -30,8 +32,10 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
     }
     check_groups({name: groups[name] for name in ("body", "layout") if name in groups})
     check_plausibility(groups)
-    port = groups.get("device", {}).get("port")
-    if isinstance(port, str):
+    device = groups.get("device", {})
+    if isinstance(port := device.get("port"), str):
+        names = {field.name for field in fields(PortSettings)}
+        PortSettings(**{name: value for name, value in device.items() if name in names and value is not None})
         check_port(port)
     named = {override.split("=")[0].split(".")[0] for override in overrides}
     if "run" in config and config.run is not None and not config.run.endswith(".onnx"):

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hydra import compose
+from hydra import compose, initialize_config_dir
 from hydra._internal.defaults_list import create_defaults_list
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from skin.config import plain, validate_config
 from skin.errors import InputError
+from skin.paths import CONF
 
 # Groups that the weights of a run depend on.
 _FIXED = (
@@ -80,6 +81,9 @@ class _Option:
 
 def _find_options(overrides: Sequence[str]) -> list[_Option]:
     """Return the options that a command line chooses, and those that they choose in turn."""
+    if not GlobalHydra.instance().is_initialized():  # in Python, not in a command
+        with initialize_config_dir(str(CONF), version_base=None):
+            return _find_options(overrides)
     loader = GlobalHydra.instance().config_loader()
     # The loader has no public function that returns the files of a configuration.
     parsed, files = loader._parse_overrides_and_create_caching_repo("train", list(overrides))  # type: ignore[attr-defined]

@@ -59,7 +59,7 @@ def test_help_lists_options_of_ones_own(run, own):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["simulator=gaussian"], "Could not find 'data/gaussian'"),
+        (["simulator=gaussian"], "there is no data=gaussian: there are fem, naive, solid"),
         (
             ["simulator=gaussian", "data=fem", "simulator.spread=-1"],
             "simulator.spread=-1 must be greater than 0",

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from skin import array_cache
 from skin.config import Tracking
 from skin.error_messages import to_input_error
 from skin.errors import InputError
@@ -21,7 +22,7 @@ from skin.plot.touches import simulated
 from skin.recording import Recording
 from skin.recording_file import write_recording as write_recording
 from skin.signal import calibration
-from skin.simulator import _elastic, _store
+from skin.simulator import _elastic
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -109,7 +110,7 @@ def test_an_animation_is_whole(tmp_path, configured):
 def test_a_cache_that_cannot_be_kept_costs_a_warning(tmp_path):
     path = tmp_path / "x.npz"
     with full(), pytest.warns(RuntimeWarning, match="cannot be kept"):
-        found = _store.kept(path, "key", {"a": (99,)}, lambda: {"a": np.ones(99)})
+        found = array_cache.kept(path, "key", {"a": (99,)}, lambda: {"a": np.ones(99)})
     assert found["a"].sum() == 99
     assert not list(tmp_path.iterdir())
 

@@ -87,12 +87,11 @@ def test_what_is_there_is_not_drawn_again(tmp_path, monkeypatch, capsys):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-import pyarrow.parquet
 sys.path.insert(0, {tests!r})
-import skin.device.simulated, skin.device._threads
+import skin.device.simulated, skin.device._threads, skin.recording_file
 skin.device.simulated._BATCH, skin.device._threads._PART = 8, 2
 from test_generation import generate
-write, calls = pyarrow.parquet.write_table, []
+write, calls = skin.recording_file.write_parquet, []
 
 def cut_off(table, partial, **options):
     calls.append(partial)
@@ -101,7 +100,7 @@ def cut_off(table, partial, **options):
     partial.write_bytes(b"half")
     os.kill(os.getpid(), signal.SIGKILL)
 
-pyarrow.parquet.write_table = cut_off
+skin.recording_file.write_parquet = cut_off
 generate(Path({folder!r}))
 """
 

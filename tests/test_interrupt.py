@@ -3,7 +3,7 @@
 import signal
 import subprocess
 import sys
-from time import monotonic
+from time import monotonic, sleep
 
 import pytest
 
@@ -66,6 +66,7 @@ def test_sigterm_is_answered_within_seconds_whatever_the_process_does(step, line
     line = [sys.executable, "-c", BUSY.format(step)]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stdout.readline() == "busy\n"
+        sleep(0.5)  # until it is in the middle of it
         start = monotonic()
         process.terminate()
         said = process.stdout.read().split()

@@ -4,7 +4,6 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 from pydantic import PositiveFloat
-from scipy.spatial import cKDTree
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
@@ -76,6 +75,8 @@ def _inside(body: AbstractBody, positions: np.ndarray) -> None:
 
 def _apart(positions: np.ndarray) -> None:
     # Not all pairs, which would take gigabytes for the most sensors that a file may have.
+    from scipy.spatial import cKDTree  # a mistake in the settings must not wait for it
+
     distance, nearest = cKDTree(positions[:, :2]).query(positions[:, :2], k=2)
     close = np.flatnonzero(distance[:, 1] < _APART)
     if len(close):

@@ -224,7 +224,7 @@ def _calibration(stored: Mapping[str, Any]) -> Calibration:
     polarity = [polarity] * count if isinstance(polarity, int) else polarity
     if not isinstance(polarity, list) or not isinstance(channels, list):
         raise InputError("polarity and channels must be lists")
-    return Calibration(sensors, broken, ranges, scale, zero, about, polarity, channels)
+    return Calibration(sensors, broken, ranges, scale, zero, about, tuple(polarity), tuple(channels))
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:

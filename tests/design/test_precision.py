@@ -75,7 +75,7 @@ def test_a_sweep_has_a_line_for_each_thickness_and_grid(run, tmp_path):
         (["design=sweep", "simulator=naive"], "needs a simulator with mechanics: set simulator=solid"),
         (["design=sweep", "design.height=0.02", "simulator=solid"], "design.height=0.02 m is not inside"),
         (["body=arm", "simulator=fem", "~body.size"], "simulator=solid"),
-        (["design=placement"], "Could not find 'design/placement'"),
+        (["design=placement"], "there is no design=placement: did you mean place?"),
     ],
 )
 def test_refuses(run, tmp_path, given, words):

@@ -87,7 +87,9 @@ def watch_run(
         above = point.threshold
     elif above is not None:
         say(f"alarm above {above:g}")
-    nominal = replace(nominal, patience=replace(nominal.patience, above=above))
+    # A threshold of the command line is tested against the usual one.
+    chosen = above if live.patience.above is None else None
+    nominal = replace(nominal, patience=replace(nominal.patience, above=chosen))
     if source is None:
         source = device.source()
         opened.enter_context(source.skin)
@@ -145,9 +147,8 @@ def choose_threshold(
     key = array_cache.hashed(content, [Path(str(module.__file__)) for module in _SOURCES])
 
     def choose() -> dict[str, np.ndarray]:
-        say(
-            f"choosing the threshold of the alarm on {count} simulated safe touches at {watching.rate:.3g} Hz"
-        )
+        devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
+        say(f"choosing the alarm's threshold on {count} safe touches at {watching.rate:.3g} Hz{devices}")
         threads = torch.get_num_threads()
         torch.set_num_threads(os.cpu_count() or 1)  # nothing is watched yet
         point = choose_for_touches(of.learner, device, watching, target, count)

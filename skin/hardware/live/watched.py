@@ -89,7 +89,8 @@ def watch_model(
     source = SerialSource(sensors=len(about.positions), rate=about.rate, **settings).source()
     opened.enter_context(source.skin)
     say(f"loaded {about.title} from {path}, exported by version {about.version}")
-    above = live.patience.above or _threshold(about, source.skin, path, say)
+    given = live.patience.above
+    above = about.threshold if given is not None else _threshold(about, source.skin, path, say)
     nominal = EngineSettings(
         model.probabilities,
         about.task,
@@ -100,9 +101,9 @@ def watch_model(
         DebounceSettings(above=above),
         None if about.presses is None else np.array(about.presses),
     )
-    if above is not None:
-        say(f"alarm above {above:.4f}")
     used = used_settings(nominal, live)
+    if used.patience.above is not None:
+        say(f"alarm above {used.patience.above:.4f}")
     return Watched(about.title, source, used, nominal, np.array(about.positions), about.size)
 
 

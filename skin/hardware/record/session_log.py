@@ -83,7 +83,8 @@ class SessionLog:
 
     def conversion(self, conversion: UnitConversion) -> None:
         """Write the conversion of the following values to N; its ``zero`` is the baseline."""
-        arrays = {name: value.tolist() for name, value in vars(conversion).items()}
+        # What a tare tells of the noise is for those who watch.
+        arrays = {name: getattr(conversion, name).tolist() for name in ("scale", "zero", "broken")}
         line, self._conversion_checksum = encode_event("meaning", **arrays)
         self._lines.add(line)
 

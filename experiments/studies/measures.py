@@ -146,6 +146,7 @@ class TouchAlarms:
         import numpy as np
 
         from experiments.studies.tables import Page
+        from skin.evaluation import touch_alarm
         from skin.evaluation.alarm import Reached
         from skin.evaluation.operating_point import LABEL, choose_operating_point
         from skin.evaluation.touch_alarm import choose_for_touches, touch_scores
@@ -171,7 +172,8 @@ class TouchAlarms:
         danger = labels[:, TOUCH.names.index(LABEL)]
         wanted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         scores = touch_scores(subject.learner, device, watching, wanted, _COUNTED)
-        single = touch_scores(subject.learner, device, one, wanted[: self.safe], _COUNTED)
+        few = min(self.safe, touch_alarm.SAFE)
+        single = touch_scores(subject.learner, device, one, wanted[:few], _COUNTED)
         tests = device.touches("test")
         chances = subject.learner.probabilities(tests)
         metrics, lines = dict[str, float](), list[str]()
@@ -181,7 +183,7 @@ class TouchAlarms:
                 self.dangerous, int(alarms[self.safe :].sum()), self.safe, int(alarms[: self.safe].sum())
             ),
             "window": window.reached(chances, tests.known_labels, of.device.task),
-            "touch_at_window_threshold": Reached(0, 0, self.safe, int(window.alarm(single).sum())),
+            "touch_at_window_threshold": Reached(0, 0, few, int(window.alarm(single).sum())),
         }
         for name, reached in found.items():
             low, high = reached.range

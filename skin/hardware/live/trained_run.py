@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from math import log
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from skin.tracking import Store
 from skin.trained import Trained, load_trained, threshold_device
 
 _EXPECTED = 20.0  # s
+_RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
 _SOURCES = (touch_alarm, operating_point, decisions, device_sampling, imperfection)
 
 
@@ -103,12 +105,14 @@ def watching_of(of: Trained, contact: float, rate: float, patience: float, align
     Args:
         of: the run.
         contact: threshold, N.
-        rate: of the device, Hz.
+        rate: of the device, Hz; the nearest of some rates is used.
         patience: s for which decisions must be dangerous.
         aligned: whether the device gives the frames of the model.
     """
     longest, column = engine_builder.longest_touch(of), of.device.task.names.index(LABEL)
-    return Watching(rate, contact, longest, patience, column, aligned)
+    # A measured rate is never the same twice, and the threshold would be chosen anew at each start.
+    ratio = min(_RATIOS, key=lambda known: abs(log(known * of.rate / rate)))
+    return Watching(ratio * of.rate, contact, longest, patience, column, aligned)
 
 
 def choose_threshold(

@@ -81,3 +81,12 @@ def test_an_untouched_skin_without_visible_noise_is_no_defect():
     frames = np.full((2000, 5), 12)
     frames[900:950, :2] = 200  # a touch of two of five
     assert check(ChannelHealth(), frames).all()
+
+
+def test_a_value_that_the_converter_cannot_give_is_invalid_at_once():
+    health = ChannelHealth((None, 1023.0))
+    health.largest = 1023.0
+    valid, saturated = health.check(np.array([500.0, -300.0, 1023.0, 65535.0, -3.0]), 0.0)
+    assert valid.tolist() == [True, False, True, False, True]
+    assert saturated.tolist() == [False, False, True, False, False]
+    assert health.states()[1] == "impossible"

@@ -1,9 +1,10 @@
 """Numbers and clocks followed by hand."""
 
+import numpy as np
 import pytest
 
 from skin.signal.frame import FrameError
-from skin.wire.sequence import HostClock, SequenceTracker, frames_ahead
+from skin.wire.sequence import FrameClock, HostClock, SequenceTracker, frames_ahead
 
 
 @pytest.mark.parametrize(
@@ -77,3 +78,25 @@ def test_the_hosts_clock_sees_through_delays_and_a_slow_resonator():
         assert latest <= mapped <= true + delay + 1e-9
         latest = mapped
     assert worst < 0.021
+
+
+@pytest.mark.parametrize("burst", [0.01, 0.25, 1.0])
+@pytest.mark.parametrize("rate", [None, 100.0])
+def test_the_number_of_frames_tells_their_time_where_the_device_tells_none(burst, rate):
+    clock, count = FrameClock(), round(burst * 100)
+    times = [
+        [clock(5 + arrival * burst, 1, rate) for _ in range(count)] for arrival in range(round(12 / burst))
+    ]
+    late = np.diff(np.concatenate(times)[600:])
+    assert (late >= 0).all()
+    assert np.median(late) == pytest.approx(0.01, rel=0.05)
+    # Nothing is measured after it arrived.
+    assert all(row[-1] <= 5 + number * burst for number, row in enumerate(times))
+
+
+def test_a_pause_of_the_device_is_no_burst():
+    clock = FrameClock()
+    for number in range(400):
+        before = clock(number / 100, 1, None)
+    assert clock(10.0, 1, None) == 10.0
+    assert before == pytest.approx(3.99, abs=0.05)

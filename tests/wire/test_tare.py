@@ -194,3 +194,91 @@ def test_without_tare_only_the_rate_is_read():
 def test_a_slow_device_is_refused():
     with pytest.raises(InputError, match="rate"):
         settled(Played(np.zeros(100), rate=4.0), 2.0)
+
+
+def limited(values, channels, limit=1023.0):
+    """Return frames of which some channels are at their limit."""
+    rows = []
+    for frame in frames(values):
+        full = np.isin(np.arange(3), channels)
+        rows.append(frame._replace(values=np.where(full, limit, frame.values), saturated=full))
+    return rows
+
+
+def test_a_channel_at_its_limit_has_no_baseline():
+    watch = watched(scale=0.01)
+    for one in limited(noisy(150), [1]):
+        watch(one)
+    assert watch.tare.conversion.broken.tolist() == [False, True, False]
+    assert watch.tare.warning == "channel 1 at the limit or without a value: no baseline"
+
+
+def test_a_channel_at_its_limit_keeps_its_last_baseline():
+    watch = watched(scale=0.01)
+    for one in frames(noisy(150)):
+        watch(one)
+    assert watch.tare.warning == ""
+    before = watch.tare.conversion.zero
+    watch.tare.restart()
+    for one in limited(noisy(150, 1), [1]):
+        watch(one._replace(t=one.t + 2, t_host=one.t_host + 2))
+    after = watch.tare.conversion
+    assert watch.tare.count == 2
+    assert not after.broken.any()
+    assert after.zero[1] == before[1]
+
+
+def test_all_channels_at_their_limit_give_no_baseline():
+    watch = watched(scale=0.01)
+    for one in limited(noisy(400), [0, 1, 2]):
+        watch(one)
+    assert watch.tare.conversion is None
+    assert watch.status == "no baseline: all channels at the limit or without a value"
+
+
+def test_a_device_without_noise_is_told():
+    watch = watched(scale=0.01)
+    for one in frames(np.tile(REST, (150, 1))):
+        watch(one)
+    assert "this device shows no noise" in watch.tare.warning
+
+
+def test_the_noise_of_the_untouched_skin_is_known():
+    watch = watched(scale=0.01)
+    for one in frames(REST + np.random.default_rng(0).normal(scale=5.0, size=(400, 3))):
+        watch(one)
+    np.testing.assert_allclose(watch.tare.conversion.noise, 0.05, rtol=0.3)
+    assert (watch.tare.conversion.changing > 0.9).all()
+
+
+def test_a_device_that_restarts_often_gets_a_baseline():
+    """Its clock begins again every 0.6 s; the baseline needs a second."""
+    watch = watched(scale=0.01)
+    for number, one in enumerate(frames(noisy(300))):
+        watch(one._replace(t=number % 60 / 100, segment=number // 60))
+    assert watch.tare.conversion is not None
+
+
+def test_a_new_baseline_waits_for_the_end_of_a_touch_unless_it_is_forced():
+    tare = watched(scale=0.01).tare
+    for one in frames(noisy(150)):
+        tare.add(one)
+    later = [one._replace(t=one.t + 2, t_host=one.t_host + 2) for one in frames(noisy(150) + 100)]
+    tare.restart()
+    for one in later:
+        tare.add(one, touched=True)
+    assert (tare.count, tare.status) == (1, "the new baseline waits: something touches the skin")
+    tare.restart(force=True)
+    for one in later:
+        tare.add(one._replace(t=one.t + 2, t_host=one.t_host + 2), touched=True)
+    assert tare.count == 2
+    np.testing.assert_allclose(tare.conversion.zero, REST + 100, atol=1.5)
+
+
+def test_few_frames_are_waited_for():
+    """Frames of a bridge without a clock come in bursts: only some intervals have any."""
+    watch = watched(scale=1.0, tare=2.0)
+    for burst in range(6):
+        for one in frames(noisy(25)):
+            watch(one._replace(t=0.5 * burst + 0.5, t_host=0.5 * burst + 0.5))
+    assert watch.status == "taking the baseline: waiting for more frames"

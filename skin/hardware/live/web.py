@@ -121,7 +121,7 @@ def _application(display: Display) -> Starlette:
 
 
 async def _events(display: Display, picture: SkinPicture) -> AsyncIterator[str]:
-    number, due = 0, monotonic()
+    number, due = display.state().number, monotonic()  # of the first picture: the latest frame
     while not display.closed.is_set():
         state = display.state(number)
         number = state.number

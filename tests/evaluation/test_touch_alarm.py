@@ -89,17 +89,18 @@ def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(device, rat
     assert share == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
 
 
-class Newest(Peak):
-    """Looks at the newest interval only."""
+class Onset(Peak):
+    """Looks at the change from one interval to the next."""
 
     def probabilities(self, touches):
-        return torch.sigmoid(touches.readings[:, -1].amax(1) - 5)[:, None].expand(-1, 4)
+        change = touches.readings[:, -1].amax(1) - touches.readings[:, -2].amax(1)
+        return torch.sigmoid(change)[:, None].expand(-1, 4)
 
 
 def test_one_decision_raises_more_alarms_than_two(device):
     labels = balanced(64, generator(Stream.TEST, 8))
     two, one = (
-        touch_scores(Newest(), device, watching(100.0, patience=patience), labels, 9) for patience in (0.1, 0)
+        touch_scores(Onset(), device, watching(100.0, patience=patience), labels, 9) for patience in (0.1, 0)
     )
     assert (one >= two).all()
     assert (one > two).any()

@@ -272,10 +272,16 @@ class TestSelfTest:
             self.run(conversion=conversion)
 
     def test_masked_sensors_are_counted(self):
-        broken = np.arange(SENSORS) < 2
+        broken = np.arange(SENSORS) < 3
         conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
-        with pytest.raises(InputError, match=r"11 of 14 .* the mask of broken sensors"):
+        with pytest.raises(InputError, match=r"9 of 14 .* the mask of broken sensors"):
             self.run(conversion=conversion)
+
+    def test_one_dead_sensor_of_nine_is_no_reason_to_stop(self):
+        """Its place is shown as unknown."""
+        broken = np.arange(SENSORS) == 4
+        conversion = UnitConversion(np.full(SENSORS, SCALE), np.full(SENSORS, 200.0), broken)
+        assert "not on sensor 4" in self.run(conversion=conversion)[0]
 
     def test_a_model_that_finds_nothing_is_refused(self):
         nominal = replace_detection(settings(), threshold=1e308)

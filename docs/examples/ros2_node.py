@@ -1,7 +1,8 @@
 """ROS 2 node that publishes the verdicts of ``skin live ... live.verdicts=7777``.
 
-Topics: ~/verdict (std_msgs/String, the JSON line), ~/danger and ~/stale (std_msgs/Bool). Parameters:
-host, port. A lost connection makes the data stale. It does not clear an alarm.
+Topics: ~/verdict (std_msgs/String, the JSON line), ~/danger, ~/unknown and ~/stale (std_msgs/Bool).
+Without danger, the skin is safe only where ~/unknown is false. Parameters: host, port. A lost connection
+makes the data stale and unknown. It does not clear an alarm.
 """
 
 import json
@@ -26,6 +27,7 @@ class SkinNode(Node):
         self._address = host, port
         self._verdict = self.create_publisher(String, "~/verdict", 10)
         self._danger = self.create_publisher(Bool, "~/danger", 10)
+        self._unknown = self.create_publisher(Bool, "~/unknown", 10)
         self._stale = self.create_publisher(Bool, "~/stale", 10)
         self._over = Event()
         self._thread = Thread(target=self._read, daemon=True)
@@ -48,6 +50,7 @@ class SkinNode(Node):
                 reason = "skin live has ended"
             except (OSError, ValueError) as error:
                 reason = str(error)
+            self._unknown.publish(Bool(data=True))
             self._stale.publish(Bool(data=True))
             self.get_logger().warning(f"no verdicts from {self._address}: {reason}")
             self._over.wait(SILENCE)
@@ -57,6 +60,7 @@ class SkinNode(Node):
             raise ValueError(f"schema {message['schema']}, this node reads {SCHEMA}")
         self._verdict.publish(String(data=line))
         self._danger.publish(Bool(data=message["alarm"]))
+        self._unknown.publish(Bool(data=message["state"] == "unknown"))
         self._stale.publish(Bool(data=message["stale"]))
 
 

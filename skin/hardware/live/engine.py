@@ -144,8 +144,8 @@ class Engine:
         self._held = held_frames(detection.longest, rate, frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * rate - 1e-9), frames)
         self._above = 0.5 if self._patience.above is None else self._patience.above
-        itself = np.eye(sensors, dtype=bool)
-        self._responds = itself if presses is None else itself | (presses >= detection.threshold)
+        responds = None if presses is None else presses >= detection.threshold
+        self._responds = np.eye(sensors, dtype=bool) if responds is None else responds
         self._clock, self._freshness = StreamClock(), _Freshness(sensors)
         self._segment: int | None = None
         self._latest: tuple[Frame, float] | None = None

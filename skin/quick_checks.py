@@ -8,8 +8,6 @@ from omegaconf import DictConfig
 
 from skin.config import plain
 from skin.settings import check_groups
-from skin.wire.open import PortSettings
-from skin.wire.transport import check_port
 
 _GROUPS = ("body", "layout", "touch", "device", "contact")
 
@@ -24,8 +22,10 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         InputError: naming the setting, or the port.
     """
-    # It imports numpy, for which a mistyped setting must not wait.
+    # They import numpy, for which a mistyped setting must not wait.
     from skin.plausibility import check_plausibility
+    from skin.wire.open import PortSettings
+    from skin.wire.transport import check_port
 
     groups: dict[str, Any] = {
         name: plain(config[name]) for name in _GROUPS if isinstance(config.get(name), DictConfig)

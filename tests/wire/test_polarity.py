@@ -22,7 +22,7 @@ FALLING = Calibration(
     {"gain": [2.0, 0.5, 1.0], "offset": [0.1, -0.2, 0.0], "clip": [10.0, 10.0, 10.0]},
     scale=0.02,
     zero=500.0,
-    polarity=[1, -1, -1],
+    polarity=(1, -1, -1),
 )
 
 
@@ -32,7 +32,7 @@ def raw_of(true: np.ndarray) -> np.ndarray:
 
 
 def test_a_file_keeps_polarity_and_channels(tmp_path):
-    whole = replace(FALLING, channels=[2, 0, 1])
+    whole = replace(FALLING, channels=(2, 0, 1))
     assert read_calibration(write_calibration(whole, tmp_path / "mine.yaml")) == whole
     assert "polarity" not in write_calibration(replace(FALLING, polarity=()), tmp_path / "a.yaml").read_text()
 
@@ -107,7 +107,7 @@ def test_an_interval_keeps_the_value_of_most_force():
 
 
 def test_frames_come_in_the_order_of_the_layout():
-    decoder = Decoder(3, channels=[2, 0, 1], polarity=[1, -1, 1])
+    decoder = Decoder(3, channels=(2, 0, 1), polarity=[1, -1, 1])
     frames = decoder.feed(b"".join(encode_line([1, 2, 3], n, 1000 * n) for n in range(4)))
     assert frames[-1].values.tolist() == [3, 1, 2]
     assert frames[-1].polarity.tolist() == [1, -1, 1]

@@ -276,7 +276,9 @@ class Engine:
         chances = dict(zip(self.task.names, probabilities, strict=True))
         learned = self._detection.learned and chances[self.task.gate or ""] > 0.5
         period = max(self.window.period, 1 / DECISIONS)
-        self._update_alarm(decision.contact or learned, chances, decision, period)
+        # A touch that the window shows, but that has ended, raises no alarm.
+        present = decision.contact or (learned and not decision.risen)
+        self._update_alarm(present, chances, decision, period)
         # An alarm does not wait for the debounced touch.
         touched = decision.contact or decision.risen or learned
         touched = self._touch(touched, decision.time, period) or self.alarm

@@ -81,7 +81,8 @@ def test_a_dangerous_press_turns_the_page_red_and_a_replugged_skin_heals_it(begi
         healed = lambda: {*after()} & {"idle", "touch", "danger"}  # noqa: E731
         until(healed, live, "healing")
         assert browser.run("return pictures") > 20
-        assert "1 reconnected" in browser.run("return document.getElementById('line').textContent")
+        line = lambda: browser.run("return document.getElementById('line').textContent")  # noqa: E731
+        until(lambda: "1 reconnected" in line(), live, "the line")  # it is updated twice a second
         live.send_signal(signal.SIGINT)
         assert live.wait(60) == 0, live.err
     assert "DANGEROUS: " in live.out

@@ -23,6 +23,7 @@ Tare = Literal["", "tare", "forced"]
 """A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
 
 _KEPT = 8192  # frames that are kept for slow views
+_ONSET = 10  # frames of a touch before its contact is decided
 _CONFIRM = 60.0  # s after a refusal in which a tare may be forced
 REFUSED = "tare refused: something touches the skin; if nothing does, confirm it (terminal: force and Enter)"
 
@@ -106,7 +107,7 @@ class Display:
         first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
         self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=_KEPT)
         self._valid, self._alarm = np.ones(sensors, dtype=bool), False
-        self._peak = np.zeros(sensors)
+        self._peak, self._contact = np.zeros(sensors), False
         self._number = 0
         self._verdict: Verdict | None = None
         self._trouble, self._line, self._note = "waiting for the first frame", "", ""
@@ -128,9 +129,13 @@ class Display:
         with self._lock:
             self._verdict, self._trouble = verdict, trouble
             self._alarm = alarm if verdict is None else verdict.dangerous
-            touched = verdict is not None and (verdict.touched or verdict.contact is not None)
-            if not touched and not self._alarm:
-                self._peak = np.zeros_like(self._peak)
+            contact = verdict is not None and verdict.contact is not None
+            touched = contact or (verdict is not None and verdict.touched)
+            if not self._alarm and (not touched or (contact and not self._contact)):
+                # A new touch; its first frames came before the decision.
+                recent = [values for values, _ in list(self._frames)[-_ONSET:]]
+                self._peak = np.max(recent, axis=0) if contact else np.zeros_like(self._peak)
+            self._contact = contact
         for observer in self.observers:
             observer(verdict, trouble, alarm)
 

@@ -274,6 +274,12 @@ def test_the_map_of_an_alarm_is_held_and_goes_with_the_touch():
         subject.set_verdict(verdict)
         state = subject.state(state.number)
         assert (state.held, state.map[2], state.values[2]) == (True, 6.0, 0.1)
+    # The next touch follows before the prediction is over: its map is its own.
+    for _ in range(20):
+        subject.add_frame(frame(np.zeros(5)), PLAIN)
+    subject.add_frame(frame([0, 1.0, 0, 0, 0]), PLAIN)
+    subject.set_verdict(replace(PRESSED, dangerous=False, contact=0.05))
+    assert subject.state().peak.tolist() == [0, 1, 0, 0, 0]
     subject.set_verdict(idle)
     assert subject.state().peak.max() == 0
 

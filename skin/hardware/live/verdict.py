@@ -91,7 +91,7 @@ class DebounceSettings:
         alarm: of ``dangerous`` before it is shown: two decisions of a device of 20 Hz or more. One alone
             would raise several times as many false alarms; more than 0.1 s would come too late.
         calm: without ``dangerous`` before the alarm is removed.
-        above: probability above which a touch is dangerous; None: the threshold stored with the run.
+        above: probability above which a touch is dangerous; None: that of the run.
 
     Raises:
         InputError: a negative time, an alarm that would be too late, or a value that is no probability.

@@ -15,7 +15,8 @@ from scipy import sparse
 from skin.body.base import AbstractBody, overlaps
 from skin.errors import InputError
 from skin.sensors import Sensors
-from skin.simulator import _beam, _plate
+from skin.simulator._beam import beam_stiffness
+from skin.simulator._plate import plate_stiffness, pressure_load
 
 Constraint = Literal["vertical", "free"]
 
@@ -78,7 +79,7 @@ class Structure:
     def load(self) -> sparse.csc_matrix:
         """Return P, (N, H*W): ``P @ pressure`` is the load of a pressure (H*W,), Pa, on the surface."""
         corners = self._unknowns(self._corners(-1))
-        unit = _plate.pressure_load(*self.body.cell).reshape(4, 6)[:, self.free].ravel()
+        unit = pressure_load(*self.body.cell).reshape(4, 6)[:, self.free].ravel()
         cells = np.repeat(np.arange(len(corners)), corners.shape[1])
         shape = (self.unknowns, len(corners))
         return sparse.coo_matrix((np.tile(unit, len(corners)), (corners.ravel(), cells)), shape).tocsc()
@@ -140,9 +141,9 @@ class Structure:
     def _layer(self, level: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Return rows, columns and values of one layer's plates and of its beams."""
         layer = self.body.layers[level]
-        plate = _plate.plate_stiffness(*self.body.cell, layer.thickness, layer.material)
+        plate = plate_stiffness(*self.body.cell, layer.thickness, layer.material)
         width, height = (np.diff(_section_edges(self.body, axis)) for axis in (0, 1))
-        beams = _beam.beam_stiffness(
+        beams = beam_stiffness(
             np.tile(width, len(height)), np.repeat(height, len(width)), layer.thickness, layer.material
         )
         beams = beams * _beam_moduli(self.body)[level].reshape(-1, 1, 1)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from skin.errors import InputError
-from skin.model import _sparse
+from skin.model._sparse import Cells, convolve_and_pool, dense, linear, plan_convolution
 from skin.model.base import AbstractModel, Kind
 
 SPARSE = 32  # images with fewer than one active pixel in so many go the short way
@@ -89,14 +89,14 @@ class Cnn(AbstractModel):
 
     def _sparse(self, x: Tensor, active: Tensor) -> Tensor:
         difference = x.flatten(2)[:, :, active.flatten()].permute(2, 1, 0)
-        cells = _sparse.Cells(difference, x.new_zeros(x.shape[1], 1), active)
+        cells = Cells(difference, x.new_zeros(x.shape[1], 1), active)
         for weight, bias in self._weights():
-            cells = _sparse.convolve_and_pool(cells, _sparse.plan_convolution(cells.active), weight, bias)
+            cells = convolve_and_pool(cells, plan_convolution(cells.active), weight, bias)
             background = F.relu(cells.background)
             difference = F.relu(cells.difference + cells.background) - background
             # spatial dropout takes whole channels of an image: background and difference alike
             keep = F.dropout(x.new_ones(len(bias), len(x)), self.dropout, self.training)
-            cells = _sparse.Cells(difference * keep, background * keep, cells.active)
+            cells = Cells(difference * keep, background * keep, cells.active)
         if self.embedding is None:
-            return _sparse.dense(cells, len(x)).flatten(1)
-        return F.relu(_sparse.linear(cells, self.embedding.weight, self.embedding.bias))
+            return dense(cells, len(x)).flatten(1)
+        return F.relu(linear(cells, self.embedding.weight, self.embedding.bias))

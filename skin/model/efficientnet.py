@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from skin.errors import InputError
-from skin.model import _weights
 from skin.model._mbconv import Bottleneck, unit
+from skin.model._weights import find_weights, load_weights
 from skin.model.base import AbstractModel, Kind
 
 # Table 1 of Tan and Le (2019): ratio, kernel, stride of the first block, channels, blocks
@@ -73,7 +73,7 @@ class EfficientNet(AbstractModel):
         if weights == "random":
             self.features.apply(_start)
         else:
-            _weights.load_weights(self, _weights.find_weights(weights), spare=HEAD)
+            load_weights(self, find_weights(weights), spare=HEAD)
         self.requires_grad_(not frozen)
         self.train()
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from skin.recording import Touches
 from skin.signal.features import above_idle
 
-SHARES = (0.1, 0.25, 0.5)  # of the touch's own peak: a frame beyond is active
+_SHARES = (0.1, 0.25, 0.5)  # of the touch's own peak: a frame beyond is active
 _FORCE = 0.1  # N, twice the noise; smaller readings have no weight in a centre
 
 
@@ -20,7 +20,7 @@ def direction_features(touches: Touches) -> dict[str, Tensor]:
     vectors = {"order of the sensors": _order(x, at)} | _lean(x, at)
     for power in (1, 2):
         push = (x - _FORCE).clamp(min=0) ** power
-        for share in SHARES:
+        for share in _SHARES:
             name = f"centre {power} beyond {share} of the peak"
             vectors |= {f"{way} of the {name}": one for way, one in _ways(push, at, x, share).items()}
     return {

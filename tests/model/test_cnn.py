@@ -5,8 +5,8 @@ import torch
 from torch.nn import functional as F
 
 from skin.errors import InputError
-from skin.model import _sparse
 from skin.model import cnn as module
+from skin.model._sparse import _FirstMaximum
 from skin.model.cnn import Cnn
 
 
@@ -44,7 +44,7 @@ def test_few_pixels_give_what_all_pixels_give(given, options, monkeypatch):
     assert 32 * int((given != 0).flatten(0, 1).any(0).sum()) < 64 * 64
     taken = []
     monkeypatch.setattr(
-        _sparse, "plan_convolution", lambda a, plan=_sparse.plan_convolution: taken.append(1) or plan(a)
+        module, "plan_convolution", lambda a, plan=module.plan_convolution: taken.append(1) or plan(a)
     )
     short, short_gradients = embed(model, given, monkeypatch, 32)
     assert len(taken) == len(options["channels"])
@@ -83,7 +83,7 @@ def test_dropout_takes_whole_channels_of_single_images(share, monkeypatch):
 
 def test_the_gradient_of_a_tie_goes_to_the_first_maximum():
     x = torch.randint(0, 2, (3, 4, 5, 7)).double().requires_grad_()
-    _sparse._FirstMaximum.apply(x).square().sum().backward()
+    _FirstMaximum.apply(x).square().sum().backward()
     plain = x.detach().clone().requires_grad_()
     F.max_pool2d(plain.permute(0, 2, 3, 1), (1, 4)).square().sum().backward()
     assert torch.equal(x.grad, plain.grad)

@@ -38,7 +38,7 @@ def find_force(
     solve: Callable[[np.ndarray, np.ndarray, torch.Tensor], tuple[Equilibrium, np.ndarray]],
     begin: torch.Tensor,
     peak: np.ndarray,
-    wanted: np.ndarray,
+    labels: np.ndarray,
     problem: ContactProblem,
 ) -> ForceSearch:
     """Find loads at which single frames are big or small, dangerous or safe, as wanted.
@@ -55,14 +55,14 @@ def find_force(
         wanted: (B, 2), bool: big, dangerous.
         problem: the body, ranges and thresholds.
     """
-    search = _Search.of(begin, peak, wanted, problem)
+    search = _Search.of(begin, peak, labels, problem)
     rows = np.arange(len(peak))
     for _ in range(_STEPS):
-        here = torch.from_numpy(rows)
-        equilibrium, lost = solve(rows, search.load[rows], search.pressure[here])
-        search.pressure[here] = equilibrium.pressure.to(search.pressure)
+        selected = torch.from_numpy(rows)
+        equilibrium, lost = solve(rows, search.load[rows], search.pressure[selected])
+        search.pressure[selected] = equilibrium.pressure.to(search.pressure)
         peaks, classes = _classes(equilibrium.pressure, problem)
-        rows = search.move(rows, search.judge(rows, peaks, classes != wanted[rows], lost), peaks)
+        rows = search.move(rows, search.judge(rows, peaks, classes != labels[rows], lost), peaks)
         if not len(rows):
             break
     search.result[search.failed] = np.nan
@@ -99,11 +99,11 @@ class _Search:
 
     @classmethod
     def of(
-        cls, begin: torch.Tensor, peak: np.ndarray, wanted: np.ndarray, problem: ContactProblem
+        cls, begin: torch.Tensor, peak: np.ndarray, labels: np.ndarray, problem: ContactProblem
     ) -> "_Search":
         """Return a search that begins at the drawn peaks (B,), Pa, clipped to their ranges."""
         settings, cell = problem.settings, problem.shapes.body.cell
-        ends = np.where(wanted[:, 1:], settings.dangerous_peak, settings.safe_peak)
+        ends = np.where(labels[:, 1:], settings.dangerous_peak, settings.safe_peak)
         least, most = ends[:, 0] * _NEAR, np.maximum(ends[:, 1] / _NEAR, ends[:, 0] * _NEAR)
         target = np.clip(peak, least, most)
         share = torch.from_numpy(target / begin.amax(1).double().numpy()).to(begin)
@@ -112,7 +112,7 @@ class _Search:
         count = len(peak)
         power, last = np.full(count, 1.5), np.full((2, count), np.nan)
         result = np.full(count, np.nan), np.zeros(count, bool), np.zeros(count, bool)
-        return cls(wanted, least, most, target, load, pressure, power, last, *result)
+        return cls(labels, least, most, target, load, pressure, power, last, *result)
 
     def judge(self, rows: np.ndarray, peak: np.ndarray, wrong: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Store finished searches, and move the target where the classes at it are wrong.

@@ -77,7 +77,7 @@ def _solve_part(
     tolerance: float,
     iterations: int,
 ) -> Equilibrium:
-    found = Equilibrium(
+    equilibrium = Equilibrium(
         torch.zeros_like(gap), torch.full_like(total, torch.inf), torch.zeros(len(gap), dtype=torch.long)
     )
     state = _State(compliance, gap, total, start, _REST * tolerance)
@@ -88,15 +88,15 @@ def _solve_part(
         leaves = residual <= tolerance if step < iterations else torch.ones_like(residual, dtype=torch.bool)
         if leaves.any():
             gone = rows[leaves]
-            found.pressure[gone] = state.pressure[leaves]
-            found.residual[gone] = residual[leaves]
-            found.iterations[gone] = step
+            equilibrium.pressure[gone] = state.pressure[leaves]
+            equilibrium.residual[gone] = residual[leaves]
+            equilibrium.iterations[gone] = step
             rows = rows[~leaves]
             if not len(rows):
                 break
             state.keep(~leaves)
         state.step()
-    return found
+    return equilibrium
 
 
 class _State:

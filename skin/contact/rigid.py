@@ -73,8 +73,8 @@ class Rigid(AbstractContact):
         full = np.zeros(len(trajectories.peak))
         np.maximum.at(full, trajectories.owner, trajectories.share)
         reference = _reference_frames(trajectories, full, gap, problem.footprints)
-        found, lost = self._sought(trajectories, gap, reference, problem)
-        force = found.load / full
+        forces, lost = self._sought(trajectories, gap, reference, problem)
+        force = forces.load / full
         refused = np.isnan(force)
 
         solved = np.flatnonzero(~refused[trajectories.owner])
@@ -84,7 +84,7 @@ class Rigid(AbstractContact):
         stands = (
             trajectories.place[solved] == trajectories.place[reference][trajectories.owner[solved]]
         ).all(axis=1)
-        start = found.pressure[owner] * torch.from_numpy(stands)[:, None]
+        start = forces.pressure[owner] * torch.from_numpy(stands)[:, None]
         states = solve_contact(self.compliance, gap[rows], totals, start, self.tolerance, self.iterations)
         missed = trajectories.owner[solved][(~(states.residual <= self.tolerance)).numpy()]
         lost += np.bincount(missed, minlength=len(force))
@@ -100,7 +100,7 @@ class Rigid(AbstractContact):
         dangerous = trajectories.wanted[:, 3]
         refused |= peak > np.where(dangerous, settings.dangerous_peak[1], settings.safe_peak[1])
         refused |= lost > 0
-        return ContactResult(frames, force, peak, refused, found.area, lost)
+        return ContactResult(frames, force, peak, refused, forces.area, lost)
 
     def gap(self, trajectories: Trajectories, problem: ContactProblem) -> Tensor:
         """Return the gap between object and cells at first contact, (U, H * W), m.
@@ -121,20 +121,25 @@ class Rigid(AbstractContact):
         self, trajectories: Trajectories, gap: Tensor, reference: np.ndarray, problem: ContactProblem
     ) -> tuple[ForceSearch, np.ndarray]:
         """Return the loads of each gesture's reference frame, and how many of these did not converge."""
-        own = gap[torch.from_numpy(reference)]
+        own_gap = gap[torch.from_numpy(reference)]
         cell = problem.shapes.body.cell[0] * problem.shapes.body.cell[1]
 
         def solved(rows: np.ndarray, load: np.ndarray, start: Tensor) -> tuple[Equilibrium, np.ndarray]:
             total = torch.from_numpy(load / cell)
             state = solve_contact(
-                self.compliance, own[torch.from_numpy(rows)], total, start, self.tolerance, self.iterations
+                self.compliance,
+                own_gap[torch.from_numpy(rows)],
+                total,
+                start,
+                self.tolerance,
+                self.iterations,
             )
             return state, (~(state.residual <= self.tolerance)).numpy()
 
-        found = find_force(
-            solved, own.isfinite().float(), trajectories.peak, trajectories.wanted[:, [0, 3]], problem
+        solution = find_force(
+            solved, own_gap.isfinite().float(), trajectories.peak, trajectories.wanted[:, [0, 3]], problem
         )
-        return found, found.failed.astype(np.int64)
+        return solution, solution.failed.astype(np.int64)
 
 
 def _sag(body: AbstractBody, inside: Tensor) -> Tensor:

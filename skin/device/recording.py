@@ -128,9 +128,12 @@ class Recorded(AbstractDevice):
             f"{self.path}, {count} gestures at once,",
             "train a network, which reads shard by shard, or generate fewer gestures",
         )
-        found = concatenate([part.make() for part in parts] or [self._example[:0]])
+        recording = concatenate([part.make() for part in parts] or [self._example[:0]])
         # The summary is of one shard.
-        return replace(found, metadata={name: of for name, of in found.metadata.items() if name != "summary"})
+        return replace(
+            recording,
+            metadata={name: content for name, content in recording.metadata.items() if name != "summary"},
+        )
 
     def parts(self, split: Split | None = None) -> list[Part] | None:
         """Return the shards of a data set, or what a split has of each; None for a file."""
@@ -143,7 +146,7 @@ class Recorded(AbstractDevice):
         part: Split = "holdout" if split == "test" else split
         seed = self.split_seed
         rows = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
-        return [Part(len(own), partial(self._rows, n, complete, own)) for n, own in rows]
+        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in rows]
 
     def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
         return self._stored.read(number, complete)[rows]

@@ -219,7 +219,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
         Each part is drawn on one thread, with metadata of its own.
         """
-        return grouped(self._budget(False), lambda of: describe(self, of, None, 0)) if split is None else None
+        return (
+            grouped(self._budget(False), lambda touches: describe(self, touches, None, 0))
+            if split is None
+            else None
+        )
 
     def _budget(self, complete: bool) -> list[Part]:
         """Return the batches of the budget."""
@@ -227,8 +231,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         if not self.stream:
             return draw(self.gestures, self.data_seed)
         counts = [len(range(self.gestures)[rows]) for rows in split_slices(self.gestures).values()]
-        own = [draw(count, self.data_seed, number) for number, count in enumerate(counts)]
-        return [batch for split in own for batch in split]
+        parts = [draw(count, self.data_seed, number) for number, count in enumerate(counts)]
+        return [batch for split in parts for batch in split]
 
     def _batches(self, complete: bool, stream: Stream, count: int, *key: int) -> list[Part]:
         """Return the batches of gestures or windows; ``complete`` adds the displacements."""
@@ -236,14 +240,16 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         if self.stream:
             jobs = [partial(self._windows, cut, complete, stream, (*key, n)) for n, cut in enumerate(cuts)]
         else:
-            wanted = balanced(count, generator(stream, *key, 0))
-            rest = complete, stream
-            jobs = [partial(self._batch, wanted[cut], *rest, (*key, 1 + n)) for n, cut in enumerate(cuts)]
+            labels = balanced(count, generator(stream, *key, 0))
+            arguments = complete, stream
+            jobs = [
+                partial(self._batch, labels[cut], *arguments, (*key, 1 + n)) for n, cut in enumerate(cuts)
+            ]
         return [Part(cut.stop - cut.start, job) for cut, job in zip(cuts, jobs, strict=True)]
 
     @torch.no_grad()
-    def _batch(self, wanted: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
-        movie = self.sampler.sample(len(wanted), generator(stream, *key), wanted)
+    def _batch(self, labels: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
+        movie = self.sampler.sample(len(labels), generator(stream, *key), labels)
         return self._felt(self._true(movie, complete), generator(Stream.NOISE, self.seed, stream, *key))
 
     @torch.no_grad()
@@ -279,10 +285,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         motion = self.tracker.motion(movie)
         touches = Touches(readings, valid, positions, labels, self.model_rate, motion, geometry=self.geometry)
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
-        known = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
+        true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.
         about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
-        return Recording(touches, *about, movie.force, displacement, movie.parameters | known)
+        return Recording(touches, *about, movie.force, displacement, movie.parameters | true_values)
 
     def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""

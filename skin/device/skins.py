@@ -102,8 +102,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
         return self.reference.source()
 
     def _prepare(self, part: int, count: int) -> list[Simulated]:
-        console, shown = Console(stderr=True), sys.stderr.isatty()
-        numbers = track(range(count), "preparing skins", console=console, disable=not shown)
+        console, terminal = Console(stderr=True), sys.stderr.isatty()
+        numbers = track(range(count), "preparing skins", console=console, disable=not terminal)
         for number in numbers:
             # What solves a skin keeps large factors; made again, it reads its operator from the disk.
             self._skin(part, number).geometry  # noqa: B018
@@ -116,7 +116,9 @@ class Skins(ImperfectionSettings, AbstractDevice):
     def _simulated(self, skin: DrawnSkin, number: int) -> Simulated:
         imperfections = {entry.name: getattr(self, entry.name) for entry in fields(ImperfectionSettings)}
         sensors = len(skin.layout.sensors(skin.body))
-        imperfections["dead"] = [min(one, sensors // _DEAD) for one in Imperfection.of(self, None).dead_range]
+        imperfections["dead"] = [
+            min(limit, sensors // _DEAD) for limit in Imperfection.of(self, None).dead_range
+        ]
         return Simulated(
             body=skin.body,
             layout=skin.layout,
@@ -135,13 +137,13 @@ class Skins(ImperfectionSettings, AbstractDevice):
         if not new and split in self._kept:
             return self._kept[split]
         skins = self.unseen_skins if split == "test" else self.training_skins
-        own = range(self.gestures)[split_slices(self.gestures).get(split, slice(0))]
-        count = self.test_gestures if split == "test" else len(own)
+        touches = range(self.gestures)[split_slices(self.gestures).get(split, slice(0))]
+        count = self.test_gestures if split == "test" else len(touches)
         seed = 0 if split == "test" else self.data_seed
-        found = self._draw(skins, count, (seed, _NUMBERS[split], epoch if new else 0))
+        drawn = self._draw(skins, count, (seed, _NUMBERS[split], epoch if new else 0))
         if not new:
-            self._kept[split] = found
-        return found
+            self._kept[split] = drawn
+        return drawn
 
     def _draw(self, skins: Sequence[Simulated], count: int, key: tuple[int, ...]) -> Touches:
         """Return gestures in groups, each on a drawn skin; every skin is drawn once before any again."""

@@ -140,7 +140,11 @@ class Network(AbstractLearner):
         epochs, theirs = settings.get("max_epochs"), settings.pop("logger", None)
         if type(epochs) is not int or epochs < 1:
             raise InputError(f"trainer.max_epochs={epochs} must be a whole number from 1 up")
-        loggers = [one for one in (logger, *(theirs if isinstance(theirs, list) else [theirs])) if one]
+        loggers = [
+            candidate
+            for candidate in (logger, *(theirs if isinstance(theirs, list) else [theirs]))
+            if candidate
+        ]
         try:
             trainer = Trainer(
                 **settings | {"callbacks": [*callbacks, *(settings.get("callbacks") or [])]},
@@ -157,11 +161,13 @@ class Network(AbstractLearner):
         """Return the probability of each label, (B, L), for touches of any layout that the model accepts."""
         from skin.classifier import probabilities
 
-        return self._map(touches, lambda of, frames: probabilities(of(frames), of.task))
+        return self._map(
+            touches, lambda classifier, frames: probabilities(classifier(frames), classifier.task)
+        )
 
     def embeddings(self, touches: Touches) -> Tensor:
         """Return the embeddings of touches, (B, E), which are the input of the dense layers."""
-        return self._map(touches, lambda of, frames: of.fusion(frames))
+        return self._map(touches, lambda classifier, frames: classifier.fusion(frames))
 
     @property
     def network(self) -> "TouchClassifier":

@@ -79,13 +79,16 @@ class Rules(AbstractLearner):
             )
         began = time.perf_counter()
         train, validation = data.touches("train"), data.touches("validation")
-        known, other = engineered_features(train.to("cpu")), engineered_features(validation.to("cpu"))
+        train_features, validation_features = (
+            engineered_features(train.to("cpu")),
+            engineered_features(validation.to("cpu")),
+        )
         self._set(
             {
                 name: _tune(
                     name,
-                    _defined(known, train.known_labels, data.task, i),
-                    _defined(other, validation.known_labels, data.task, i),
+                    _defined(train_features, train.known_labels, data.task, i),
+                    _defined(validation_features, validation.known_labels, data.task, i),
                 )
                 for i, name in enumerate(data.task.names)
             }
@@ -111,10 +114,10 @@ class Rules(AbstractLearner):
         """Load the rules that :meth:`save` wrote."""
         stored = parse_json(read_file(Path(path), TEXT))
         rules = {name: Rule(**stored[name]) for name in data.task.names}
-        known = engineered_features(data.example.to("cpu"))
+        features = engineered_features(data.example.to("cpu"))
         for name, rule in rules.items():
             numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
-            if rule.measurement not in known or not numbers:
+            if rule.measurement not in features or not numbers:
                 raise ValueError(f"the rule of {name} is {asdict(rule)}")
         self._set(rules)
 
@@ -129,14 +132,14 @@ def _defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) 
     return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()
 
 
-def _tune(label: str, known: _Split, other: _Split) -> Rule:
+def _tune(label: str, train: _Split, validation: _Split) -> Rule:
     """Return the best rule for one label: feature and threshold from ``known``, slope from ``other``."""
-    values, truth = known
+    values, truth = train
     # The trailing blank keeps "maximum 1" from matching "maximum 10".
     looked_at = tuple(f"{name} " for name in LOOK_AT[label])
     allowed = [name for name in values if f"{name} ".startswith(looked_at)]
     _, threshold, name = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
-    values, truth = other
+    values, truth = validation
     distance = values[name].double().numpy() - threshold
     unit = np.std(distance) or 1.0
 

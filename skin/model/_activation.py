@@ -11,7 +11,7 @@ def activation(name: str) -> nn.Module:
     Raises:
         InputError: another name.
     """
-    known = {"relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
-    if name not in known:
+    activations = {"relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
+    if name not in activations:
         raise InputError(f"unknown activation {name!r}: set activation=relu, elu or silu")
-    return known[name]()
+    return activations[name]()

@@ -61,5 +61,5 @@ class Bottleneck(nn.Module):
         result = self.block(x)
         if not self.residual:
             return result
-        kept = F.dropout(x.new_ones(len(x), 1, 1, 1), self.skipped, self.training)
-        return torch.addcmul(x, result, kept)
+        keep = F.dropout(x.new_ones(len(x), 1, 1, 1), self.skipped, self.training)
+        return torch.addcmul(x, result, keep)

@@ -40,10 +40,10 @@ def find_weights(weights: str) -> Path:
             f"no weights file {weights}: looked for {looked}; "
             f"give model.weights=FILE.pth or model.weights=imagenet; {_WAYS}"
         )
-    found = next((path for path in named if path.is_file()), None)
-    if found is None:
+    file = next((path for path in named if path.is_file()), None)
+    if file is None:
         raise InputError(missing)
-    return found
+    return file
 
 
 def load_weights(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
@@ -57,13 +57,13 @@ def load_weights(module: nn.Module, path: Path, spare: tuple[str, ...]) -> None:
     Raises:
         InputError: the file cannot be read, is no state dict, or holds other weights than the module has.
     """
-    content, wanted = _read(path), module.state_dict()
-    if wrong := _unfit(content, wanted, spare):
+    content, state = _read(path), module.state_dict()
+    if wrong := _unfit(content, state, spare):
         raise InputError(
             f"the weights file {path} {wrong}: model=efficientnet needs the state dict of torchvision's "
             f"efficientnet_b0; {_WAYS}"
         )
-    module.load_state_dict(wanted | {name: content[name] for name in content if name not in spare})
+    module.load_state_dict(state | {name: content[name] for name in content if name not in spare})
 
 
 def _read(path: Path) -> Any:
@@ -75,24 +75,24 @@ def _read(path: Path) -> Any:
         raise InputError(f"cannot read the weights file {path}: {reason}; get it again; {_WAYS}") from error
 
 
-def _unfit(content: Any, wanted: dict[str, Tensor], spare: tuple[str, ...]) -> str:
+def _unfit(content: Any, state: dict[str, Tensor], spare: tuple[str, ...]) -> str:
     """Return what is wrong with the content of a file; empty if it fits."""
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         return "is no state dict (names and tensors)"
-    given = {name: value for name, value in content.items() if name not in spare}
+    stored = {name: value for name, value in content.items() if name not in spare}
     # they count batches for a momentum that is not used; files older than torch 0.4.1 have none
-    missing = [name for name in wanted if name not in given and not name.endswith("num_batches_tracked")]
-    foreign = [name for name in given if name not in wanted]
+    missing = [name for name in state if name not in stored and not name.endswith("num_batches_tracked")]
+    foreign = [name for name in stored if name not in state]
     if missing or foreign:
         return " and ".join(filter(None, [_listed("lacks", missing), _listed("has the unknown", foreign)]))
-    for name, value in given.items():
-        if value.shape != wanted[name].shape:
-            return f"has {name} of shape {tuple(value.shape)} where {tuple(wanted[name].shape)} is needed"
+    for name, value in stored.items():
+        if value.shape != state[name].shape:
+            return f"has {name} of shape {tuple(value.shape)} where {tuple(state[name].shape)} is needed"
         if not value.isfinite().all():
             return f"has numbers in {name} that are not finite"
     return ""
 
 
 def _listed(verb: str, names: list[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"{verb} {', '.join(names[:3])}{more}" if names else ""
+    remainder = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return f"{verb} {', '.join(names[:3])}{remainder}" if names else ""

@@ -46,15 +46,15 @@ class Pyg(AbstractModel):
         degree: Annotated[int, Ge(1)] = 7,
     ) -> None:
         super().__init__(kind)
-        given: dict[str, Any] = network.keywords if isinstance(network, partial) else {}
+        keywords: dict[str, Any] = network.keywords if isinstance(network, partial) else {}
         made = network.func if isinstance(network, partial) else network
         self._weighted = bool(getattr(made, "supports_edge_weight", False))
         # The adjacency is normalised already.
-        own: dict[str, Any] = {"normalize": False, "add_self_loops": False} if self._weighted else {}
-        if "scalers" in given:
-            own["deg"] = torch.nn.functional.one_hot(torch.tensor(degree), degree + 1)
+        defaults: dict[str, Any] = {"normalize": False, "add_self_loops": False} if self._weighted else {}
+        if "scalers" in keywords:
+            defaults["deg"] = torch.nn.functional.one_hot(torch.tensor(degree), degree + 1)
         try:
-            self.network = network(shape[-1], width, layers, **own)
+            self.network = network(shape[-1], width, layers, **defaults)
         except (TypeError, ValueError, AssertionError) as error:
             raise InputError(f"model.network refuses its settings: {error}") from error
         self.pooling = POOLINGS[pooling](width)

@@ -50,7 +50,7 @@ class Interpolation(AbstractRepresentation):
         self.pixels, self.scale, self.mask = pixels, scale, mask
         methods: Sequence = method if isinstance(method, list | tuple) else [method]
         points, targets = positions[:, :2].cpu().numpy(), centres(size, pixels)
-        matrix = np.concatenate([weights(points, targets, one) for one in methods])
+        matrix = np.concatenate([weights(points, targets, method) for method in methods])
         self.register_buffer("matrix", torch.from_numpy(matrix).to(torch.float32))
 
     def forward(self, readings: Tensor, valid: Tensor) -> Frames:

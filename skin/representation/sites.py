@@ -130,8 +130,8 @@ class Sites(AbstractRepresentation):
     def _largest(self, values: Tensor, valid: Tensor) -> Tensor:
         """Return the largest values of working sensors, (B, T, strongest), 0 where there are fewer."""
         working = values.masked_fill(~valid, -torch.inf)
-        found = working.topk(min(self.strongest, values.shape[2]), dim=2).values
-        return pad(found.masked_fill(found.isinf(), 0), (0, self.strongest - found.shape[2]))
+        strongest = working.topk(min(self.strongest, values.shape[2]), dim=2).values
+        return pad(strongest.masked_fill(strongest.isinf(), 0), (0, self.strongest - strongest.shape[2]))
 
     def _summary(self, geometry: Tensor, works: Tensor, shares: Tensor) -> Tensor:
         """Return number and mean, least and largest geometry of working sensors, and coverage, (B, D)."""
@@ -141,15 +141,15 @@ class Sites(AbstractRepresentation):
         least = geometry.masked_fill(~alive, torch.inf).amin(1)
         most = geometry.masked_fill(~alive, -torch.inf).amax(1)
         columns = [mean, least, most]
-        found = [torch.where(column.isfinite(), column, 0) for column in columns]
-        return torch.cat([count.to(mean).log(), *found, (shares.amax(1) + 1e-3).log()], dim=1)
+        finite = [torch.where(column.isfinite(), column, 0) for column in columns]
+        return torch.cat([count.to(mean).log(), *finite, (shares.amax(1) + 1e-3).log()], dim=1)
 
 
 def _engineered(touches: Touches) -> Tensor:
     """Return the engineered features that a dead sensor does not change, (B, D), as asinh."""
-    found = engineered_features(touches)
-    kept = [value for name, value in found.items() if not name.startswith(_COUNTING)]
-    return torch.stack([value.to(touches.readings) for value in kept], dim=1).asinh()
+    features = engineered_features(touches)
+    selected = [value for name, value in features.items() if not name.startswith(_COUNTING)]
+    return torch.stack([value.to(touches.readings) for value in selected], dim=1).asinh()
 
 
 def _no_geometry() -> InputError:

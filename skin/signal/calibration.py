@@ -140,36 +140,38 @@ class Calibration:
 
         A sensor that was never driven to its limit thus clips like the others: channels share a converter.
         """
-        given = np.array([np.nan if value is None else value for value in self.sensors.get(name, [None])])
-        given = np.broadcast_to(given, (len(self),))
+        values = np.array([np.nan if value is None else value for value in self.sensors.get(name, [None])])
+        values = np.broadcast_to(values, (len(self),))
         spare = QUANTITIES[name]
-        if np.isfinite(given).any():
-            spare = float(np.nanmedian(given))
-        return np.where(np.isnan(given), spare, given)
+        if np.isfinite(values).any():
+            spare = float(np.nanmedian(values))
+        return np.where(np.isnan(values), spare, values)
 
     def values(self) -> dict[str, np.ndarray]:
         """Return every quantity, (S,), with ``dead`` and the constant ``level`` of broken sensors, N."""
-        found = {name: self.known(name) for name in QUANTITIES}
+        quantities = {name: self.known(name) for name in QUANTITIES}
         dead = np.zeros(len(self), dtype=bool)
         dead[[number for group in self.broken.values() for number in group]] = True
-        level = np.array(found["offset"])
+        level = np.array(quantities["offset"])
         level[list(self.broken.get("dead", []))] = 0.0
-        return found | {"dead": dead, "level": level}
+        return quantities | {"dead": dead, "level": level}
 
     def draw(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
         """Return the same for similar devices, (..., S) each, drawn from the ranges.
 
         Quantities without a range keep their values. Broken sensors are drawn as well.
         """
-        own, found = self.values(), dict[str, np.ndarray]()
+        own_values, converted = self.values(), dict[str, np.ndarray]()
         for name in QUANTITIES:
             low, high = self.ranges.get(name, (0.0, 0.0))
             drawn = generator.uniform(low, high, shape)
-            found[name] = drawn if name in self.ranges else np.broadcast_to(own[name], shape).copy()
+            converted[name] = (
+                drawn if name in self.ranges else np.broadcast_to(own_values[name], shape).copy()
+            )
         fewest, most = self.ranges.get("dead", (0, 0))
         count = generator.integers(int(fewest), int(most), (*shape[:-1], 1), endpoint=True)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
-        return found | {"dead": rank < count, "level": np.zeros(shape)}
+        return converted | {"dead": rank < count, "level": np.zeros(shape)}
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -182,23 +184,23 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: no such file, unreadable, invalid contents, or a line ``sha256`` with the checksum of
             other contents.
     """
-    found = next((place for place in candidates(path) if place.is_file()), None)
-    if found is None:
+    file = next((place for place in candidates(path) if place.is_file()), None)
+    if file is None:
         raise InputError(f"no calibration {path}: skin calibrate session=FILE out={path} makes one")
     try:
-        text = read_file(found, TEXT).decode("utf-8")
+        text = read_file(file, TEXT).decode("utf-8")
         stored: Any = parse_yaml(text)
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the calibration {found}: {error}") from error
+        raise InputError(f"cannot read the calibration {file}: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        raise InputError(f"{found} is no calibration: it needs format: {FORMAT}, count: and sensors:")
+        raise InputError(f"{file} is no calibration: it needs format: {FORMAT}, count: and sensors:")
     try:
         check_text(text, stored)
         return _calibration(stored)
     except ChecksumError as error:
-        raise InputError(f"{found}: {error}: remove its line sha256 if you changed it by hand") from error
+        raise InputError(f"{file}: {error}: remove its line sha256 if you changed it by hand") from error
     except (InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"{found} is no calibration: {error}") from error
+        raise InputError(f"{file} is no calibration: {error}") from error
 
 
 def _calibration(stored: Mapping[str, Any]) -> Calibration:
@@ -251,8 +253,8 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     return files.write("\n".join(lines) + "\n", path)
 
 
-def _known(given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:
-    if unknown := set(given) - set(names):
+def _known(names_given: Mapping[str, Any], names: Sequence[str] | Mapping[str, Any], group: str) -> None:
+    if unknown := set(names_given) - set(names):
         raise InputError(f"{group} takes {', '.join(names)}, got {', '.join(sorted(map(str, unknown)))}")
 
 
@@ -261,8 +263,8 @@ def _check(name: str, values: Sequence[float]) -> None:
     if not numbers or (name not in _SIGNED and min(values, default=0) < 0):
         least = "" if name in _SIGNED else " from 0 up"
         least += " (a channel whose values fall with force has polarity: -1)" if name == "gain" else ""
-        shown = str(values)
-        raise InputError(f"{name} must be numbers{least}, got {shown[:_SHOWN]}")
+        text = str(values)
+        raise InputError(f"{name} must be numbers{least}, got {text[:_SHOWN]}")
 
 
 def _is_number(name: str, value: Any) -> bool:

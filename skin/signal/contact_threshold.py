@@ -56,8 +56,8 @@ class ContactThreshold:
                 f"{len(touched)} validation windows are all alike, with touch or all without: "
                 "give more with data.gestures"
             )
-        alarms, found, levels = roc_curve(touched.numpy(), rises.numpy())
-        return cls(float(levels[int((found - alarms).argmax())]), idle)
+        alarms, detected, levels = roc_curve(touched.numpy(), rises.numpy())
+        return cls(float(levels[int((detected - alarms).argmax())]), idle)
 
     def touched(self, touches: Touches) -> Tensor:
         """Return which windows are touched, (B,), bool."""
@@ -66,11 +66,11 @@ class ContactThreshold:
 
 def gates(threshold: ContactThreshold, task: Task) -> dict[str, Gate]:
     """Return the gates by name: ``none`` lets all through; ``learned`` only where the task has a gate."""
-    found: dict[str, Gate] = {
+    gates: dict[str, Gate] = {
         "none": lambda touches, chances: torch.ones(len(touches), dtype=torch.bool),
         "threshold": lambda touches, chances: threshold.touched(touches),
     }
     if task.gate is not None:
         gate = task.names.index(task.gate)
-        found["learned"] = lambda touches, chances: chances[:, gate] > 0.5
-    return found
+        gates["learned"] = lambda touches, chances: chances[:, gate] > 0.5
+    return gates

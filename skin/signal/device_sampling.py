@@ -32,15 +32,15 @@ def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndar
     place = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
     now = np.minimum(place.astype(int), window - 1)
     offset = place - now - 0.5  # from the middle of the interval, in intervals
-    other = now + np.sign(offset).astype(int)
+    neighbour = now + np.sign(offset).astype(int)
     padded = torch.nn.functional.pad(force, (0, 0, 1, 1))
     touched = (padded != 0).any(dim=2, keepdim=True)
     share = torch.from_numpy(np.abs(offset)).to(force)[..., None]
     row = np.arange(batch)[:, None]
-    here, there = padded[row, now + 1], padded[row, other + 1]
+    current, neighbour_value = padded[row, now + 1], padded[row, neighbour + 1]
     # Towards a frame without contact the force is 0 at the edge, which is half an interval away.
-    share = torch.where(touched[row, other + 1], share, 2 * share)
-    return torch.where(touched[row, now + 1], torch.lerp(here, there, share), 0.0)
+    share = torch.where(touched[row, neighbour + 1], share, 2 * share)
+    return torch.where(touched[row, now + 1], torch.lerp(current, neighbour_value, share), 0.0)
 
 
 def measure(
@@ -80,13 +80,15 @@ def _reduced(
     """Return readings and masks (B, F, S) at the first of two rates as (B, window, S) at the second, Hz."""
     batch, frames, sensors = readings.shape
     values, works, limits = (
-        one.transpose(0, 1).flatten(1).cpu().numpy() for one in (readings, valid, saturated)
+        tensor.transpose(0, 1).flatten(1).cpu().numpy() for tensor in (readings, valid, saturated)
     )
     time = (np.arange(frames) + 0.5) / rates[0]
-    found = resample(time, values, works, limits, window / rates[1], 1 / rates[1], window)
-    tensors = (torch.from_numpy(one).unflatten(1, (batch, sensors)).transpose(0, 1) for one in found[:3])
-    highest, known, limited = (one.contiguous().to(readings.device) for one in tensors)
-    return highest.to(readings.dtype), known, limited
+    resampled = resample(time, values, works, limits, window / rates[1], 1 / rates[1], window)
+    tensors = (
+        torch.from_numpy(tensor).unflatten(1, (batch, sensors)).transpose(0, 1) for tensor in resampled[:3]
+    )
+    highest, known_frames, limited = (tensor.contiguous().to(readings.device) for tensor in tensors)
+    return highest.to(readings.dtype), known_frames, limited
 
 
 def draw_constants(

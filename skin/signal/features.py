@@ -63,8 +63,8 @@ def estimate_noise(touches: Touches) -> Tensor:
     """
     steps = _valid(touches).diff(dim=1).abs()
     valid = touches.valid[:, 1:] & touches.valid[:, :-1]
-    known = torch.where(valid, steps, torch.nan).flatten(1)
-    return _PER_MEDIAN * known.nanmedian(dim=1).values.nan_to_num(0)
+    known_steps = torch.where(valid, steps, torch.nan).flatten(1)
+    return _PER_MEDIAN * known_steps.nanmedian(dim=1).values.nan_to_num(0)
 
 
 def above_idle(touches: Touches, noise: Tensor | None = None) -> Tensor:

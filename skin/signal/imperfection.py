@@ -130,9 +130,9 @@ class Imperfection(ImperfectionSettings):
     def _drawn(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
         """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
         ranges = {name: getattr(self, name) for name in _SPREADS}
-        some = any(isinstance(one, list | tuple) for one in ranges.values())
+        some = any(isinstance(bounds, list | tuple) for bounds in ranges.values())
         share = generator.random((*shape[:-1], 1)) if some else np.zeros(())
-        spread = {name: _part(one, share) for name, one in ranges.items()}
+        spread = {name: _part(bounds, share) for name, bounds in ranges.items()}
         gain = np.exp(spread["gain_spread"] * generator.standard_normal(shape))
         offset = self.offset * generator.standard_normal(shape)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
@@ -158,9 +158,9 @@ class Imperfection(ImperfectionSettings):
         calibration.fits(shape[-1])
         values = calibration.values() if len(shape) == 1 else calibration.draw(shape, generator)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
-        more = rank < generator.integers(*self.dead_range, (*shape[:-1], 1), endpoint=True)
-        values["level"] = np.where(more, 0.0, values["level"])
-        values["dead"] = values["dead"] | more
+        also_dead = rank < generator.integers(*self.dead_range, (*shape[:-1], 1), endpoint=True)
+        values["level"] = np.where(also_dead, 0.0, values["level"])
+        values["dead"] = values["dead"] | also_dead
         return values | {"idle": generator.standard_normal(shape)}
 
     def apply(
@@ -236,5 +236,5 @@ def _part(spread: Spread, share: np.ndarray) -> np.ndarray:
     return np.asarray(least + (most - least) * share)
 
 
-def _settings(of: ImperfectionSettings) -> dict[str, Any]:
-    return {entry.name: getattr(of, entry.name) for entry in fields(ImperfectionSettings)}
+def _settings(settings: ImperfectionSettings) -> dict[str, Any]:
+    return {entry.name: getattr(settings, entry.name) for entry in fields(ImperfectionSettings)}

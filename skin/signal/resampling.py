@@ -68,12 +68,12 @@ def resample(
     highest = np.full((window, values.shape[1]), -np.inf)
     limited = np.zeros(highest.shape, dtype=bool)
     if some.any():
-        known = np.where(good, values[inside], -np.inf)
-        highest[some] = np.maximum.reduceat(known, begins[some], axis=0)
+        known_values = np.where(good, values[inside], -np.inf)
+        highest[some] = np.maximum.reduceat(known_values, begins[some], axis=0)
         limited[some] = np.logical_or.reduceat(good & saturated[inside], begins[some], axis=0)
-    found = np.isfinite(highest)
-    strongest = np.where(found, highest, 0.0)
-    return Resampled(strongest if polarity is None else strongest * polarity, found, limited)
+    has_value = np.isfinite(highest)
+    strongest = np.where(has_value, highest, 0.0)
+    return Resampled(strongest if polarity is None else strongest * polarity, has_value, limited)
 
 
 def check_rate(found: float, rate: float, setting: str | None = None) -> None:
@@ -148,11 +148,11 @@ class Window:
             self._segment = frame.segment
         if self._end == len(self._times):
             self._make_room()
-        here, self._end = self._end, self._end + 1
-        self._times[here], self._lost[here] = frame.t, max(frame.lost, int(frame.after == "gap"))
-        self._values[here], self._valid[here] = frame.values, frame.valid
+        position, self._end = self._end, self._end + 1
+        self._times[position], self._lost[position] = frame.t, max(frame.lost, int(frame.after == "gap"))
+        self._values[position], self._valid[position] = frame.values, frame.valid
         self._polarity = frame.polarity
-        self._saturated[here] = False if frame.saturated is None else frame.saturated
+        self._saturated[position] = False if frame.saturated is None else frame.saturated
 
     def read(self, partial: bool = False) -> Resampled | None:
         """Return the window that ends with the latest frame; None before T intervals are complete.
@@ -188,7 +188,7 @@ class Window:
         times = self._times[: self._end]
         first = int(np.searchsorted(times, end - (self.frames + 1) * interval))
         part = slice(first, int(np.searchsorted(times, end)))
-        found = resample(
+        resampled = resample(
             times[part],
             self._values[part],
             self._valid[part],
@@ -204,14 +204,14 @@ class Window:
         ages = np.unique(np.floor((end - times[part][inside]) / interval))
         before = max(0, self.frames - 1 - int((end - times[0]) / interval)) if len(times) else self.frames
         missing = self.frames - before - len(ages)
-        return found._replace(gap=bool(lost) or missing > 0, before=before)
+        return resampled._replace(gap=bool(lost) or missing > 0, before=before)
 
     def _make_room(self) -> None:
         """Discard frames older than the window; double the capacity unless that frees half of it."""
         since = self._times[self._end - 1] - 1.1 * _SLOWER * self.frames / self.rate
         first = min(int(np.searchsorted(self._times[: self._end], since)), max(0, self._end - _MANY))
-        kept, segment = slice(first, self._end), self._segment
-        old = [array[kept] for array in self._arrays]
+        window, segment = slice(first, self._end), self._segment
+        old = [array[window] for array in self._arrays]
         capacity, count = len(self._times), len(old[0])
         self._clear(capacity if 2 * count <= capacity else 2 * capacity)
         self._end, self._segment = count, segment

@@ -22,7 +22,7 @@ def direction_features(touches: Touches) -> dict[str, Tensor]:
         push = (x - _FORCE).clamp(min=0) ** power
         for share in _SHARES:
             name = f"centre {power} beyond {share} of the peak"
-            vectors |= {f"{way} of the {name}": one for way, one in _ways(push, at, x, share).items()}
+            vectors |= {f"{way} of the {name}": vector for way, vector in _ways(push, at, x, share).items()}
     return {
         f"{name}, {axis}": column
         for name, vector in vectors.items()

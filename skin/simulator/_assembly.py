@@ -110,8 +110,8 @@ class Structure:
         steps = sensors.positions[:, :2, None] / np.array(self.body.cell)[:, None]
         # Linear between the nearest two lines of nodes: a hat around each.
         x, y = (
-            np.clip(1 - np.abs(steps[:, one] - np.arange(count + 1)), 0, None)
-            for one, count in enumerate(self.body.cells)
+            np.clip(1 - np.abs(steps[:, axis] - np.arange(count + 1)), 0, None)
+            for axis, count in enumerate(self.body.cells)
         )
         return self._read(y[:, :, None] * x[:, None, :], levels, dof=axis)
 
@@ -149,12 +149,12 @@ class Structure:
         beams = beams * _beam_moduli(self.body)[level].reshape(-1, 1, 1)
         upper = self.nodes[level].reshape(-1, 1)
         if level == 0:
-            ends, kept = upper, _dofs([1], self.free)
+            ends, columns = upper, _dofs([1], self.free)
         else:
-            ends, kept = np.hstack([self.nodes[level - 1].reshape(-1, 1), upper]), _dofs([0, 1], self.free)
+            ends, columns = np.hstack([self.nodes[level - 1].reshape(-1, 1), upper]), _dofs([0, 1], self.free)
         corners, corner_kept = self._unknowns(self._corners(level)), _dofs(range(4), self.free)
         plates = plate[None, corner_kept][:, :, corner_kept] * self.body.moduli[level].reshape(-1, 1, 1)
-        return [_scatter(corners, plates), _scatter(self._unknowns(ends), beams[:, kept][:, :, kept])]
+        return [_scatter(corners, plates), _scatter(self._unknowns(ends), beams[:, columns][:, :, columns])]
 
     def _corners(self, level: int) -> np.ndarray:
         """Return the four nodes of every cell of an interface, (H*W, 4), in the order of a plate's nodes."""
@@ -163,8 +163,8 @@ class Structure:
 
     def _unknowns(self, nodes: np.ndarray) -> np.ndarray:
         """Return the unknowns of elements' nodes (n, k), as (n, k * unknowns per node)."""
-        each = len(self.free)
-        return (nodes[:, :, None] * each + np.arange(each)).reshape(len(nodes), -1)
+        free_dofs = len(self.free)
+        return (nodes[:, :, None] * free_dofs + np.arange(free_dofs)).reshape(len(nodes), -1)
 
 
 def _section_edges(body: AbstractBody, axis: int) -> np.ndarray:
@@ -194,7 +194,7 @@ def _dofs(ends: Iterable[int], free: tuple[int, ...]) -> list[int]:
 
 def _scatter(unknowns: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of element matrices (n, k, k) with unknowns (n, k)."""
-    each = unknowns.shape[1]
-    rows = np.repeat(unknowns, each, axis=1)
-    columns = np.tile(unknowns, (1, each))
+    size = unknowns.shape[1]
+    rows = np.repeat(unknowns, size, axis=1)
+    columns = np.tile(unknowns, (1, size))
     return rows.ravel(), columns.ravel(), matrices.reshape(len(unknowns), -1).ravel()

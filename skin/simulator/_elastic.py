@@ -58,13 +58,13 @@ class Elastic:
         One solve per row, of the transposed problem (K is symmetric), whatever the number of cells.
         """
         loads = [self.mesh.loads(axis) for axis in axes]
-        found = np.empty((len(axes), rows.shape[0], loads[0].shape[1]))
+        influence = np.empty((len(axes), rows.shape[0], loads[0].shape[1]))
         for first in range(0, rows.shape[0], _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             adjoint = self.solve(rows[part].T.toarray())
-            for load, out in zip(loads, found, strict=True):
+            for load, out in zip(loads, influence, strict=True):
                 out[part] = (load.T @ adjoint).T
-        return found
+        return influence
 
     def influence(self, axis: int, path: Path) -> np.ndarray:
         """Return how every node moves under 1 Pa on each cell, (3 N, cells) float32, m/Pa, read from a file.
@@ -75,35 +75,37 @@ class Elastic:
             axis: along which the cells are loaded.
             path: of the file, x.npy; it is written if it is not there.
         """
-        known = self._influence(path)
-        if known is None:
+        influence = self._influence(path)
+        if influence is None:
             self._write_influence(axis, path)
-            known = self._influence(path)
-        assert known is not None
-        return known
+            influence = self._influence(path)
+        assert influence is not None
+        return influence
 
     def _influence(self, path: Path) -> np.ndarray | None:
         """Return what a file holds, or None if there is none or it is no such array."""
         columns, rows, _ = self.mesh.counts
         shape = (len(self.mesh.held), columns * rows)
         try:
-            found = np.load(path, mmap_mode="r", allow_pickle=False)
+            influence = np.load(path, mmap_mode="r", allow_pickle=False)
         except (OSError, EOFError, ValueError):
             return None
-        return found if found.shape == shape and found.dtype == np.float32 else None
+        return influence if influence.shape == shape and influence.dtype == np.float32 else None
 
     def _write_influence(self, axis: int, path: Path) -> None:
         loads = self.mesh.loads(axis)
         parts = range(0, loads.shape[1], _AT_ONCE)
         with whole(path, "SKIN_CACHE=FOLDER") as partial:
-            found = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float32, shape=loads.shape)
+            influence = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float32, shape=loads.shape)
             _reserve(partial)
             console = Console(stderr=True)
-            shown = sys.stderr.isatty()
-            for first in track(parts, "solving for each surface cell", console=console, disable=not shown):
-                found[:, first : first + _AT_ONCE] = self.solve(loads[:, first : first + _AT_ONCE].toarray())
-            found.flush()
-            del found  # Windows does not rename a file that is mapped
+            terminal = sys.stderr.isatty()
+            for first in track(parts, "solving for each surface cell", console=console, disable=not terminal):
+                influence[:, first : first + _AT_ONCE] = self.solve(
+                    loads[:, first : first + _AT_ONCE].toarray()
+                )
+            influence.flush()
+            del influence  # Windows does not rename a file that is mapped
 
 
 def _reserve(path: Path) -> None:

@@ -38,10 +38,10 @@ def quadrature(
         points.append(place + grid.reshape(-1, 3))
         areas.append(np.outer(ds, dt).ravel())
         owners.append(np.full(areas[-1].size, number))
-    found, weights, owner = np.concatenate(points), np.concatenate(areas), np.concatenate(owners)
+    places, weights, owner = np.concatenate(points), np.concatenate(areas), np.concatenate(owners)
     last = np.array([line[-1] for line in lines])
-    inside = ((found >= 0) & (found <= last)).all(axis=1)
-    return found[inside], weights[inside], owner[inside]
+    inside = ((places >= 0) & (places <= last)).all(axis=1)
+    return places[inside], weights[inside], owner[inside]
 
 
 def _turn(normal: np.ndarray) -> np.ndarray:

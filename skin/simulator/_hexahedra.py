@@ -146,8 +146,8 @@ class Hexahedra:
         """
         frame = self.frame(points)
         n, m = (
-            np.einsum("pi,pij->pj", given, frame)
-            for given in (normals, normals if others is None else others)
+            np.einsum("pi,pij->pj", sides, frame)
+            for sides in (normals, normals if others is None else others)
         )
         middles = (self.lines[2][1:] + self.lines[2][:-1]) / 2
         last = len(middles) - 1

@@ -102,11 +102,11 @@ def _bytes(structure: Structure, sensors: int) -> float:
     has about (7.5 log2(side) - 17) entries per unknown and unknown of the place. The sum came out 1.1 to 1.4
     times the memory then measured.
     """
-    each = len(structure.free)
+    free_dofs = len(structure.free)
     layers, rows, columns = structure.grid
     places = float(rows * columns)
-    per_place = each * layers
+    per_place = free_dofs * layers
     filling = max(7.5 * np.log2(places**0.5) - 17, 7.0)
     factors = 16 * places * per_place**2 * filling
-    elements = 32 * places * layers * ((4 * each) ** 2 + (2 * each) ** 2)
+    elements = 32 * places * layers * ((4 * free_dofs) ** 2 + (2 * free_dofs) ** 2)
     return factors + elements + 16 * 5 * sensors * (places * per_place + places)

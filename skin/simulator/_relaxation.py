@@ -36,18 +36,18 @@ def times(body: AbstractBody) -> list[float]:
     a layer relaxes with the first, at constant stress it creeps with the second. Values closer than a factor
     of 1.2 are merged, and those of creep take precedence.
     """
-    branches = [one for layer in body.layers if (one := layer.material.relaxation) is not None]
-    creep = [one.time * (1 + one.strength) for one in branches]
-    kept: list[float] = []
-    for time in [*creep, *(one.time for one in branches)]:
-        if all(max(time / other, other / time) >= _APART for other in kept):
-            kept.append(time)
-    return sorted(kept)
+    branches = [branch for layer in body.layers if (branch := layer.material.relaxation) is not None]
+    creep = [branch.time * (1 + branch.strength) for branch in branches]
+    times: list[float] = []
+    for time in [*creep, *(branch.time for branch in branches)]:
+        if all(max(time / time_before, time_before / time) >= _APART for time_before in times):
+            times.append(time)
+    return sorted(times)
 
 
 def speeds(lags: Sequence[float]) -> list[float]:
     """Return the collocation points, 1/s, one per lag: 0, and one between each lag and the next."""
-    return [0.0, *(1 / math.sqrt(one * other) for one, other in pairwise(lags))]
+    return [0.0, *(1 / math.sqrt(shorter * longer) for shorter, longer in pairwise(lags))]
 
 
 class Relaxing(AbstractSimulator):

@@ -53,16 +53,16 @@ def largest(cells: Tensor, rows: Tensor) -> Tensor:
         rows: (C, places, cells), 1/Pa, with C = 1, or 6 for xx, yy, zz, yz, xz, xy.
     """
     components, places, _ = rows.shape
-    found = []
+    strains = []
     for part in cells.split(max(1, _NUMBERS_AT_ONCE // (components * places))):
         strain = (part @ rows.flatten(0, 1).T).unflatten(-1, (components, places))
         if components == 1:
-            found.append(strain.abs().amax((1, 2)))
+            strains.append(strain.abs().amax((1, 2)))
             continue
         at = (strain.square() * _TIMES[:, None]).sum(1).argmax(1)
         worst = strain[torch.arange(len(part)), :, at]
         tensor = worst.new_zeros(len(part), 3, 3)
         for value, (i, j) in zip(worst.T, _PAIRS, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
-        found.append(torch.linalg.eigvalsh(tensor).abs().amax(1))
-    return torch.cat(found)
+        strains.append(torch.linalg.eigvalsh(tensor).abs().amax(1))
+    return torch.cat(strains)

@@ -89,10 +89,10 @@ class AbstractSimulator(nn.Module, ABC):
             displacement: whether to compute the displacement.
         """
         readings, moves = self(frames, shear)
-        shown = readings[index] * scale[..., None]
+        scaled = readings[index] * scale[..., None]
         if moves is None or not displacement:
-            return Response(shown, None)
-        return Response(shown, moves[index] * scale[..., None, None])
+            return Response(scaled, None)
+        return Response(scaled, moves[index] * scale[..., None, None])
 
     def respond(self, movie: Movie, displacement: bool = True) -> Response:
         """Return the readings (B, T, S), N, of gestures, and the displacement (B, T, S, 2), m.

@@ -205,7 +205,10 @@ def _motions(mesh: Hexahedra, sensors: Sensors) -> list[sp.csr_matrix]:
     places = sensors.positions
     above = places * np.array([1.0, 1.0, 0.0])
     x, y, inwards = (np.tile(axis, (len(places), 1)) for axis in np.eye(3))
-    return [mesh.motion(*one) for one in ((places, inwards), (above, inwards), (places, x), (places, y))]
+    return [
+        mesh.motion(*motion_axes)
+        for motion_axes in ((places, inwards), (above, inwards), (places, x), (places, y))
+    ]
 
 
 def _read(rows: sp.csr_matrix, influence: np.ndarray) -> np.ndarray:

@@ -63,11 +63,11 @@ def _load(path: Path, key: str, shapes: Mapping[str, Sequence[int]]) -> dict[str
         stored = load_npz(path, most=expected + 4 * len(key))
         if str(stored["key"]) != key:
             return None
-        found = {name: stored[name] for name in shapes}
+        arrays = {name: stored[name] for name in shapes}
     except Exception:  # any error of a broken archive: build the arrays again
         return None
     sound = all(
         array.shape == tuple(shapes[name]) and array.dtype == np.float64 and np.isfinite(array).all()
-        for name, array in found.items()
+        for name, array in arrays.items()
     )
-    return found if sound else None
+    return arrays if sound else None

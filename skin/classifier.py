@@ -120,9 +120,9 @@ class TouchClassifier(pl.LightningModule):
         counts = self.task.counts(labels)
         right = ((logits > 0) == (labels > 0.5)) & counts
         shares = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
-        each = dict(zip(self.task.binary, shares, strict=False))
-        overall = torch.stack([each[name] for name in self.task.gated]).mean()
-        return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in each.items()}
+        label_shares = dict(zip(self.task.binary, shares, strict=False))
+        overall = torch.stack([label_shares[name] for name in self.task.gated]).mean()
+        return {"accuracy": overall} | {f"accuracy_{name}": share for name, share in label_shares.items()}
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """Return the loss of one batch."""

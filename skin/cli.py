@@ -19,9 +19,9 @@ from skin import interrupt
 
 def verbs() -> dict[str, str]:
     """Return the module of each verb."""
-    own = sorted(path.stem for path in (Path(__file__).parent / "commands").glob("[!_]*.py"))
-    others = {found.name: found.module for found in entry_points(group="skin.verbs")}
-    return {name: f"skin.commands.{name}" for name in own} | dict(sorted(others.items()))
+    names = sorted(path.stem for path in (Path(__file__).parent / "commands").glob("[!_]*.py"))
+    others = {entry.name: entry.module for entry in entry_points(group="skin.verbs")}
+    return {name: f"skin.commands.{name}" for name in names} | dict(sorted(others.items()))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -33,35 +33,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Raises:
         SystemExit: with code 2 for bad input.
     """
-    verb, *rest = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
-    known = verbs()
+    verb, *overrides = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
+    modules = verbs()
     if verb in ("-sc", "--shell-completion"):
-        _complete(" ".join(rest), known)
+        _complete(" ".join(overrides), modules)
     elif verb in ("-h", "--help"):
-        print(_help(known))
+        print(_help(modules))
     elif verb == "--version":
         from skin import __version__
 
         print(f"skin {__version__}")
-    elif verb not in known:
-        near = get_close_matches(verb, known, 1)
-        hint = f": did you mean {near[0]}?" if near else f": {', '.join(known)}"
+    elif verb not in modules:
+        near = get_close_matches(verb, modules, 1)
+        hint = f": did you mean {near[0]}?" if near else f": {', '.join(modules)}"
         sys.exit(_refused(f"skin has no verb {verb}{hint}"))
-    elif _source(known[verb]) is None:
+    elif _source(modules[verb]) is None:
         sys.exit(_refused(f"skin {verb} needs files that an installed package lacks: clone the repository"))
     else:
         try:
-            import_module(known[verb]).main(rest)
+            import_module(modules[verb]).main(overrides)
         except SystemExit as end:
             if end.code == 128 + signal.SIGTERM and arguments is None:
                 interrupt.leave(end.code)
             raise
 
 
-def _help(known: Mapping[str, str]) -> str:
+def _help(modules: Mapping[str, str]) -> str:
     """Return the first line of each verb's docstring, without importing it."""
-    sources = {name: _source(module) for name, module in known.items()}
-    width = max(map(len, known))
+    sources = {name: _source(module) for name, module in modules.items()}
+    width = max(map(len, modules))
     lines = [
         f"  {name:{width}}  {(ast.get_docstring(ast.parse(path.read_text())) or '').split(chr(10))[0]}"
         for name, path in sources.items()
@@ -86,23 +86,23 @@ complete -o nospace -o default -F _skin skin
 """
 
 
-def _complete(asked: str, known: Mapping[str, str]) -> None:
+def _complete(request: str, modules: Mapping[str, str]) -> None:
     """Print the script that completes a command line in bash, or the choices for ``COMP_LINE``."""
-    if asked == "install=bash":
+    if request == "install=bash":
         print(_SCRIPT, end="")
         return
-    if asked != "query=bash":
-        sys.exit(_refused(f'skin -sc {asked}: give install=bash, as in eval "$(skin -sc install=bash)"'))
+    if request != "query=bash":
+        sys.exit(_refused(f'skin -sc {request}: give install=bash, as in eval "$(skin -sc install=bash)"'))
     program, *words = os.environ.get("COMP_LINE", "skin ").split(" ")
     if len(words) < 2:
-        print(*(name for name in known if name.startswith("".join(words))))
+        print(*(name for name in modules if name.startswith("".join(words))))
         return
-    verb, *rest = words
-    if verb not in known:
+    verb, *overrides = words
+    if verb not in modules:
         return
     # Hydra completes groups, options and settings, and knows no verbs.
-    os.environ["COMP_LINE"] = " ".join([program, *rest])
-    import_module(known[verb]).main(["-sc", "query=bash"])
+    os.environ["COMP_LINE"] = " ".join([program, *overrides])
+    import_module(modules[verb]).main(["-sc", "query=bash"])
 
 
 def _source(module: str) -> Path | None:

@@ -68,16 +68,16 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
 
         def main(words: Sequence[str] | None = None) -> None:
             _log_to_stderr()
-            given = sys.argv[1:] if words is None else words
+            arguments = sys.argv[1:] if words is None else words
             try:
-                _run(job, name, given)
+                _run(job, name, arguments)
             except Exception as error:
                 refused = to_input_error(error)
                 if refused is None and not started and isinstance(error, _WORDS):
                     refused = InputError(f"the configuration cannot be composed: {one_line(error)}")
                 if refused is None or "HYDRA_FULL_ERROR" in os.environ:
                     raise
-                print(suggest(error, name, given) or refused, file=sys.stderr)
+                print(suggest(error, name, arguments) or refused, file=sys.stderr)
                 sys.exit(1 if started else 2)
 
         return main
@@ -99,26 +99,26 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
     version.setbase(_VERSION)
     parser = get_args_parser()
     # Neither the shell nor Hydra expands ~ in device.path=~/x.csv.
-    asked = parser.parse_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
-    if asked.help:
+    options = parser.parse_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
+    if options.help:
         if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-        print(_help(sys.modules[job.__module__].__doc__ or "", asked.config_name or name, asked))
+        print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
         return
-    given = os.environ.get("HYDRA_FULL_ERROR")
+    full_error = os.environ.get("HYDRA_FULL_ERROR")
     # Makes Hydra raise errors instead of printing them.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        _run_hydra(asked, parser, job, str(CONF), name)
+        _run_hydra(options, parser, job, str(CONF), name)
     finally:
-        if given is None:
+        if full_error is None:
             del os.environ["HYDRA_FULL_ERROR"]
 
 
-def _help(about: str, name: str, asked: Any) -> str:
+def _help(about: str, name: str, options_given: Any) -> str:
     """Return the help of a command: its docstring, the options of its groups, and its settings."""
-    folders = [CONF, *([Path(asked.config_dir).resolve()] if asked.config_dir else [])]
-    words = [*asked.overrides, f"hydra.searchpath=[{','.join(map(str, folders[1:]))}]"]
+    folders = [CONF, *([Path(options_given.config_dir).resolve()] if options_given.config_dir else [])]
+    words = [*options_given.overrides, f"hydra.searchpath=[{','.join(map(str, folders[1:]))}]"]
     with initialize_config_dir(str(CONF), version_base=_VERSION):
         config = compose(name, words, return_hydra_config=True)
         choices = config.hydra.runtime.choices.items()
@@ -129,8 +129,8 @@ def _help(about: str, name: str, asked: Any) -> str:
     }
     width = max(map(len, chosen), default=0)
     lines = [
-        f"  {group:{width}}  {', '.join(f'[{one}]' if one == chosen[group] else one for one in known)}"
-        for group, known in options.items()
+        f"  {group:{width}}  {', '.join(f'[{name}]' if name == chosen[group] else name for name in choices)}"
+        for group, choices in options.items()
     ]
     texts = [_text(folders, part) for part in reversed(_parts(folders, name))]
     for group, option in chosen.items():
@@ -146,16 +146,16 @@ def _parts(folders: Sequence[Path], name: str) -> list[str]:
     stored = OmegaConf.load(next(path for folder in folders if (path := folder / f"{name}.yaml").is_file()))
     assert isinstance(stored, DictConfig)
     below = [part for part in stored.get("defaults", []) if isinstance(part, str) and part != "_self_"]
-    return [one for part in below if part != "command" for one in _parts(folders, part)] + [name]
+    return [ancestor for part in below if part != "command" for ancestor in _parts(folders, part)] + [name]
 
 
 def _text(folders: Sequence[Path], name: str) -> str:
     """Return the settings in a configuration's file, with its comments and without its defaults list."""
-    found = [path for folder in folders if (path := folder / f"{name}.yaml").is_file()]
-    lines = found[-1].read_text().splitlines() if found else []
-    kept, listed = [], False
+    files = [path for folder in folders if (path := folder / f"{name}.yaml").is_file()]
+    lines = files[-1].read_text().splitlines() if files else []
+    shown_lines, listed = [], False
     for line in lines:
         listed = line.startswith("defaults:") or (listed and line.startswith((" ", "-")))
         if not listed and not line.startswith(("_target_", "_convert_", "_partial_", "# @package")):
-            kept.append(line)
-    return "\n".join(kept).strip()
+            shown_lines.append(line)
+    return "\n".join(shown_lines).strip()

@@ -95,13 +95,13 @@ class Manifest:
                 "use the program that wrote it, or generate the data again"
             )
         check_settings(cls, stored, str(path), whole=True)
-        found = cls(**{name: value for name, value in stored.items() if name in cls.__annotations__})
-        if found.units != UNITS or sum(found.shards) != found.gestures:
+        manifest = cls(**{name: value for name, value in stored.items() if name in cls.__annotations__})
+        if manifest.units != UNITS or sum(manifest.shards) != manifest.gestures:
             raise InputError(
                 f"{path} is damaged: its units or counts are not those that were written: generate the data "
                 "again"
             )
-        return found
+        return manifest
 
     def write(self, folder: Path) -> None:
         """Write the manifest into a folder."""
@@ -149,8 +149,8 @@ class DataSet:
         for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
             with _mended():
                 about = read_description(self.path(number))
-            own = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
-            if own != (count, first, self.manifest.config_hash):
+            expected = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
+            if expected != (count, first, self.manifest.config_hash):
                 raise InputError(f"{self.path(number)} is not the shard that {MANIFEST} describes: {_AGAIN}")
 
     def path(self, number: int) -> Path:

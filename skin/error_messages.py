@@ -35,16 +35,16 @@ def to_input_error(error: Exception) -> InputError | None:
     """Return an error as an InputError with a message for the user; None for bugs, which need a traceback."""
     if isinstance(error, InputError):
         return error
-    for one in _chain(error):
-        if isinstance(one, sqlite3.OperationalError) or type(one) is sqlite3.DatabaseError:
+    for link in _chain(error):
+        if isinstance(link, sqlite3.OperationalError) or type(link) is sqlite3.DatabaseError:
             return InputError(
-                f"the database of runs failed: {one}: make room, or give another one, as in "
+                f"the database of runs failed: {link}: make room, or give another one, as in "
                 "tracking.uri=sqlite:////FOLDER/runs.db; what has finished is kept"
             )
-        if isinstance(one, OSError) and one.errno in _DISK:
-            where = one.filename2 or one.filename or "a file"
+        if isinstance(link, OSError) and link.errno in _DISK:
+            where = link.filename2 or link.filename or "a file"
             return InputError(
-                f"cannot use {where}: {os.strerror(one.errno)}: make room or give another folder, and run "
+                f"cannot use {where}: {os.strerror(link.errno)}: make room or give another folder, and run "
                 "the same command again; what has finished is kept"
             )
     if not isinstance(error, HydraException | OmegaConfBaseException | TypeError):
@@ -64,16 +64,16 @@ def to_input_error(error: Exception) -> InputError | None:
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
     """Yield an error and its causes: libraries wrap errors of the system."""
-    found: BaseException | None = error
-    while found is not None:
-        yield found
-        found = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
 
 
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line, without the details that OmegaConf adds."""
     text = str(error).split("Config search path:")[0]
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    kept = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
-    ends = [" " if line.endswith((".", ":", ",")) else "; " for line in kept[:-1]] + [""]
-    return "".join(line + end for line, end in zip(kept, ends, strict=True))
+    lines_left = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
+    ends = [" " if line.endswith((".", ":", ",")) else "; " for line in lines_left[:-1]] + [""]
+    return "".join(line + end for line, end in zip(lines_left, ends, strict=True))

@@ -59,9 +59,9 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
         for left in folder.glob("shards/.*"):  # of a process that was killed
             left.unlink()
         _write_missing(parts, manifest, folder)
-    found = DataSet(folder)
-    size = sum(found.path(number).stat().st_size for number in range(len(found.counts)))
-    return f"{manifest.gestures} gestures in {len(found.counts)} shards, {size / 1e6:.0f} MB"
+    data_set = DataSet(folder)
+    size = sum(data_set.path(number).stat().st_size for number in range(len(data_set.counts)))
+    return f"{manifest.gestures} gestures in {len(data_set.counts)} shards, {size / 1e6:.0f} MB"
 
 
 def _begin(device: AbstractDevice, parts: list[Part], source: dict[str, Any], folder: Path) -> None:
@@ -90,8 +90,10 @@ def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
         before, now = dict(_flat(manifest.config)), dict(_flat(source["config"]))
         changed = [name for name in before | now if before.get(name, ...) != now.get(name, ...)]
         changed.sort(key=lambda name: name.count("."))  # settings before what is derived from them
-        said = [f"{name}={before.get(name)}, not {now.get(name)}" for name in changed[:3]]
-        what = "; ".join(said) or "other contents of the files that its settings name, or another version"
+        differences = [f"{name}={before.get(name)}, not {now.get(name)}" for name in changed[:3]]
+        what = (
+            "; ".join(differences) or "other contents of the files that its settings name, or another version"
+        )
         raise InputError(f"{folder} was begun with {what}: repeat those settings, or add out= with a new one")
     if manifest.source_commit != commit:
         raise InputError(

@@ -65,8 +65,10 @@ class Material:
         """
         if self.relaxation is None:
             return self
-        rest = 1 / (1 + speed * self.relaxation.time)
-        return Material(self.name, self.young * (1 + self.relaxation.strength * (1 - rest)), self.poisson)
+        relaxed_share = 1 / (1 + speed * self.relaxation.time)
+        return Material(
+            self.name, self.young * (1 + self.relaxation.strength * (1 - relaxed_share)), self.poisson
+        )
 
     @classmethod
     def of(cls, given: "str | Mapping[str, Any] | Material") -> "Material":
@@ -107,9 +109,9 @@ _BY_KEY = {_key(material.name): material for material in MATERIALS}
 def _material(
     name: str, young: PositiveFloat | None = None, poisson: Ratio | None = None, relaxation: Any = None
 ) -> Material:
-    known = _BY_KEY.get(_key(name))
-    if known is not None:
-        name, young, poisson = known.name, young or known.young, known.poisson if poisson is None else poisson
+    entry = _BY_KEY.get(_key(name))
+    if entry is not None:
+        name, young, poisson = entry.name, young or entry.young, entry.poisson if poisson is None else poisson
     if young is None or poisson is None:
         raise InputError(_missing(name, young, poisson))
     if relaxation is not None:

@@ -60,13 +60,13 @@ class Touches:
         if self.valid.dtype != torch.bool:
             raise ValueError(f"valid must be bool, got {self.valid.dtype}")
         batch, time, sensors = self.readings.shape
-        each, moving = (batch, time, sensors), (batch, time, sensors, 3)
-        known = (sensors, len(GEOMETRY))
-        _expect(self.valid, "valid", each)
+        scalars, moving = (batch, time, sensors), (batch, time, sensors, 3)
+        geometry_shape = (sensors, len(GEOMETRY))
+        _expect(self.valid, "valid", scalars)
         _expect(self.positions, "positions", (sensors, 3), (batch, sensors, 3), moving)
-        _expect(self.geometry, "geometry", known, (batch, *known))
+        _expect(self.geometry, "geometry", geometry_shape, (batch, *geometry_shape))
         _expect(self.motion, "motion", moving)
-        _expect(self.saturated, "saturated", each)
+        _expect(self.saturated, "saturated", scalars)
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
             raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
@@ -180,8 +180,8 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
     first = parts[0]
 
     def together(tensors: Iterable[Tensor | None]) -> Tensor | None:
-        known = [tensor for tensor in tensors if tensor is not None]
-        return torch.cat(known) if known else None
+        present = [tensor for tensor in tensors if tensor is not None]
+        return torch.cat(present) if present else None
 
     touches = replace(
         first.touches,

@@ -209,7 +209,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
 
     def columns(name: str) -> Tensor:
-        return torch.stack([column(one) for one in numbered(name, sensors)], dim=-1)
+        return torch.stack([column(column_name) for column_name in numbered(name, sensors)], dim=-1)
 
     present = [table[name].is_valid().to_numpy() for name in numbered("reading", sensors)]
     touches = Touches(

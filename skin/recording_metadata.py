@@ -50,12 +50,12 @@ def check_metadata(about: Any, where: str) -> Task:
         InputError: a key is missing or has a wrong type; the message names it.
         ValueError: invalid labels.
     """
-    known = about
+    fields = about
     if isinstance(about, Mapping):
         if unknown := set(about) - set(_Description.__annotations__) - {"format", "saturated", "sha256"}:
             raise ValueError(f"its description has unknown entries: {', '.join(sorted(unknown))}")
-        known = {name: value for name, value in about.items() if name in _Description.__annotations__}
-    check_settings(_Description, known, f"{where}: description", whole=True)
+        fields = {name: value for name, value in about.items() if name in _Description.__annotations__}
+    check_settings(_Description, fields, f"{where}: description", whole=True)
     check_settings(Task, about["task"], f"{where}: task", whole=True)
     return Task(**about["task"] | {"names": tuple(about["task"]["names"])})
 

@@ -152,10 +152,10 @@ def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
     """Return the size of an array, bytes, which must match that of its entry."""
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
-        known = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in known:
+        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        if version not in readers:
             raise ValueError(f"{entry.filename} has the unknown version {version}")
-        shape, _, kind = known[version](file)
+        shape, _, kind = readers[version](file)
         size = math.prod(shape) * kind.itemsize
         if kind.hasobject or size != entry.file_size - file.tell():
             raise ValueError(f"{entry.filename} holds objects, or claims another size than it has")
@@ -169,14 +169,14 @@ def limited_memory(more: int) -> Iterator[None]:
     Who asks for more gets a MemoryError or the error of its library. There is no limit where the system does
     not know one for address space, as on macOS and Windows.
     """
-    known = Path("/proc/self/statm")
-    if not known.exists():
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
         yield
         return
     import resource  # not on Windows
 
     before = resource.getrlimit(resource.RLIMIT_AS)
-    limit = int(known.read_text().split()[0]) * resource.getpagesize() + more
+    limit = int(statm.read_text().split()[0]) * resource.getpagesize() + more
     if before[0] != resource.RLIM_INFINITY:
         limit = min(limit, before[0])
     resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))

@@ -32,9 +32,9 @@ def suggest(error: Exception, name: str, words: Sequence[str]) -> str | None:
     text = str(error).split("Config search path:")[0]
     ambiguous = _AMBIGUOUS.search(text)
     if isinstance(error, OverrideParseException) or ambiguous:
-        given = ambiguous[1] if ambiguous else str(getattr(error, "override", ""))
-        quoted = quote_value(given)
-        return None if quoted is None else f"{given} cannot be read: quote the value, as in {quoted}"
+        override = ambiguous[1] if ambiguous else str(getattr(error, "override", ""))
+        quoted = quote_value(override)
+        return None if quoted is None else f"{override} cannot be read: quote the value, as in {quoted}"
     if unknown := _UNKNOWN.search(text):
         near = get_close_matches(unknown[1], _names(name, words, unknown[1]), 1, 0.8)
         return f"there is no setting or group {unknown[1]}: did you mean {near[0]}?" if near else None
@@ -61,10 +61,10 @@ def quote_value(override: str) -> str | None:
 
 def _names(name: str, words: Sequence[str], unknown: str) -> list[str]:
     """Return the groups and settings of a configuration by their names on the command line."""
-    known = [word for word in words if "=" in word and not word.startswith(("-", unknown))]
+    settings = [word for word in words if "=" in word and not word.startswith(("-", unknown))]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         try:
-            config = compose(name, known)
+            config = compose(name, settings)
         except HydraException:
             config = compose(name)
     groups = [folder.name for folder in CONF.iterdir() if folder.is_dir()]

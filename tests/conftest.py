@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import json
+import logging
 import os
 import shutil
 import signal
@@ -8,6 +9,8 @@ import socket
 import subprocess
 import sys
 import threading
+import traceback
+import warnings
 
 # Where tests run in the background Ctrl-C may be ignored, and commands that they start would inherit that.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -17,9 +20,10 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from copy import deepcopy
 from functools import partial
+from io import StringIO
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
@@ -302,21 +306,67 @@ def begin(request, tmp_path_factory) -> Callable[..., Command]:
 
 
 @pytest.fixture(scope="session")
-def run(begin) -> Callable[..., subprocess.CompletedProcess]:
+def run(begin, stores_are_copied) -> Callable[..., subprocess.CompletedProcess]:
     """Return a function that runs a command, named as for ``begin``, in a folder with a store of its own.
 
-    ``store=False`` names no store. The command is started as by ``begin``; with ``fresh=True`` it shares
-    nothing, as where a person starts it.
+    ``store=False`` names no store. A verb of ``skin`` runs in this process; ``apart=True`` gives it a process
+    of its own as ``begin`` does, and ``fresh=True`` one that shares nothing, as where a person starts it.
     """
 
-    def run(folder, script, *arguments, store=True, fresh=False) -> subprocess.CompletedProcess:
-        own = [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
+    def run(folder, script, *arguments, store=True, apart=False, fresh=False) -> subprocess.CompletedProcess:
+        settings = (
+            [f"tracking.uri=sqlite:///{folder}/m.db", f"tracking.artifacts={folder}/a"] if store else []
+        )
+        words = [*map(str, arguments), *settings]
         if fresh:
-            command = [sys.executable, *named(script), *map(str, arguments), *own]
+            command = [sys.executable, *named(script), *words]
             return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE)
-        return begin(folder, script, *arguments, *own).completed()
+        if apart or Path(script).suffix:
+            return begin(folder, script, *words).completed()
+        return run_here(folder, [str(script), *words])
 
     return run
+
+
+def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
+    """Run ``skin`` with these words in this process; leave its state as it was."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.singleton import Singleton
+
+    from skin.cli import main
+
+    state, environment, here = Singleton.get_state(), dict(os.environ), Path.cwd()
+    threads, handlers = (
+        torch.get_num_threads(),
+        {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)},
+    )
+    root = logging.getLogger()
+    levels, loggers = root.level, list(root.handlers)
+    out, err, argv = StringIO(), StringIO(), sys.argv
+    GlobalHydra.instance().clear()
+    os.chdir(folder)
+    sys.argv = ["skin", *words]
+    code = 0
+    try:
+        with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
+            warnings.simplefilter("default")
+            main(words)
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc(file=err)
+        code = 1
+    finally:
+        Singleton.set_state(state)
+        os.environ.clear()
+        os.environ.update(environment)
+        os.chdir(here)
+        sys.argv = argv
+        torch.set_num_threads(threads)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        root.handlers[:], root.level = loggers, levels
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 class MadeUpDevice(AbstractDevice):

@@ -17,7 +17,7 @@ Copyright (c) 2026 The skin developers. MIT licence; see LICENSE.
 
 Data and weights. The layouts and shapes in data/, the results in docs/results/ and the weights in models/
 were made by this project and have its licence. data/report_table.csv quotes numbers of the report that the
-project follows. The Corpus of Social Touch (docs/cost.md) and weights of EfficientNet (model.weights) are not
+project follows. The Corpus of Social Touch (docs/data.md) and weights of EfficientNet (model.weights) are not
 part of the project: whoever uses them obtains them under their own terms.
 
 Dependencies. None is part of the repository or of the wheel; pip installs them. The licences are those that

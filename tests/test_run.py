@@ -55,7 +55,7 @@ def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
     assert choices == {"representation": "graph", "model": "gcn", "fusion": "linked", "learner": "network"}
     assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
     assert skin.run.train(config) is False
-    page = (ROOT / "docs" / "mlflow.md").read_text()
+    page = (ROOT / "docs" / "runs.md").read_text()
     for name in run.data.metrics:
         # train_accuracy_press is told of as train_accuracy
         parts = name.split("/") if f"`{name}`" not in page else [name]

@@ -81,7 +81,7 @@ def test_the_example_of_the_readme_runs():
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
     """Return the variables of the Python example of the page on ``any_skin`` after it has run."""
-    page = (ROOT / "docs" / "any-skin.md").read_text()
+    page = (ROOT / "docs" / "pretrained.md").read_text()
     (code,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     variables = {}
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Check settings against the annotated parameters of what they configure (docs/adr/0016).
+"""Check settings against the annotated parameters of what they configure (docs/adr/0007).
 
 Types are checked for every parameter that has one, ranges where it is ``Annotated``, as in
 ``rounds: Annotated[int, Ge(1)]`` or pydantic's ``PositiveInt``. Numbers must be finite.

@@ -48,7 +48,7 @@ for count in (3, 5):
 # Where on the skin
 # -----------------
 # The map shows the local precision for a touch on each cell of the last skin. ``skin design design=place``
-# chooses positions (:doc:`/placement`).
+# chooses positions (:doc:`/design`).
 
 sensors = skin.Grid(rows=5, columns=5, depth=0.0245).sensors(body)
 maps = {5.0: precision.maps(simulator, body)[0]}

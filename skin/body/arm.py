@@ -16,7 +16,7 @@ from skin.settings import checked
 @checked("body")
 @dataclass(frozen=True)
 class Arm(AbstractBody):
-    """Layers on a rigid cylinder, over a part of its circumference: a rolled-up sheet (docs/adr/0010).
+    """Layers on a rigid cylinder, over a part of its circumference: a rolled-up sheet (docs/adr/0005).
 
     The chart is the unrolled outer surface: x runs around the arm, y along it. Distances on the surface are
     those of the chart; below the surface an arc over the same x is shorter. In space y is the axis of the

@@ -68,7 +68,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
-        track: motion of the sensors in touches (docs/adr/0007): ``none``, ``oracle`` (from the simulator) or
+        track: motion of the sensors in touches (docs/adr/0006): ``none``, ``oracle`` (from the simulator) or
             ``estimated`` from readings; both need sensors that move along the sheet.
 
     Raises:

@@ -68,7 +68,7 @@ class _Tally:
 class TouchSampler:
     """Draws gestures with wanted labels and renders their movies.
 
-    Labels are computed from the movie (docs/adr/0009 for rigid objects that slide). Where they differ from
+    Labels are computed from the movie (docs/adr/0005 for rigid objects that slide). Where they differ from
     the wanted ones, the path is drawn again (start, direction, speed, peak), up to ``redraws`` times, and
     then the whole gesture.
 

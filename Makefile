@@ -60,8 +60,8 @@ check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY)  ## measure speed and memory; write results/bench.json
-	$(BIN)/skin bench
+bench: $(READY)  ## measure speed and memory; write results/bench.json (BENCH="only=wire against=../other")
+	$(BIN)/python -m experiments.benchmarks $(BENCH)
 
 physics: $(READY)  ## check the laws of mechanics against independent solutions
 	$(BIN)/skin validate

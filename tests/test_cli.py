@@ -12,7 +12,7 @@ from skin.cli import main, verbs
 from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
-OTHERS = ["bench", "results", "study", "table", "validate"]
+OTHERS = ["results", "study", "table", "validate"]
 SCRIPTS = ["evaluate", "generate", "live", "record", "train"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
@@ -45,7 +45,7 @@ def test_a_verb_of_the_repository_shows_its_settings(verb, capsys):
     main([verb, "--help"])
     text = capsys.readouterr().out
     assert f"skin {verb}" in text
-    assert f"{'benchmark' if verb == 'bench' else verb}:" in text
+    assert f"{verb}:" in text
     assert verbs()[verb] == f"experiments.commands.{verb}"
 
 

@@ -60,11 +60,11 @@ check: $(READY)  ## check lint, format and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY)  ## measure speed and memory; write results/bench.json
-	$(BIN)/skin bench
+bench: $(READY)  ## measure speed and memory; write results/bench.json (BENCH="only=wire against=../other")
+	$(BIN)/python -m experiments.benchmarks $(BENCH)
 
-physics: $(READY)  ## check the laws of mechanics against independent solutions
-	$(BIN)/skin validate
+physics: $(READY)  ## check the laws of mechanics against independent solutions (PHYSICS="quick=true laws=hertz,punch")
+	$(BIN)/python -m experiments.validation $(PHYSICS)
 
 $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraints.txt
 	$(PYTHON) -m venv $(PEERS)

@@ -116,8 +116,6 @@ class Config:
     study: dict[str, Any] | None = None
     smoke: bool | None = None
     table: dict[str, Any] | None = None
-    validate: dict[str, Any] | None = None
-    benchmark: dict[str, Any] | None = None
     results: dict[str, Any] | None = None
     design: dict[str, Any] | None = None
     adapt: dict[str, Any] | None = None

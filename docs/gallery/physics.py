@@ -3,17 +3,17 @@ Laws of mechanics
 =================
 
 Simulated displacements and forces against independent solutions (:doc:`/physics`). The meshes are those of
-``skin validate validate.quick=true``, coarser than the published ones.
+``make physics PHYSICS=quick=true``, coarser than the published ones.
 """
 
 from pathlib import Path
 from tempfile import mkdtemp
 
-from experiments.validation.laws import select_laws
-from experiments.validation.physics_page import draw
+from experiments.validation import select_laws
+from experiments.validation.finding import draw
 
 folder, paths = Path(mkdtemp()), []
-for law in select_laws(["boussinesq", "hertz", "locking"]):
+for law in select_laws("boussinesq,hertz,locking"):
     outcome = law.check(True)
     print(f"{law.name}: {law.statement} Worst error {max(one.error for one in outcome.findings):.1e}")
     for plot in outcome.plots:

@@ -1,1 +1,1 @@
-"""What ``make bench`` measures, one module per kind of figure."""
+"""What ``make bench`` measures: the speed of the simulation, of the training and of the live view."""

@@ -1,18 +1,22 @@
-"""Common parts of the benchmarks: configuration, timing, peak memory, versions."""
+"""Common parts of the benchmarks: configuration, timing, peak memory, versions; and the process of one.
 
+python -m experiments.benchmarks.harness training measure_generation '["naive", 3]'
+"""
+
+import json
 import os
 import platform
 import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 
 from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from skin.config import validate_config
@@ -21,8 +25,7 @@ from skin.paths import CONF
 
 def training_config(*overrides: str) -> DictConfig:
     """Return the configuration of a training with overrides."""
-    inside = GlobalHydra.instance().is_initialized()  # of a command
-    with nullcontext() if inside else initialize_config_dir(str(CONF), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         return validate_config(compose("train", list(overrides)))
 
 
@@ -70,3 +73,9 @@ def _processor() -> str:
     except OSError:
         return platform.processor()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+if __name__ == "__main__":
+    module, function, arguments = sys.argv[1:]
+    measure = getattr(import_module(f"experiments.benchmarks.{module}"), function)
+    print(json.dumps(measure(*json.loads(arguments))))

@@ -1,50 +1,83 @@
-"""Seconds per epoch of each row, compared with a plain implementation of the same network."""
+"""What a training waits for: gestures, the operator of a skin, epochs. Each runs in a process of its own."""
 
-import torch
+import os
+import tempfile
+import time
+from statistics import median
 
-from experiments.benchmarks.harness import median_seconds, training_config
-from experiments.benchmarks.reference_models import PLAIN, train_epoch
+import numpy as np
+from hydra.utils import instantiate
+
+from experiments.benchmarks.harness import median_seconds, peak_memory, training_config
 from skin.build import build_data, build_device, build_learner
 from skin.console import quiet
-from skin.datamodule import TouchData
+from skin.layout.random import Random
 from skin.learner.network import Network
+
+GESTURES = 4038
+_SKINS = 20  # of the 200 of any_skin: a batch mixes skins in the same way
+_SKIN_GESTURES = 8000  # a fifth of those of any_skin
+
+
+def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
+    """Return gestures per second (median), distinct frames per second and peak memory, bytes.
+
+    The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
+    readings, imperfections.
+    """
+    config = training_config(f"simulator={simulator}", f"data.gestures={GESTURES}")
+    device = build_device(config).simulated("gestures are generated")
+    durations = []
+    for seed in range(repeats + 1):
+        began = time.perf_counter()
+        device.replace(data_seed=seed).touches("train")
+        durations.append(time.perf_counter() - began)
+    speed = GESTURES / median(durations[1:])
+    movie = device.sampler.sample(1024, np.random.default_rng(0))
+    return {
+        "gestures_per_second": speed,
+        "frames_per_second": speed * len(movie.frames) / len(movie),
+        "peak_memory_bytes": peak_memory(),
+    }
+
+
+def measure_operator(simulator: str, repeats: int) -> dict[str, float]:
+    """Return the seconds (medians) to build an operator, and the peak memory, bytes.
+
+    ``build_seconds``: of the default skin, with nothing cached. ``layout_seconds``: of a layout that was not
+    seen before, on a body that was.
+    """
+    config = training_config(f"simulator={simulator}")
+    body, make = instantiate(config.body), instantiate(config.simulator)
+    sensors = instantiate(config.layout).sensors(body)
+    unseen = iter([Random(seed=seed).sensors(body) for seed in range(repeats + 1)])
+
+    def build() -> None:
+        with tempfile.TemporaryDirectory() as empty:
+            os.environ["SKIN_CACHE"] = empty
+            make(body, sensors)
+
+    build_seconds = median_seconds(build, repeats)
+    with tempfile.TemporaryDirectory() as warm:
+        os.environ["SKIN_CACHE"] = warm
+        make(body, sensors)
+        layout_seconds = median_seconds(lambda: make(body, next(unseen)), repeats)
+    return {
+        "build_seconds": build_seconds,
+        "layout_seconds": layout_seconds,
+        "peak_memory_bytes": peak_memory(),
+    }
 
 
 def measure_training(row: str, repeats: int) -> dict[str, float]:
-    """Return the median seconds per epoch on 4038 finite-element gestures, and the plain twin's times that.
-
-    Both train on the same touches with batches of 64; samples of the twin are made beforehand.
-    """
+    """Return the median seconds per epoch of a row, on 4038 finite-element gestures (any_skin: its own)."""
     quiet()
-    config = training_config("simulator=fem", f"experiment={row}", f"trainer.max_epochs={repeats + 1}")
-    data, learner = build_data(config, build_device(config)), build_learner(config)
-    assert isinstance(learner, Network)
-    learner.fit(data)
-    ours = learner.seconds_per_epoch
-    return {"seconds_per_epoch": ours, "ratio_to_plain": plain_seconds(row, data, repeats) / ours}
-
-
-def measure_drawn_skins(repeats: int) -> dict[str, float]:
-    """Return the median seconds per epoch of any_skin, for its number of gestures, from a fifth of them.
-
-    Twenty skins instead of 200: a batch mixes skins in the same way.
-    """
-    quiet()
-    settings = ("device.count=20", "data.gestures=8000", f"trainer.max_epochs={repeats + 1}")
-    config = training_config("simulator=solid", "experiment=any_skin", *settings)
+    settings, share = ["simulator=fem"], 1.0
+    if row == "any_skin":
+        settings = ["simulator=solid", f"device.count={_SKINS}", f"data.gestures={_SKIN_GESTURES}"]
+        share = training_config("experiment=any_skin").data.gestures / _SKIN_GESTURES
+    config = training_config(f"experiment={row}", *settings, f"trainer.max_epochs={repeats + 1}")
     learner = build_learner(config)
     assert isinstance(learner, Network)
     learner.fit(build_data(config, build_device(config)))
-    return {"seconds_per_epoch": 5 * learner.seconds_per_epoch}
-
-
-def plain_seconds(row: str, data: TouchData, repeats: int) -> float:
-    """Return the seconds per epoch of a row's plain twin, from a few batches: its slowest takes minutes."""
-    touches = data.touches("train")
-    assert touches.labels is not None
-    twin = PLAIN[row]()
-    samples, labels = twin.samples(touches, data.device.size), touches.labels
-    optimizer = torch.optim.Adam(twin.parameters(), 1e-3)
-    some = 8 * data.batch_size
-    taken = median_seconds(lambda: train_epoch(twin, optimizer, samples, labels[:some]), repeats)
-    return taken * len(labels) / some
+    return {"seconds_per_epoch": share * learner.seconds_per_epoch}

@@ -1,10 +1,18 @@
-"""The result of checking a law: our number, the reference and the tolerance."""
+"""The result of checking a law: our number, the reference and the tolerance; and the page of all results."""
 
+import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from itertools import cycle
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+
+from skin.files import whole, write
+from skin.plot.figures import MARKS
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,7 @@ class Law:
     """A law and how it is checked.
 
     Attributes:
-        name: short, lower case, as ``validate.laws`` takes it.
+        name: short, lower case, as ``laws=`` takes it.
         statement: what must hold.
         reference: source of the independent solution.
         check: takes whether to be quick (coarser meshes, fewer cases, the same tolerances) and returns the
@@ -95,3 +103,130 @@ def relative_finding(case: str, ours: float, reference: float, tolerance: float)
     """Return a finding whose error is relative to the reference."""
     error = abs(ours - reference) / abs(reference) if reference else abs(ours)
     return Finding(case, ours, reference, error, tolerance)
+
+
+Results = Sequence[tuple[Law, CheckResult]]
+
+_HEAD = """# Physics, verified
+
+Written by `make physics`. Each law is checked against an independent solution. The
+command exits with code 1 if a law does not hold. The page shows only digits that are the same on every
+processor; rounding errors are shown as an upper bound. `results/physics.json` holds all digits of one
+machine.
+
+| law | reference | numbers | worst error | tolerance | |
+|---|---|---|---|---|---|
+"""
+
+# Rounding errors in double and in single precision; the tolerance of a finding tells which applies.
+_DOUBLE, _SINGLE = 1e-10, 1e-6
+_LINES = ("-", "--", "-.", ":")  # curves differ without colour
+
+_LIMITS = """
+## Limits
+
+- **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
+  [limitations](limitations.md).
+- **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Material under a
+  wide object must move sideways. Elements that are as long as the skin is thick restrict this motion, most
+  of all beside the edge of the object: see `mesh` for the default mesh, a finer one and coarser ones.
+  Readings are more accurate, because the layers transmit the applied force. Beside an edge, however, an
+  error of 1 % of the reading under the object can be a large part of a small reading.
+- **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of a
+  half-space. Refining the mesh does not reduce this error.
+- **A sensor at the interface of two layers** interpolates linearly between the stresses above and below. The
+  stress along the layers is discontinuous there; a tilted sensor reads a mean of both sides.
+- **A footprint is defined on the unrolled surface.** Deep in an arm it covers a shorter arc than the sensor
+  (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full area.
+- **Contact is solved without friction.** The tangential traction of a sliding touch is added afterwards.
+"""
+
+
+def publish_physics(folder: Path, json_path: Path, results: Results) -> None:
+    """Write physics.md and its plots into a folder, and the findings as JSON, each file atomically."""
+    write(as_json(results), json_path)
+    for _, outcome in results:
+        for plot in outcome.plots:
+            draw(plot, folder / "results" / "physics" / f"{plot.name}.png")
+    write(page(results), folder / "physics.md")
+
+
+def as_json(results: Results) -> str:
+    """Return the findings as a list of {law, case, ours, reference, error, tolerance, ok}."""
+    lines = [
+        {"law": law.name} | asdict(finding) | {"ok": finding.ok}
+        for law, outcome in results
+        for finding in outcome.findings
+    ]
+    return json.dumps(_finite(lines), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return lines with null instead of values that are not finite, which JSON does not have."""
+    return [
+        {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in line.items()
+        }
+        for line in lines
+    ]
+
+
+def page(results: Results) -> str:
+    """Return the page: a table with one line per law, then one section per law."""
+    return _HEAD + "".join(map(_line, results)) + "".join(map(_section, results)) + _LIMITS
+
+
+def _line(result: tuple[Law, CheckResult]) -> str:
+    law, outcome = result
+    worst = max(
+        outcome.findings,
+        key=lambda one: math.inf if math.isnan(one.error) else max(one.error, _rounding(one)) / one.tolerance,
+    )
+    verdict = "holds" if all(one.ok for one in outcome.findings) else "**fails**"
+    return (
+        f"| [{law.name}](#{law.name}) | {law.reference} | {len(outcome.findings)} | {_error(worst)} | "
+        f"{worst.tolerance:.0e} | {verdict} |\n"
+    )
+
+
+def _section(result: tuple[Law, CheckResult]) -> str:
+    law, outcome = result
+    lines = [f"\n## {law.name}\n\n{law.statement}\n\n"]
+    lines.append("| | ours | reference | error | tolerance | |\n|---|---|---|---|---|---|\n")
+    for one in outcome.findings:
+        ours = f"{one.ours:.5g}" if one.reference else _error(one)
+        lines.append(
+            f"| {one.case} | {ours} | {one.reference:.5g} | {_error(one)} | {one.tolerance:.0e} | "
+            f"{'ok' if one.ok else '**missed**'} |\n"
+        )
+    lines += [f"\n- {remark}" for remark in outcome.remarks]
+    lines += [f"\n\n![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
+    return "".join(lines).rstrip("\n") + "\n"
+
+
+def _rounding(finding: Finding) -> float:
+    return _DOUBLE if finding.tolerance <= 1e-8 else _SINGLE
+
+
+def _error(finding: Finding) -> str:
+    bound = _rounding(finding)
+    return f"< {bound:.0e}" if finding.error < bound else f"{finding.error:.2g}"
+
+
+def draw(plot: Plot, path: Path) -> None:
+    """Write a plot as PNG."""
+    figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    for curve, mark, line in zip(plot.curves, cycle(MARKS), cycle(_LINES), strict=False):
+        if curve.marks:
+            axes.plot(curve.x, curve.y, mark, markersize=3.5, label=curve.label)
+        else:
+            axes.plot(curve.x, curve.y, line, linewidth=1.2, label=curve.label)
+    if plot.log:
+        axes.set(xscale="log", yscale="log")
+    axes.set(xlabel=plot.x, ylabel=plot.y, title=plot.title)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    with whole(path) as partial:
+        figure.savefig(partial, dpi=100)

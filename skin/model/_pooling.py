@@ -1,7 +1,7 @@
 """Poolings: modules that reduce the nodes of a graph to one vector.
 
 PyTorch Geometric's aggregations take 2.9 (max), 1.0 to 1.5 (mean), 1.1 to 1.2 (attention) and 1.0 to 1.3
-(set2set) times as long as these, and 0.7 s to import (`skin bench benchmark=layers`).
+(set2set) times as long as these, and 0.7 s to import.
 """
 
 from collections.abc import Callable

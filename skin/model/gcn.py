@@ -21,7 +21,7 @@ class _Convolution(nn.Module):
     """One graph convolution A x W + b (Kipf and Welling, 2017).
 
     One matrix, normalised once, serves all frames in one product. 1.5 to 3.0 times as fast as PyTorch
-    Geometric's DenseGCNConv, 4 to 80 times as its GCNConv (`skin bench benchmark=layers`).
+    Geometric's DenseGCNConv, 4 to 80 times as its GCNConv.
     """
 
     def __init__(self, features: int, width: int) -> None:

@@ -1,4 +1,4 @@
-"""The same sheet in PyNite: the referee of the plates-and-beams model, and the peer of the benchmark.
+"""The same sheet in PyNite: the referee of the plates-and-beams model.
 
 PyNite is a development dependency, imported on use.
 """

@@ -1,22 +1,19 @@
 """The benchmark measures what it says, in a form that others can read."""
 
 import json
-import subprocess
-import sys
 
 import pytest
-from omegaconf import OmegaConf
 
-from experiments.commands.bench import run_alone
-from skin.paths import CONF
-from skin.settings import check_settings, import_target
+from experiments.benchmarks.__main__ import benchmarks, main, run_alone
+from skin.errors import InputError
+from skin.paths import ROOT
 
 
 @pytest.mark.slow
 def test_generation_reports_rates_and_its_own_memory():
     # 400 MB in this process must not count in the one that is measured.
     ballast = bytearray(400_000_000)
-    figures = run_alone("generation", "measure_generation", "naive", 1)
+    figures = run_alone("training", "measure_generation", ["naive", 1])
     assert set(figures) == {"gestures_per_second", "frames_per_second", "peak_memory_bytes"}
     # a gesture shows between one frame (static) and twenty (the longest slide)
     assert 1 < figures["frames_per_second"] / figures["gestures_per_second"] < 20
@@ -25,75 +22,68 @@ def test_generation_reports_rates_and_its_own_memory():
 
 
 @pytest.mark.slow
-def test_a_data_set_is_measured_beside_drawing_alone():
-    figures = run_alone("data_sets", "measure_data_set", 64, 1)
-    assert set(figures) == {
-        "gestures_per_second",
-        "ratio_to_generation",
-        "bytes_per_gesture",
-        "peak_memory_bytes",
-    }
-    # readings alone are 3000 bytes, which noise keeps from shrinking much; few gestures have a large footer
-    assert 2000 < figures["bytes_per_gesture"] < 10000
-    assert 2e8 < figures["peak_memory_bytes"] < 1e9
-    assert 0 < figures["ratio_to_generation"] < 10
+def test_building_starts_cold_each_time(tmp_path, monkeypatch):
+    monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
+    figures = run_alone("training", "measure_operator", ["fem", 1])
+    # a warm operator is there in a hundredth of that
+    assert figures["build_seconds"] > 0.02
+    assert figures["layout_seconds"] > 0
+    assert 1e8 < figures["peak_memory_bytes"] < 1.5e9
+    assert not list(tmp_path.iterdir())
 
 
-def test_bad_arguments_exit_with_2(run, tmp_path):
-    done = run(tmp_path, "bench", "benchmark.repeats=1", store=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("benchmark.repeats=1 must be greater")
+@pytest.mark.slow
+@pytest.mark.parametrize("function", ["measure_latency", "measure_onnx_latency"])
+def test_a_verdict_is_timed_by_the_wall_and_by_the_core(function):
+    figures = run_alone("live", function, ["best_fresh", 30])
+    assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share", "memory_mb"}
+    assert 0 < figures["p50_ms"] <= figures["p99_ms"]
 
 
-@pytest.mark.parametrize("path", sorted((CONF / "benchmark").glob("*.yaml")), ids=lambda path: path.stem)
-def test_a_benchmark_takes_its_settings(path):
-    part = OmegaConf.to_container(OmegaConf.load(path))
-    check_settings(import_target(part["_target_"], "benchmark"), part, "benchmark", whole=True)
+@pytest.mark.slow
+def test_another_checkout_is_measured_in_the_same_run(tmp_path, capsys):
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("skin", "conf", "data"):
+        (other / name).symlink_to(ROOT / name)
+    main(["only=wire", f"against={other}", f"out={tmp_path}"])
+    figures = json.loads((tmp_path / "bench.json").read_text())
+    assert json.loads(capsys.readouterr().out) == figures
+    here, there = figures["wire"]["here"], figures["wire"]["there"]
+    assert (
+        figures["wire"]["ratios"]["decode_core_share"]
+        == here["decode_core_share"] / there["decode_core_share"]
+    )
+
+
+@pytest.mark.slow
+def test_the_epochs_of_a_row_are_timed():
+    assert run_alone("training", "measure_training", ["temporal_graph", 1])["seconds_per_epoch"] > 0
+
+
+def test_every_benchmark_is_a_function():
+    import experiments.benchmarks.live as live
+    import experiments.benchmarks.training as training
+
+    for module, function, _ in benchmarks(3).values():
+        assert callable(getattr({"live": live, "training": training}[module], function))
+
+
+@pytest.mark.parametrize(
+    ("word", "reason"),
+    [
+        ("repeats=1", "must be a number of at least 3"),
+        ("repeat=3", "give some of repeats=, out="),
+        ("only=page", "is none of generation.naive"),
+        ("against=nowhere", "has no folder skin"),
+    ],
+)
+def test_a_bad_setting_is_refused(word, reason):
+    with pytest.raises(InputError, match=reason):
+        main([word])
 
 
 def test_the_table_refuses_bad_arguments(run, tmp_path):
     done = run(tmp_path, "table", "table.seeds=0", store=False)
     assert done.returncode == 2
     assert "table.seeds=0 must be greater" in done.stderr
-
-
-@pytest.mark.slow
-def test_building_starts_cold_each_time(tmp_path, monkeypatch):
-    monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    figures = run_alone("building", "measure_building", "fem", 1)
-    # a warm operator is there in a hundredth of that
-    assert figures["build_seconds"] > 0.02
-    assert 1e8 < figures["peak_memory_bytes"] < 1.5e9
-    assert not list(tmp_path.iterdir())
-
-
-def test_what_is_not_installed_is_left_out():
-    script = (
-        "import sys; sys.modules['Pynite'] = None\n"
-        "from experiments.benchmarks import harness, mechanics\n"
-        "print(mechanics.pynite_seconds_per_frame(3), *harness.versions(['numpy', 'no-such-package']))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
-    assert done.stdout.split() == ["None", "numpy"], done.stderr
-
-
-@pytest.mark.slow
-def test_a_verdict_is_timed_by_the_wall_and_by_the_core(run, tmp_path):
-    done = run(tmp_path, "bench", "benchmark=live_latency", "benchmark.frames=30", store=False)
-    figures = json.loads((tmp_path / "results" / "bench_live_latency.json").read_text())
-    assert json.loads(done.stdout) == figures
-    assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share", "memory_mb"}
-    assert 0 < figures["p50_ms"] <= figures["p99_ms"]
-
-
-@pytest.mark.slow
-def test_the_decoder_is_fuzzed(run, tmp_path):
-    few = ["benchmark.count=300", "benchmark.format=binary", "benchmark.sensors=3", "benchmark.seed=1"]
-    done = run(tmp_path, "bench", "benchmark=fuzz", *few, store=False)
-    assert done.returncode == 0, done.stderr
-    figures = json.loads(done.stdout)
-    assert figures["format"] == "binary"
-    assert figures["good"] == figures["recovered"] > 100
-    done = run(tmp_path, "bench", "benchmark=fuzz", "benchmark.format=crc32", store=False)
-    assert done.returncode == 2
-    assert "benchmark.format=crc32 must be 'crc16'" in done.stderr

@@ -7,13 +7,8 @@ import sys
 import pytest
 
 from skin.cli import verbs
-from skin.paths import ROOT
 
 HEAVY = re.compile(r"\| +(torch|mlflow|pytorch_lightning|numpy|scipy)$", re.MULTILINE)
-KEPT = {"train", "evaluate", "generate", "record", "live", "reproduce_table"}
-SCRIPTS = {
-    path.stem: path for path in (ROOT / "experiments").glob("*.py") if path.stem not in ("__init__", "notice")
-}
 
 
 @pytest.mark.parametrize("verb", verbs())
@@ -26,13 +21,3 @@ def test_a_mistake_waits_for_no_heavy_import(verb, tmp_path):
     assert "typo" in said
     assert "Traceback" not in said
     assert not HEAVY.findall(done.stderr)
-
-
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_a_script_is_short_for_a_verb_or_says_what_replaces_it(name, tmp_path):
-    command = [sys.executable, str(SCRIPTS[name]), "typo=1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
-    replaced = f"experiments/{name}.py is now: skin " in done.stderr
-    assert replaced == (name not in KEPT), done.stderr
-    assert done.returncode in (1, 2)
-    assert "typo" in done.stderr or replaced

@@ -81,6 +81,24 @@ def test_instance_norm_is_that_of_pytorch_geometric():
     torch.testing.assert_close(ours(nodes), wanted)
 
 
+@pytest.mark.parametrize("name", POOLINGS)
+def test_a_pooling_is_that_of_pytorch_geometric(name):
+    with quiet():
+        from torch_geometric.nn import aggr
+    ours = POOLINGS[name](5)
+    if name == "set2set":
+        theirs = aggr.Set2Set(5, processing_steps=3)
+        weights = {f"{key}_l0": value for key, value in ours.lstm.state_dict().items()}
+        theirs.lstm.load_state_dict(weights)
+    elif name == "attention":
+        theirs = aggr.AttentionalAggregation(ours.gate)
+    else:
+        theirs = {"max": aggr.MaxAggregation, "mean": aggr.MeanAggregation}[name]()
+    nodes = torch.randn(8, 4, 5)
+    assert ours(nodes).shape == (4, ours.width)
+    torch.testing.assert_close(theirs(*plain(nodes), dim_size=4), ours(nodes))
+
+
 def test_a_graph_of_one_sensor_can_be_normed():
     model = gcn(norm="instance").train()
     assert torch.isfinite(model(torch.randn(4, 1, 2), torch.ones(1, 1))).all()

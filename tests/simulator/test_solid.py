@@ -1,4 +1,4 @@
-"""The solid obeys the laws of elasticity that a few elements can show; make physics shows the rest."""
+"""The solid obeys the laws of elasticity that a few elements can show; tests/validation shows the rest."""
 
 import numpy as np
 import pytest
@@ -42,23 +42,12 @@ def identity(points):
     return np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3))
 
 
-def test_patch():
-    """A uniform strain is exact on distorted elements: no force inside, the same stress everywhere."""
+def test_a_place_between_nodes_moves_as_trilinear_elements_do():
     lines = tuple(np.sort(np.random.default_rng(seed).random(5)) for seed in range(3))
     mesh = Hexahedra(lines, np.full((4, 4, 4), 2e5), np.full(4, 0.49), bent, identity)
     strain = np.array([[1.0, 0.3, -0.2], [0.3, -0.4, 0.5], [-0.2, 0.5, 0.7]]) * 1e-3
-    moved = (mesh.nodes @ strain).ravel()
-    inner = np.zeros((5, 5, 5), dtype=bool)
-    inner[1:-1, 1:-1, 1:-1] = True
-    forces = (mesh.stiffness() @ moved).reshape(-1, 3)
-    assert np.abs(forces[inner.ravel()]).max() < 1e-12 * np.abs(forces).max()
-    lam, mu = mesh.lame[0][0], mesh.lame[1][0]
-    stress = lam * np.trace(strain) * np.eye(3) + 2 * mu * strain
     points = np.random.default_rng(3).uniform(np.array(lines)[:, 0], np.array(lines)[:, -1], (20, 3))
-    for n, m in np.random.default_rng(4).normal(size=(5, 2, 3)):
-        rows = mesh.stress(points, np.tile(n, (20, 1)), np.tile(m, (20, 1)))
-        assert rows @ moved == pytest.approx(n @ stress @ m, rel=1e-9)
-    down = mesh.motion(points, np.tile([0, 0, 1.0], (20, 1))) @ moved
+    down = mesh.motion(points, np.tile([0, 0, 1.0], (20, 1))) @ (mesh.nodes @ strain).ravel()
     assert down == pytest.approx(_interpolated(mesh, points, strain), rel=1e-12)
 
 
@@ -66,12 +55,6 @@ def _interpolated(mesh, points, strain):
     """Return the third component of a uniform strain's motion where trilinear elements put chart points."""
     values = bent(np.stack(np.meshgrid(*mesh.lines, indexing="ij"), axis=-1)) @ strain
     return RegularGridInterpolator(mesh.lines, values)(points)[:, 2]
-
-
-def test_even_pressure_reaches_the_middle():
-    wide = Sheet([0.24, 0.24], [24, 24], LAYERS)
-    felt = solid(sensors((0.12, 0.12, 0.005), (0.12, 0.12, 0.012)), wide)(torch.full(wide.shape, 1e3))
-    assert felt.readings.numpy() == pytest.approx(0.1, rel=2e-3)
 
 
 def test_the_table_pushes_back():

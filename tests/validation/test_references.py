@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from experiments.validation.halfspace import SQUARE_PUNCH, HalfSpace, Hertz, square_punch
-from experiments.validation.layered import Slab, bonded_layer, patch, patch_mean, waves
+from experiments.validation.references import (
+    SQUARE_PUNCH,
+    HalfSpace,
+    Hertz,
+    Slab,
+    bonded_layer,
+    patch,
+    patch_mean,
+    square_punch,
+    waves,
+)
 
 SOFT, HARD = Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49)
 

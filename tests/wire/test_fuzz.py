@@ -1,6 +1,6 @@
 """Whatever the wire says: no exception, and every good frame after the next delimiter is recovered."""
 
-from importlib import import_module
+import os
 from itertools import pairwise
 
 import numpy as np
@@ -8,14 +8,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skin.paths import ROOT
 from skin.wire.binary import encode_frame
 from skin.wire.decoder import Decoder
 from skin.wire.text import encode_line, parse_line
+from tests.wire import bad_stream, independent_frames
 
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
+CHUNKS = int(os.environ.get("FUZZ_CHUNKS", 5000))  # 0.2 s; a million takes 40
 ENCODERS = {"text": (encode_line, b"\n"), "binary": (encode_frame, b"\0")}
 
 
@@ -93,46 +94,37 @@ def test_how_many_wrong_values_pass_each_checksum(check, most):
     assert wrong > 0 or check == "crc16"  # the test can see them
 
 
-@pytest.fixture(scope="module")
-def benchmarks():
-    """Return the benchmark and the frames that it writes, which are no part of the package."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "experiments")
-        return import_module("experiments.benchmarks.fuzz"), import_module(
-            "experiments.benchmarks.protocol_frames"
-        )
-
-
-def test_another_hand_writes_the_same_frames(benchmarks):
-    _, frames = benchmarks
+def test_another_hand_writes_the_same_frames():
     values = [0.0, 512.0, 1023.0, 7.0]
     for check in ("crc16", "xor", "none"):
         fields = [b"12", b"34000", *(b"%d" % value for value in values)]
-        written = frames.text_line(fields, b",", check) + b"\n"
+        written = independent_frames.text_line(fields, b",", check) + b"\n"
         assert written == encode_line([int(value) for value in values], 12, 34000, check)
     for kind, name in ((1, "u16"), (2, "i16"), (3, "f32")):
-        assert frames.binary_frame(12, 34000, values * 40, kind) == encode_frame(values * 40, 12, 34000, name)
+        assert independent_frames.binary_frame(12, 34000, values * 40, kind) == encode_frame(
+            values * 40, 12, 34000, name
+        )
 
 
 @pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
-def test_every_good_frame_of_a_long_bad_stream_is_recovered(benchmarks, spoken):
-    found = benchmarks[0].fuzz(5000, spoken, 25, 7)
+def test_every_good_frame_of_a_long_bad_stream_is_recovered(spoken):
+    found = bad_stream.fuzz(CHUNKS, spoken, 25, 7)
     assert found["missed"] == 0
-    assert found["good"] == found["recovered"] > 3000
+    assert found["good"] == found["recovered"] > 0.6 * CHUNKS
     assert found["pieces"] > 1.5 * found["good"]
     if spoken in ("crc16", "binary"):
-        assert found["wrong"] == 0
+        assert found["wrong"] <= CHUNKS // 100_000  # 16 bits fit by chance once in 65,536
 
 
 @pytest.mark.parametrize("spoken", ["crc16", "xor", "none", "binary"])
 @given(seed=st.integers(0, 2**32), sensors=st.integers(1, 70))
 @settings(quickly, max_examples=15)
-def test_every_good_frame_of_any_bad_stream_is_recovered(benchmarks, spoken, seed, sensors):
-    assert benchmarks[0].fuzz(60, spoken, sensors, seed)["missed"] == 0
+def test_every_good_frame_of_any_bad_stream_is_recovered(spoken, seed, sensors):
+    assert bad_stream.fuzz(60, spoken, sensors, seed)["missed"] == 0
 
 
 @pytest.mark.parametrize("fault", ["drops", "alters"])
-def test_the_oracle_sees_a_decoder_that_fails(benchmarks, fault, monkeypatch):
+def test_the_oracle_sees_a_decoder_that_fails(fault, monkeypatch):
     class Failing:
         def __init__(self, *given):
             self._decoder, self._count = Decoder(*given), 0
@@ -145,7 +137,7 @@ def test_the_oracle_sees_a_decoder_that_fails(benchmarks, fault, monkeypatch):
                 elif fault == "alters":
                     yield frame._replace(values=frame.values + 1)
 
-    monkeypatch.setattr(benchmarks[0], "Decoder", Failing)
-    found = benchmarks[0].fuzz(1000, "crc16", 5, 0)
+    monkeypatch.setattr(bad_stream, "Decoder", Failing)
+    found = bad_stream.fuzz(1000, "crc16", 5, 0)
     assert found["missed"] > 20
     assert (found["wrong"] > 20) == (fault == "alters")

@@ -1,7 +1,4 @@
-"""What reading a skin costs, and what survives a faulty wire: a pseudo-terminal, 1 % of its lines spoilt.
-
-skin bench benchmark=wire benchmark.seconds=600
-"""
+"""What survives a faulty wire: a pseudo-terminal, 1 % of its lines spoilt."""
 
 import json
 import os
@@ -13,10 +10,9 @@ from functools import partial
 
 import numpy as np
 import psutil
-from pydantic import PositiveFloat
 
+from skin.paths import ROOT
 from skin.signal.frame import Check, Frame
-from skin.wire.decoder import Decoder
 from skin.wire.errors import SkinTimeout
 from skin.wire.open import open_skin
 from skin.wire.skin import Skin, Stats
@@ -30,17 +26,7 @@ _LATE = 0.05  # s: a piece that comes later than that was held up by the machine
 _BURST = 16  # bytes
 
 
-def decode_core_share(rate: float = 1000.0, frames: int = 20_000) -> float:
-    """Return the share of one core that decoding 25 channels at ``rate`` Hz takes, pieces of 512 bytes."""
-    data = b"".join(_line(number, 1 / rate, "crc16") for number in range(frames))
-    decoder, came, began = Decoder(SENSORS), 0, time.process_time()
-    for start in range(0, len(data), 512):
-        came += len(decoder.feed(data[start : start + 512], start / len(data) * frames / rate))
-    assert came == frames
-    return (time.process_time() - began) / frames * rate
-
-
-def soak(seconds: PositiveFloat, check: Check = "crc16", rate: PositiveFloat = 500.0) -> dict[str, float]:
+def soak(seconds: float, check: Check = "crc16", rate: float = 500.0) -> dict[str, float]:
     """Read from a pseudo-terminal that another process fills, one line of a hundred spoilt.
 
     A spoilt line has two bits flipped, has lost two bytes, has lost its end and glues to the next, has a run
@@ -57,9 +43,11 @@ def soak(seconds: PositiveFloat, check: Check = "crc16", rate: PositiveFloat = 5
     master, slave = os.openpty()
     tty.setraw(slave)
     tally = _Tally(round(seconds * rate), after=min(_MINUTE, seconds / 10))
-    code = f"from experiments.benchmarks.wire import _send; _send({master}, {seconds}, {check!r}, {rate})"
+    code = f"from tests.wire.faulty_wire import _send; _send({master}, {seconds}, {check!r}, {rate})"
     command = [sys.executable, "-c", code]
-    sender = subprocess.Popen(command, pass_fds=[master], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    sender = subprocess.Popen(
+        command, pass_fds=[master], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+    )
     assert sender.stdin is not None
     assert sender.stdout is not None
     try:

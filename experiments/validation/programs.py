@@ -1,4 +1,7 @@
-"""Checks against another program, another number of threads, or the report."""
+"""Laws that another program, the report, or another number of threads decides.
+
+``python -m experiments.validation.programs 2 16 out.npz`` computes with two threads.
+"""
 
 import os
 import subprocess
@@ -13,10 +16,12 @@ import scipy.sparse as sp
 import torch
 from scipy.sparse.linalg import spsolve
 
+from experiments.validation.blocks import solve_frame
 from experiments.validation.finding import CheckResult, Finding, relative_finding
-from experiments.validation.mixed_form import solve_frame
-from experiments.validation.patch_and_equilibrium import skin
+from experiments.validation.solid import skin
 from skin.body.sheet import Sheet
+from skin.contact._checkerboard import stabilise_checkerboard
+from skin.contact._unilateral import solve_contact
 from skin.errors import InputError
 from skin.sensors import Sensors
 from skin.simulator import _pynite
@@ -143,7 +148,7 @@ def threads(quick: bool) -> CheckResult:
         for count in ("1", "2"):
             path = Path(folder) / f"{count}.npz"
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-            command = [sys.executable, "-m", "experiments.validation.fixed_threads", count, cells, str(path)]
+            command = [sys.executable, "-m", "experiments.validation.programs", count, cells, str(path)]
             environment = os.environ | dict.fromkeys(names, count)
             subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[2])
             with np.load(path) as file:
@@ -166,3 +171,28 @@ def _pynite_displacements(structure: Structure, pressure: np.ndarray) -> np.ndar
         ) from missing
     _pynite.solve(model)
     return _pynite.displacements(model, structure)
+
+
+def write_results(threads: int, cells: int, path: str) -> None:
+    """Write an operator, readings of random frames and the pressure under a sphere to an .npz file."""
+    torch.set_num_threads(threads)
+    body = skin(cells)
+    places = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))
+    sensors = Sensors(np.column_stack([places, np.full(25, 0.005)]), (0.01, 0.01))
+    mesh = hexahedra(body, 2, {})
+    operator = Elastic(mesh).transfer(reading_rows(mesh, sensors))
+    frames = torch.rand(20000, *body.shape, generator=torch.Generator().manual_seed(0))
+    with tempfile.TemporaryDirectory() as cache:
+        solid = Solid(body, sensors, divisions=2, cache=cache)
+        felt = solid(1e4 * frames).readings
+        compliance = stabilise_checkerboard(solid.compliance().double(), body)
+    away = (np.indices(body.shape) + 0.5 - cells / 2) * body.cell[0]
+    gap = torch.from_numpy((away**2).sum(axis=0).reshape(1, -1) / (2 * 1.0))
+    pressed = solve_contact(
+        compliance, gap, torch.tensor([200 / body.cell[0] ** 2]), tolerance=1e-8, iterations=1000
+    )
+    np.savez(path, operator=operator, readings=felt.numpy(), contact=pressed.pressure.numpy())
+
+
+if __name__ == "__main__":
+    write_results(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3])

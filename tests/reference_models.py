@@ -1,4 +1,4 @@
-"""The four fast rows written the usual way with PyTorch Geometric, as reference for benchmarks and a test.
+"""The four fast rows written the usual way with PyTorch Geometric, as a reference.
 
 Same networks, same numbers; but a PyTorch Geometric ``Data`` object per graph, and a dense image of three
 equal channels per frame, convolved frame by frame. Weights are interchangeable with
@@ -188,19 +188,3 @@ def take_weights(plain: Plain, classifier: nn.Module) -> None:
         if target.shape != source.shape:
             raise ValueError(f"{name} is {tuple(target.shape)} here and {tuple(source.shape)} there")
         target.copy_(source)
-
-
-def train_epoch(
-    plain: Plain, optimizer: torch.optim.Optimizer, samples: Sequence, labels: Tensor, batch_size: int = 64
-) -> float:
-    """Train one epoch on ``plain.samples`` and labels (N, 4) and return the mean loss of its batches."""
-    plain.train()
-    losses = []
-    for index in torch.randperm(len(labels)).split(batch_size):
-        inputs = plain.collate([samples[i] for i in index.tolist()])
-        loss = F.binary_cross_entropy_with_logits(plain(inputs), labels[index])
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    return sum(losses) / len(losses)

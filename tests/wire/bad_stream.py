@@ -1,22 +1,16 @@
-"""Fuzz the decoder: it raises no exception and recovers every valid frame after the next delimiter.
-
-skin bench benchmark=fuzz benchmark.count=1000000 benchmark.format=crc16
+"""A stream of valid, damaged and invalid frames and noise, and what a decoder recovers of it.
 
 Frames are encoded independently of the package. The check uses only which frames were sent intact.
 """
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from random import Random
-from typing import Any
 
-from pydantic import PositiveInt
-from rich.console import Console
-from rich.progress import Progress
-
-from experiments.benchmarks.protocol_frames import (
+from skin.signal.frame import Frame
+from skin.wire.decoder import Decoder
+from tests.wire.independent_frames import (
     FORMATS,
     WireFormat,
     binary_frame,
@@ -24,8 +18,6 @@ from experiments.benchmarks.protocol_frames import (
     invalid_frame,
     text_line,
 )
-from skin.signal.frame import Frame
-from skin.wire.decoder import Decoder
 
 _HEAD = 10  # good frames at the beginning, so that the format shows
 _LENGTHS = (0, 1, 3, 20, 130, 500, 3000)  # bytes, at most, of a chunk; drawn alike
@@ -36,9 +28,7 @@ _AHEAD = 50  # frames that are looked for after one that did not come
 _LONG = 70_000  # bytes: longer than any line may be
 
 
-def fuzz(
-    count: int, spoken: WireFormat, sensors: int, seed: int, on_event: Callable[[int], object] = id
-) -> dict[str, int]:
+def fuzz(count: int, spoken: WireFormat, sensors: int, seed: int) -> dict[str, int]:
     """Feed a decoder with ``count`` chunks of a stream of valid, damaged and invalid frames, and noise.
 
     Args:
@@ -46,7 +36,6 @@ def fuzz(
         spoken: the checksum of the lines, or ``binary``.
         sensors: S.
         seed: of the random generator.
-        on_event: called with the number of chunks from time to time.
 
     Returns:
         ``chunks`` and ``bytes``; ``pieces``: frames and fragments in them; ``good``: those sent intact behind
@@ -65,8 +54,6 @@ def fuzz(
         chunk = stream.chunk(rng.randint(0, rng.choice(_LENGTHS)))
         for frame in decoder.feed(chunk, number * 1e-3):
             oracle.take(frame)
-        if number % 1000 == 0:
-            on_event(number)
     for frame in decoder.feed(stream.rest(), count * 1e-3):
         oracle.take(frame)
     missed = oracle.missed + len(stream.expected)
@@ -213,11 +200,3 @@ class _Oracle:
                 expected.popleft()
             self.missed += place
             self.recovered += 1
-
-
-def fuzz_decoder(count: PositiveInt, format: WireFormat, sensors: PositiveInt, seed: int) -> dict[str, Any]:
-    """Fuzz the decoder with a progress bar, as :func:`fuzz` does."""
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task(f"{format}, {sensors} sensors", total=count)
-        found = fuzz(count, format, sensors, seed, lambda done: progress.update(bar, completed=done))
-    return {"format": format, "sensors": sensors, "seed": seed} | found

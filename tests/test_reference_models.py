@@ -1,8 +1,7 @@
 """The fast rows and their plain twins are the same networks, to 1e-5 in outputs and gradients."""
 
-import importlib.util
 import warnings
-from pathlib import Path
+from importlib import import_module
 
 import pytest
 import torch
@@ -12,22 +11,16 @@ from torch.nn import functional as F
 from skin.datamodule import TouchData
 from skin.device.base import AbstractDevice
 from skin.layout.file import File
+from skin.paths import ROOT
 from skin.recording import Touches
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
 def plain():
-    specification = importlib.util.spec_from_file_location(
-        "plain", ROOT / "experiments/benchmarks/reference_models.py"
-    )
-    module = importlib.util.module_from_spec(specification)
     with warnings.catch_warnings():
         # PyTorch Geometric compiles with torch.jit.script while it is imported
         warnings.filterwarnings("ignore", "`torch.jit.script", DeprecationWarning)
-        specification.loader.exec_module(module)
-    return module
+        return import_module("tests.reference_models")
 
 
 class Device(AbstractDevice):
@@ -70,14 +63,3 @@ def test_the_plain_twin_computes_the_same(row, plain, configured, made_up_device
     theirs = [parameter.grad for parameter in twin.parameters()]
     for ours_, theirs_ in zip((p.grad for p in ours.parameters()), theirs, strict=True):
         assert (ours_ - theirs_).abs().max() <= 1e-5 * max(1, float(theirs_.abs().max()))
-
-
-@pytest.mark.parametrize("row", ["temporal_graph", "temporal_image"])
-def test_the_plain_twin_learns(row, plain, configured, made_up_device):
-    device = Device(made_up_device.task, instantiate(configured().body))
-    torch.manual_seed(0)
-    twin = plain.PLAIN[row]()
-    optimizer = torch.optim.Adam(twin.parameters(), 1e-3)
-    samples = twin.samples(device.fixed, device.size)
-    losses = [plain.train_epoch(twin, optimizer, samples, device.fixed.labels, 3) for _ in range(8)]
-    assert losses[-1] < losses[0]

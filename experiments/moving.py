@@ -1,6 +1,0 @@
-"""Replaced by `skin study`; the next release removes this file."""
-
-import sys
-
-if __name__ == "__main__":
-    sys.exit("experiments/moving.py is now: skin study study=misplaced, study=motion or study=tracking")

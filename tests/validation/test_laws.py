@@ -1,0 +1,70 @@
+"""Every law of mechanics holds, in its quick version; and the command says which do."""
+
+import json
+
+import pytest
+
+from experiments.validation import LAWS
+from experiments.validation.__main__ import main
+from skin.errors import InputError
+from skin.paths import ROOT
+from skin.simulator._hexahedra import Hexahedra
+
+SLOW = {
+    "boussinesq",
+    "cerruti",
+    "hertz",
+    "punch",
+    "threads",
+}  # seconds, of blocks that are solved or of imports
+
+
+@pytest.mark.parametrize(
+    "law",
+    [pytest.param(law, marks=pytest.mark.slow if law.name in SLOW else (), id=law.name) for law in LAWS],
+)
+def test_a_law_holds(law):
+    outcome = law.check(True)
+    assert outcome.findings
+    for finding in outcome.findings:
+        assert finding.ok, f"{finding.case}: {finding.ours}, must be {finding.reference}"
+        assert finding.error <= finding.tolerance
+
+
+def test_chosen_laws_are_written_where_they_should_be(tmp_path, capsys):
+    assert main(["quick=true", "laws=locking,naive", f"out={tmp_path}"])
+    lines = json.loads((tmp_path / "physics.json").read_text())
+    assert {line["law"] for line in lines} == {"locking", "naive"}
+    assert all(line["ok"] and line["error"] <= line["tolerance"] for line in lines)
+    text = (tmp_path / "physics.md").read_text()
+    assert "## locking\n" in text
+    for picture in (tmp_path / "results" / "physics").iterdir():
+        assert f"results/physics/{picture.name}" in text
+    assert "naive: holds, 1 numbers" in capsys.readouterr().out
+
+
+def test_some_laws_leave_the_page_alone(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = (ROOT / "docs" / "physics.md").read_bytes()
+    assert main(["quick=true", "laws=confined,naive"])
+    assert capsys.readouterr().out.splitlines() == ["confined: holds, 2 numbers", "naive: holds, 1 numbers"]
+    assert (ROOT / "docs" / "physics.md").read_bytes() == before
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("word", "reason"),
+    [("laws=gravity", "got gravity"), ("quick=yes", "must be true or false"), ("law=hertz", "is no setting")],
+)
+def test_a_bad_setting_is_refused(word, reason):
+    with pytest.raises(InputError, match=reason):
+        main([word])
+
+
+def test_a_law_that_fails_is_said_to(tmp_path, capsys, monkeypatch):
+    """A solid whose stiffness is wrong by a tenth does not pass for the right one."""
+    right = Hexahedra.stiffness
+    monkeypatch.setattr(Hexahedra, "stiffness", lambda mesh: 1.1 * right(mesh))
+    assert not main(["quick=true", "laws=confined", f"out={tmp_path}"])
+    assert "confined: FAILS" in capsys.readouterr().out
+    assert "**missed**" in (tmp_path / "physics.md").read_text()

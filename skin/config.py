@@ -34,10 +34,9 @@ class Data:
     padded: bool
     fresh: bool
     batch_size: int
-    # Older runs have none of these.
-    stream: bool = False
-    direction: bool = False
-    augment: dict[str, Any] = field(default_factory=dict)
+    stream: bool
+    direction: bool
+    augment: dict[str, Any]
 
 
 @dataclass
@@ -48,8 +47,7 @@ class Evaluation:
     layouts: int
     false_alarm_rate: float
     safe_gestures: int = 5000
-    gestures: int | None = None  # of older runs, which evaluated other gestures on other devices
-    profile: str | None = None  # older runs have none
+    profile: str | None = None
 
 
 @dataclass
@@ -61,7 +59,6 @@ class Tracking:
     experiment: str
     resume: bool
     threads: int | None
-    recorded: bool = True  # older runs have none
 
 
 @dataclass

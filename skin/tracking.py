@@ -43,8 +43,6 @@ from skin.source import source_tags
 
 PROCESS = "process"
 """Tag of the process that makes a run."""
-RECORDED = "recorded"
-"""Tag of a run that was imported: the name of the file. Such a run has results but no weights."""
 
 _SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
 
@@ -57,13 +55,11 @@ class Store:
         client: of the tracking store.
         uri: of the tracking store.
         experiment: id of the experiment.
-        recorded: whether ``find`` returns imported runs (:data:`RECORDED`).
     """
 
     client: MlflowClient
     uri: str
     experiment: str
-    recorded: bool = True
 
     @classmethod
     def open(cls, settings: Tracking) -> "Store":
@@ -90,7 +86,7 @@ class Store:
                 f"cannot use the runs in {uri}: {reason}: give another place, as in "
                 "tracking.uri=sqlite:////FOLDER/runs.db"
             ) from error
-        store = cls(client, uri, identity, settings.recorded)
+        store = cls(client, uri, identity)
         if isinstance(client, OutboxClient):
             client.upload()
         store._close_abandoned()
@@ -107,7 +103,7 @@ class Store:
         """
         uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
         if uri.startswith("sqlite:///") and not _database(uri).exists():
-            return cls(cast(MlflowClient, None), uri, "", settings.recorded)
+            return cls(cast(MlflowClient, None), uri, "")
         return cls.open(settings)
 
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
@@ -116,24 +112,17 @@ class Store:
             return []
         terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
         terms += [f"attributes.status = '{status}'"] if status else []
-        found = self.client.search_runs(
+        return self.client.search_runs(
             [self.experiment],
             " and ".join(terms),
             ViewType.ACTIVE_ONLY,
             max_results=SEARCH_MAX_RESULTS_THRESHOLD,
             order_by=["attributes.start_time DESC"],
         )
-        return [run for run in found if self.recorded or RECORDED not in run.data.tags]
 
-    def create(self, name: str, tags: dict[str, str], start: int | None = None) -> Run:
-        """Return a new run, tagged with this process; the caller must end it.
-
-        Args:
-            name: of the run.
-            tags: of the run.
-            start: when it began, ms since 1970; None: now.
-        """
-        return self.client.create_run(self.experiment, start, tags | {PROCESS: _me()}, name)
+    def create(self, name: str, tags: dict[str, str]) -> Run:
+        """Return a new run, tagged with this process; the caller must end it."""
+        return self.client.create_run(self.experiment, tags=tags | {PROCESS: _me()}, run_name=name)
 
     def _close_abandoned(self) -> None:
         """Set the status of runs whose process no longer exists to KILLED.

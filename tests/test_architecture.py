@@ -10,7 +10,7 @@ from skin.paths import CONF, ROOT
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
 errors interrupt paths option safe_loading
-trust earlier_settings checksum suggestions
+trust checksum suggestions
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
 config recording body gesture_measures server shard run_table

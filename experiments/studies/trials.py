@@ -26,9 +26,8 @@ from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.run_overrides import apply_overrides
-from skin.source import note_reuse
 from skin.stored_run import TAG, load_configuration
-from skin.tracking import Store
+from skin.tracking import Store, note_reuse
 from skin.trained import Trained, load_trained
 
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.build import build_device
-from skin.config import Evaluation
+from skin.config import Evaluation, validate_config
 from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
@@ -78,7 +78,8 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
         trust: skip :func:`skin.trust.check_targets`; the configuration may then run any code.
 
     Raises:
-        InputError: the configuration cannot be read, or names a class that is not allowed.
+        InputError: the configuration cannot be read, is that of another version, or names a class that is
+            not allowed.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = fetch(store, run, "config.yaml", folder)
@@ -90,7 +91,14 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
         raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
     if not trust:
         check_targets(stored, f"config.yaml of run {run.info.run_id}")
-    return OmegaConf.create(stored)
+    config = OmegaConf.create(stored)
+    try:
+        validate_config(config)
+    except InputError as error:
+        raise InputError(
+            f"config.yaml of run {run.info.run_id} does not fit this version: {error}: train it again"
+        ) from error
+    return config
 
 
 @contextmanager

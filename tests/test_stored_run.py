@@ -15,7 +15,7 @@ from skin.config import Evaluation, Tracking, validate_config
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.paths import CONF
-from skin.stored_run import TAG, find_run, load_learner, load_operating_point
+from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -189,3 +189,10 @@ def test_a_run_without_its_files_is_refused(store):
     config = validate_config(composed(*SKIN, "learner=rules"))
     with pytest.raises(InputError, match=r"has no rules\.json in "):
         load_learner(store, store.client.get_run(run.info.run_id), build_learner(config), None)
+
+
+def test_a_run_of_another_version_is_refused(store):
+    with store.run("other", {"learned": "rules.json"}) as run:
+        store.client.log_text(run.info.run_id, "evaluation: {gestures: 5}", "config.yaml")
+    with pytest.raises(InputError, match=r"does not fit this version: .*gestures.*: train it again$"):
+        load_configuration(store, run)

@@ -26,7 +26,7 @@ NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/c
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install test roundings slow cluster check bench physics peers demo ui reproduce-table results wheel-check release-check docs notice clean
+.PHONY: help install test roundings slow cluster check bench physics peers demo ui reproduce-table results wheel-check docs notice clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -100,9 +100,6 @@ wheel-check: $(READY)  ## install the wheel in an empty environment; train and e
 	$(WHEEL)/env/bin/python -m pip install --quiet --constraint constraints.txt $(WHEEL)/dist/*.whl
 	cd $(WHEEL)/empty && unset PYTHONPATH && ../env/bin/skin train $(SMOKE) && ../env/bin/skin evaluate run=latest && ../env/bin/skin demo seconds=5 live.web_port=0
 	rm -rf $(WHEEL)
-
-release-check: $(READY) wheel-check  ## check the wheel and the demo; train three models again and compare them with docs/results/runs.parquet
-	$(BIN)/skin results results.action=check
 
 docs: $(READY)  ## build the documentation site in site/, offline; run tutorials and gallery; warnings are errors
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -b html docs site

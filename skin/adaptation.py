@@ -21,9 +21,8 @@ from skin.progress import Steps
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_learner, log_report, tags
 from skin.settings import configured
-from skin.source import note_reuse
 from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point
-from skin.tracking import Store
+from skin.tracking import Store, note_reuse
 
 ADAPTED = "adapted"
 """Tag of an adapted run: the id of the run that it was made from."""

@@ -18,12 +18,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import overrides, refuse_null_groups, validate_config
+from skin.config import check_server, overrides, refuse_null_groups, validate_config
 from skin.error_messages import JobInputError, one_line, to_input_error
 from skin.errors import InputError
 from skin.paths import CONF
 from skin.quick_checks import check_quickly
-from skin.server import check_server
 from skin.shard import left_out
 from skin.suggestions import suggest
 

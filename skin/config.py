@@ -4,10 +4,12 @@ Only Hydra is imported here: ``--help`` and a mistyped key must not import torch
 """
 
 from skin import interrupt  # noqa: F401  # isort: skip
+import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import isnan
 from typing import Any, cast
+from urllib.parse import urlsplit
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -18,6 +20,7 @@ from skin.errors import InputError
 from skin.fingerprint import config_hash
 
 _TOO_LARGE = 2**63
+_PATIENCE = 5.0  # s until a server that accepts no connection counts as away
 PARENT = "SKIN_PARENT_RUN"
 """Environment variable by which a sweep tells its jobs the id of their parent run."""
 
@@ -34,10 +37,9 @@ class Data:
     padded: bool
     fresh: bool
     batch_size: int
-    # Older runs have none of these.
-    stream: bool = False
-    direction: bool = False
-    augment: dict[str, Any] = field(default_factory=dict)
+    stream: bool
+    direction: bool
+    augment: dict[str, Any]
 
 
 @dataclass
@@ -48,8 +50,7 @@ class Evaluation:
     layouts: int
     false_alarm_rate: float
     safe_gestures: int = 5000
-    gestures: int | None = None  # of older runs, which evaluated other gestures on other devices
-    profile: str | None = None  # older runs have none
+    profile: str | None = None
 
 
 @dataclass
@@ -61,7 +62,6 @@ class Tracking:
     experiment: str
     resume: bool
     threads: int | None
-    recorded: bool = True  # older runs have none
 
 
 @dataclass
@@ -119,6 +119,37 @@ class Config:
     results: dict[str, Any] | None = None
     design: dict[str, Any] | None = None
     adapt: dict[str, Any] | None = None
+
+
+def is_server(uri: str | None) -> bool:
+    """Return whether a tracking URI is the address of a server, not of a database."""
+    return uri is not None and uri.startswith(("http://", "https://"))
+
+
+def answers(uri: str | None) -> bool:
+    """Return whether the server of a tracking URI accepts connections; True for a database."""
+    if uri is None or not is_server(uri):
+        return True
+    place = urlsplit(uri)
+    port = place.port or (443 if place.scheme == "https" else 80)
+    try:
+        socket.create_connection((place.hostname or "", port), timeout=_PATIENCE).close()
+    except OSError:
+        return False
+    return True
+
+
+def check_server(uri: str | None) -> None:
+    """Check that the server of a tracking URI answers, before anything heavy is imported.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not answers(uri):
+        raise InputError(
+            f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "
+            "tracking.uri; without it, finished runs are not known, and nothing begins"
+        )
 
 
 def validate_config(config: DictConfig) -> DictConfig:

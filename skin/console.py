@@ -12,8 +12,14 @@ def quiet() -> None:
         logger.setLevel(logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.WARNING)
     logging.getLogger("mlflow").setLevel(logging.WARNING)
-    # Of repeated attempts; the client tells when a server is away.
-    logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)
+    logging.getLogger("urllib3.connectionpool").addFilter(_tell_of_server)
     warnings.filterwarnings("ignore", message=".*treespec.*", category=FutureWarning)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*`srun` command is available.*")  # one task needs none
+
+
+def _tell_of_server(record: logging.LogRecord) -> bool:
+    """Say in plain words that a request to the tracking server is repeated."""
+    if "/mlflow" in str(record.args):
+        record.msg, record.args = "the tracking server does not answer: trying again", ()
+    return True

@@ -1,71 +1,36 @@
-"""Hash of everything that a result depends on: configuration, the files it names, and version."""
+"""What a result depends on: a hash of configuration, the files it names, and version; code and processor."""
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+import platform
+import re
+import subprocess
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from skin import __version__
-from skin.earlier_settings import in_frames
-from skin.paths import MANIFEST, candidates
+from skin.paths import BUNDLED, MANIFEST, ROOT, candidates
 
-RENAMED: dict[str, str] = {
-    "skin.learner.features.Features": "skin.learner.boosted_trees.BoostedTrees",
-    "skin.representation.measured.Measured": "skin.representation.features.Features",
-}
-"""Former name of a class -> its name now. Add a line when you move or rename the class of an option."""
-
-# Group -> settings added later, with their neutral values, which keep the hash of older runs.
-_LATER: dict[str, dict[str, Any]] = {
-    "touch": {"stretch": 4.0, "leak": 0.6, "strict": False, "over_sensors": True},
-    "layout": {"depth": None},
-    "evaluation": {"gestures": None, "profile": None},
-}
-MACHINE = ("devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
+MACHINE = ("accelerator", "devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
 """Settings of Lightning's Trainer that choose the machine, not the result."""
+_FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 
 
 def config_hash(content: dict[str, Any]) -> str:
-    """Return the hash of a configuration in plain containers, 16 hexadecimal digits.
-
-    Classes enter by their first name, so that renaming a module does not change the hash, and gestures in
-    frames (:func:`skin.earlier_settings.in_frames`).
-    """
+    """Return the hash of a configuration in plain containers, 16 hexadecimal digits."""
     files = {value: _hash_of(value) for value in _strings(content) if _file(value)}
-    first = renamed(in_frames(content), {new: old for old, new in RENAMED.items()})
-    text = json.dumps([_relevant(first), files, __version__], sort_keys=True)
+    text = json.dumps([_without_machine(content), files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def renamed(value: Any, names: Mapping[str, str] = RENAMED) -> Any:
-    """Return plain containers with renamed classes.
-
-    Args:
-        value: containers, or an entry of one.
-        names: old -> new; by default ``RENAMED``.
-    """
-    if isinstance(value, dict):
-        return {
-            key: names.get(one, one) if key == "_target_" and isinstance(one, str) else renamed(one, names)
-            for key, one in value.items()
-        }
-    return [renamed(one, names) for one in value] if isinstance(value, list) else value
-
-
-def _relevant(value: Any, group: str = "") -> Any:
-    """Return a configuration without settings that do not affect the result.
-
-    These are later settings at their defaults, and those of the machine.
-    """
+def _without_machine(value: Any, group: str = "") -> Any:
+    """Return a configuration without :data:`MACHINE`."""
     if not isinstance(value, dict):
         return value
-    later = _LATER.get(group, {})
-    kept = {key: _relevant(one, key) for key, one in value.items() if later.get(key, ...) != one}
-    if group != "trainer":
-        return kept
-    # The CPU stands for all accelerators, as in earlier runs.
-    return {key: one for key, one in kept.items() if key not in MACHINE} | {"accelerator": "cpu"}
+    left_out = MACHINE if group == "trainer" else ()
+    return {key: _without_machine(entry, key) for key, entry in value.items() if key not in left_out}
 
 
 def _strings(value: Any) -> Iterator[str]:
@@ -95,3 +60,50 @@ def _hash_of(name: str) -> str:
         return ""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def source_tags() -> dict[str, str]:
+    """Return the tags ``source_commit`` and ``source_dirty`` of the code, and ``processor``.
+
+    ``source_commit`` is the last commit that changed the code; without git, the version of the package.
+    ``source_dirty`` is ``true`` if files differ from that commit, ``false`` if none does, and ``unknown``
+    without git.
+    """
+    commit, dirty = _git("log", "-1", "--format=%H", "--", *_FOLDERS), "unknown"
+    if commit:
+        dirty = "true" if _git("status", "--porcelain", "--", *_FOLDERS) else "false"
+    return {
+        "source_commit": commit or __version__,
+        "source_dirty": dirty,
+        "processor": _processor(),
+    }
+
+
+def _git(*arguments: str) -> str | None:
+    """Return the output of git in the repository; None without git."""
+    if BUNDLED != ROOT:  # a wheel, which may be installed inside another repository
+        return None
+    try:
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _processor() -> str:
+    """Return the name of the processor, with its family and model where the system tells them."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        text = ""
+    known = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+    if not known:
+        return platform.processor() or platform.machine() or "unknown"
+    return ", ".join(
+        part for part in (
+            known.get("model name"),
+            f"family {known['cpu family']}" if "cpu family" in known else None,
+            f"model {known['model']}" if "model" in known else None,
+        ) if part
+    )  # fmt: skip

@@ -20,12 +20,12 @@ from skin.data_set import DataSet, Manifest
 from skin.device._threads import in_threads
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
+from skin.fingerprint import source_tags
 from skin.paths import MANIFEST
 from skin.progress import format_duration
 from skin.recording import Part
 from skin.recording_file import write_recording
 from skin.recording_metadata import describe_recording
-from skin.source import source_tags
 from skin.summary import summary_line
 
 _PAUSE = 10.0  # s between two lines of progress

@@ -49,17 +49,6 @@ def find_pretrained(name: str) -> Run | None:
     return None if folder is None else _run(name, folder, _record(folder))
 
 
-def find_copy(run: Run) -> Run | None:
-    """Return the pretrained model that is a copy of a run: of its fingerprint and start; None if none is."""
-    names = sorted(path.parent.name for place in candidates(MODELS) for path in place.glob(f"*/{RECORD}"))
-    copies = (found for name in names if (found := find_pretrained(name)) is not None)
-    return next((one for one in copies if _origin(one) == _origin(run)), None)
-
-
-def _origin(run: Run) -> tuple[str | None, int]:
-    return run.data.tags.get("fingerprint"), run.info.start_time
-
-
 def is_name(name: str) -> bool:
     """Return whether a model may have this name: lower-case letters, digits and ``_``, and no id of a run."""
     known = re.fullmatch(r"[a-z][a-z0-9_]*", name) is not None

@@ -1,11 +1,13 @@
 """One run: build, train, evaluate, log."""
 
+import json
 import logging
 import math
 import os
 import shutil
 import tempfile
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -13,17 +15,19 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import torch
+from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
+from mlflow.exceptions import MlflowException
 from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
 from skin.build import build_data, build_device, build_learner
-from skin.claim import claim, refuse_twice
 from skin.class_balance import report_balance
-from skin.config import PARENT, fingerprint, overrides, plain
+from skin.config import PARENT, Tracking, fingerprint, overrides, plain
 from skin.console import quiet
 from skin.errors import InputError
 from skin.evaluation.metrics_table import metrics_table
@@ -31,18 +35,17 @@ from skin.evaluation.metrics_table import print_report as show
 from skin.evaluation.operating_point import check_evaluation, choose_operating_point
 from skin.evaluation.outcomes import OUTCOMES
 from skin.evaluation.report import Report, evaluate
-from skin.fingerprint import MACHINE
+from skin.files import unwritable
+from skin.fingerprint import MACHINE, source_tags
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
+from skin.learner.network import LAST
 from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
-from skin.run_logger import RunLogger
 from skin.settings import import_target
-from skin.source import note_reuse
 from skin.stored_run import TAG
-from skin.tracking import Store
+from skin.tracking import Store, note_reuse
 from skin.trained import threshold_device
-from skin.unfinished import find_unfinished, unfinished_folder
 
 _log = logging.getLogger(__name__)
 
@@ -68,12 +71,8 @@ def train(config: DictConfig) -> bool:
         return True
     store, identity = Store.existing(config.tracking), tags(config)
     identity["threads"] = str(torch.get_num_threads())
-    finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
-    if finished:
-        _show_finished(finished[0])
+    if _is_finished(store, config, identity):
         return False
-    if config.tracking.resume:
-        refuse_twice(store, identity["fingerprint"])
     check_evaluation(config.evaluation)
     device = build_device(config)
     judged = device if config.evaluation.profile is None else threshold_device(config, config)
@@ -82,24 +81,134 @@ def train(config: DictConfig) -> bool:
     report_balance(device, shown=PARENT not in os.environ)
     name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
     store = Store.open(config.tracking)
-    again = find_unfinished(store, config.tracking, identity["fingerprint"])
-    with (
-        store.run(name, identity, os.environ.get(PARENT), again) as run,
-        claim(store, run, config.tracking.resume),
-    ):
-        logger = RunLogger(store, run.info.run_id)
-        learner.unfinished = unfinished_folder(config.tracking, run)
-        describe(store, run.info.run_id, config, data.hash)
-        learner.fit(data, logger)
-        point = choose_operating_point(learner, judged, config.evaluation)
-        report = evaluate(learner, device, config.evaluation, point)
-        values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
-        log_learner(store, run, learner)
-        log_report(store, run, report, device.task, values)
-    shutil.rmtree(learner.unfinished, ignore_errors=True)
+    with alone(config.tracking, identity["fingerprint"]):
+        if _is_finished(store, config, identity):  # by a process that began earlier
+            return False
+        again = find_unfinished(store, config.tracking, identity["fingerprint"])
+        with store.run(name, identity, os.environ.get(PARENT), again) as run:
+            learner.unfinished = _unfinished_folder(config.tracking, run)
+            describe(store, run.info.run_id, config, data.hash)
+            learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
+            point = choose_operating_point(learner, judged, config.evaluation)
+            report = evaluate(learner, device, config.evaluation, point)
+            values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
+            log_learner(store, run, learner)
+            log_report(store, run, report, device.task, values)
+        shutil.rmtree(learner.unfinished, ignore_errors=True)
     if PARENT not in os.environ:
         show(report, f"{name}, run {run.info.run_id}")
     return True
+
+
+class RunLogger(MLFlowLogger):
+    """Logs a training to its run and leaves the run open.
+
+    Lightning's own calls a run FINISHED when the fit ends; one that is killed during its evaluation would
+    then count as finished without having any result.
+
+    Args:
+        store: of the run.
+        run: its id.
+        folder: for metrics that a server did not take, which the next logger of the run sends.
+    """
+
+    def __init__(self, store: Store, run: str, folder: Path) -> None:
+        super().__init__(tracking_uri=store.uri, run_id=run)
+        self._left = folder / "metrics.json"
+        if self._left.is_file():
+            super().log_metrics(**json.loads(self._left.read_text()))
+            self._left.unlink()
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log the metrics of an epoch; those of one that is in a checkpoint are not measured again."""
+        try:
+            super().log_metrics(metrics, step)
+        except MlflowException:
+            self._left.write_text(json.dumps({"metrics": dict(metrics), "step": step}))
+            raise
+
+    def finalize(self, status: str = "success") -> None:
+        """Do nothing: the run ends with its evaluation."""
+
+
+@contextmanager
+def alone(settings: Tracking, identity: str) -> Iterator[None]:
+    """Keep other processes from the same training; the system frees the lock of a process that was killed.
+
+    Args:
+        settings: whose folder of artifacts all these processes share.
+        identity: fingerprint of the run.
+
+    Raises:
+        InputError: another process trains it, or the folder cannot be written.
+    """
+    folder = _unfinished(settings)
+    lock = FileLock(folder / f"{identity}.lock")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(
+            f"a training with the same configuration ({identity}) is in progress in another process: "
+            "wait for it"
+        ) from None
+    except OSError as error:
+        raise unwritable(folder, error, "tracking.artifacts=FOLDER") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def find_unfinished(store: Store, settings: Tracking, identity: str) -> Run | None:
+    """Return the last killed run that the same code on the same processor can continue; call it alone.
+
+    Args:
+        store: where.
+        settings: with ``resume=False``, no run is continued.
+        identity: fingerprint of the run.
+    """
+    for run in store.find("RUNNING", fingerprint=identity):
+        if (_unfinished(settings) / run.info.run_id).is_dir():  # else of a process with another folder
+            store.client.set_terminated(run.info.run_id, "KILLED")
+    source = source_tags()
+    for run in store.find("KILLED", fingerprint=identity) if settings.resume else ():
+        same = all(run.data.tags.get(key) == value for key, value in source.items())
+        if same and (_unfinished(settings) / run.info.run_id / LAST).is_file():
+            _log.info(
+                "run %s was interrupted and continues: tracking.resume=false repeats it", run.info.run_id
+            )
+            return run
+    return None
+
+
+def _unfinished_folder(settings: Tracking, run: Run) -> Path:
+    """Return the folder for the checkpoints of a run; it is made where it is missing.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = _unfinished(settings) / run.info.run_id
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error, "tracking.artifacts=FOLDER") from error
+    return folder
+
+
+def _unfinished(settings: Tracking) -> Path:
+    """Return the folder of the checkpoints and locks of all trainings."""
+    return Path(settings.artifacts or "mlartifacts").expanduser() / "unfinished"
+
+
+def _is_finished(store: Store, config: DictConfig, identity: dict[str, str]) -> bool:
+    """Return whether a run did a training before and may replace it; print its metrics."""
+    if not config.tracking.resume:
+        return False
+    finished = store.find("FINISHED", fingerprint=identity["fingerprint"])
+    if finished:
+        _show_finished(finished[0])
+    return bool(finished)
 
 
 def _show_finished(run: Run) -> None:

@@ -17,16 +17,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.build import build_device
-from skin.config import Evaluation
+from skin.config import Evaluation, validate_config
 from skin.datamodule import TouchData
-from skin.earlier_settings import in_seconds
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
-from skin.fingerprint import renamed
 from skin.learner.base import AbstractLearner
-from skin.pretrained import find_copy, find_pretrained
+from skin.pretrained import find_pretrained
 from skin.safe_loading import load_yaml, regular
-from skin.tracking import RECORDED, Store
+from skin.tracking import Store
 from skin.trust import check_targets
 
 _log = logging.getLogger(__name__)
@@ -59,7 +57,7 @@ def find_run(store: Store, name: str) -> Run:
         return pretrained
     runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
     if name == "latest":
-        found = [run for run in runs if RECORDED not in run.data.tags][:1]
+        found = runs[:1]
     else:
         prints = {run.data.tags.get("fingerprint", ""): run for run in reversed(runs)}
         found = [run for run in runs if run.info.run_id.startswith(name)]
@@ -80,22 +78,27 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
         trust: skip :func:`skin.trust.check_targets`; the configuration may then run any code.
 
     Raises:
-        InputError: the configuration cannot be read, or names a class that is not allowed.
+        InputError: the configuration cannot be read, is that of another version, or names a class that is
+            not allowed.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = fetch(store, run, "config.yaml", folder)
         try:
-            stored = renamed(load_yaml(path))
+            stored = load_yaml(path)
         except (ValueError, OSError) as error:
             raise InputError(f"run {run.info.run_id} has no readable config.yaml: {error}") from error
     if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
         raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
-    with described(run):
-        stored = in_seconds(stored)
     if not trust:
         check_targets(stored, f"config.yaml of run {run.info.run_id}")
-    # Older runs list the settings of all commands of their time, unset.
-    return OmegaConf.create({key: value for key, value in stored.items() if value is not None})
+    config = OmegaConf.create(stored)
+    try:
+        validate_config(config)
+    except InputError as error:
+        raise InputError(
+            f"config.yaml of run {run.info.run_id} does not fit this version: {error}: train it again"
+        ) from error
+    return config
 
 
 @contextmanager
@@ -117,24 +120,12 @@ def described(run: Run) -> Iterator[None]:
         ) from error
 
 
-class MissingWeightsError(InputError):
-    """A run cannot be used because it was imported: only its results were."""
-
-
 def load_learner(store: Store, run: Run, learner: AbstractLearner, data: TouchData) -> None:
-    """Load the weights of a run into a learner. Those of an imported run are in ``models/``, if anywhere.
+    """Load the weights of a run into a learner.
 
     Raises:
         InputError: the weights do not fit the touches, such as another window with early fusion.
-        MissingWeightsError: the run has none.
     """
-    source = run.data.tags.get(RECORDED)
-    run = (find_copy(run) or run) if source else run
-    if RECORDED in run.data.tags:
-        raise MissingWeightsError(
-            f"run {run.info.run_id} ({run.info.run_name}) was imported from {source} without its weights: "
-            "tracking.recorded=false trains it again"
-        )
     name = run.data.tags["learned"]
     if Path(name).name != name:
         raise InputError(

@@ -1,4 +1,4 @@
-"""A sweep: one parent run in MLflow, one line of progress per job."""
+"""A sweep: one parent run in MLflow, one line of progress per job. The UI of MLflow compares its runs."""
 
 import atexit
 import os
@@ -16,13 +16,11 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.config import plain, validate_config
+from skin.config import check_server, plain, validate_config
 from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.progress import SweepProgress, expected_seconds, format_duration
-from skin.server import check_server
 from skin.shard import LEFT_OUT, Shard
-from skin.source import note_reuse
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -54,6 +52,13 @@ def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict
     return [_chosen(job) for job in found]
 
 
+def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
+    """Return the swept settings, such as ``model.norm=none,layer × seed=0,1``, for the name of a run."""
+    values = {key: dict.fromkeys(job[key] for job in jobs) for key in swept}
+    text = " × ".join(f"{key.lstrip('+')}={','.join(tried)}" for key, tried in values.items())
+    return text if len(text) <= 250 else f"{text[:249]}…"
+
+
 def _chosen(overrides: Iterable[str]) -> dict[str, str]:
     """Return the keys and values of overrides."""
     return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
@@ -71,7 +76,7 @@ class Sweep(Callback):
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
     not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
     closed at exit. A parent that has no children by then, because each job was finished before or refused, is
-    deleted. The results in a parent are of all jobs of the sweep, also of those in other shards.
+    deleted.
 
     Args:
         parent: whether the jobs are runs; a command whose jobs run sweeps of their own has no parent run.
@@ -122,7 +127,6 @@ class Sweep(Callback):
 
         from skin.run import PARENT, SWEPT, tags
         from skin.tracking import Store
-        from skin.variants import sweep_title
 
         identities = [tags(job) if job else {} for job in composed]
         self._fingerprints = [one.get("fingerprint", "") for one in identities]
@@ -196,28 +200,22 @@ class Sweep(Callback):
             self._conclude(store, self._parent)
 
     def _conclude(self, store: "Store", parent: "Run") -> None:
-        """Log the results of all jobs; delete a parent without children."""
+        """End the parent: FAILED if a job of this shard has no finished run; delete one without children."""
         from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 
-        from skin.variants import log_variants
+        from skin.tracking import note_reuse
 
-        own = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
-        keys = [key for key in self._swept if key != "seed"]
-        found: dict[tuple[str, ...], list[Run]] = {}
-        once = dict(zip(self._fingerprints, self._jobs, strict=True))  # seed=0,0 is one run
-        missing = {self._fingerprints[number] for number in self._own}
-        for identity, job in once.items():
+        children = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
+        missing = False
+        for identity in {self._fingerprints[number] for number in self._own}:
             # One that was finished before counts, unless it was to be repeated.
-            runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else own)
-            found.setdefault(tuple(job[key] for key in keys), []).extend(runs[:1])
+            runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else children)
+            missing |= not runs
             for run in runs[:1]:
                 note_reuse(run)  # jobs in other processes warn of nothing
-            missing -= {identity} if runs else set()
         store.client.set_terminated(parent.info.run_id, "FAILED" if missing else "FINISHED")
-        if not store.find(**own):
+        if not store.find(**children):
             store.client.delete_run(parent.info.run_id)
-        elif done := {values: runs for values, runs in found.items() if runs}:
-            log_variants(store, parent, keys, done)
 
     def _label(self, config: DictConfig) -> str:
         job = _chosen(_words(config))

@@ -1,4 +1,7 @@
-"""Runs in MLflow: one SQLite file, one experiment, and a status that is true after a crash."""
+"""Runs in MLflow: one SQLite file or a server, one experiment, and a status that is true after a crash.
+
+A request to a server that is away is repeated by MLflow: for seconds, and for twelve minutes during a run.
+"""
 
 import os
 
@@ -10,7 +13,9 @@ os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
 
+import atexit
 import json
+import logging
 import platform
 import sqlite3
 import time
@@ -25,28 +30,49 @@ import psutil
 from alembic.util import CommandError
 from filelock import FileLock
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Run, ViewType
-from mlflow.exceptions import MlflowException
+from mlflow.entities import Experiment, Metric, Run, ViewType
+from mlflow.exceptions import MlflowException, RestException
 from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
 from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
 from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
 from sqlalchemy.exc import SQLAlchemyError
 
-from skin.config import Tracking
+from skin.config import Tracking, answers, check_server, is_server
 from skin.errors import InputError
 from skin.files import whole
+from skin.fingerprint import source_tags
 from skin.interrupt import ends_on_signal
-from skin.outbox import OutboxClient
-from skin.run_table import TAGS, table_link, tag_experiment
-from skin.server import check_server, is_server
-from skin.source import source_tags
+
+_log = logging.getLogger(__name__)
 
 PROCESS = "process"
 """Tag of the process that makes a run."""
-RECORDED = "recorded"
-"""Tag of a run that was imported: the name of the file. Such a run has results but no weights."""
 
+_QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1"}
+# During a run: waits of 0, 20, 40, 80 and five times 120 s, together 12 minutes. MLflow takes no more than 9.
+_PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "10"}
 _SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
+
+# The table of runs in the UI of MLflow: the shared view of a link, with widths of its columns in pixels.
+_VIEW = "skin"
+_NAME = "attributes.`Run Name`"
+_COLUMNS = {
+    _NAME: 420,
+    "metrics.`same/overall/accuracy`": 180,
+    "metrics.`same/dangerous/alarm_recall`": 230,
+    "metrics.`same/dangerous/false_alarm_rate`": 250,
+}
+_SHOWN = {
+    "selectedColumns": [name for name in _COLUMNS if name != _NAME],
+    "columnOrder": list(_COLUMNS),
+    "columnWidths": _COLUMNS,
+}
+TAGS = {
+    # Which of its two interfaces MLflow shows. 3.17 takes it from the link instead.
+    "mlflow.experimentKind": "custom_model_development",
+    f"mlflow.sharedViewState.{_VIEW}": json.dumps(_SHOWN),
+}
+"""Tags of an experiment that holds runs of this package."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +83,11 @@ class Store:
         client: of the tracking store.
         uri: of the tracking store.
         experiment: id of the experiment.
-        recorded: whether ``find`` returns imported runs (:data:`RECORDED`).
     """
 
     client: MlflowClient
     uri: str
     experiment: str
-    recorded: bool = True
 
     @classmethod
     def open(cls, settings: Tracking) -> "Store":
@@ -75,13 +99,12 @@ class Store:
         """
         uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
         artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
-        remote = is_server(uri)
         check_server(uri)
         try:
             with _alone(uri, artifacts):
-                client = OutboxClient(uri, artifacts / "kept") if remote else MlflowClient(tracking_uri=uri)
+                client = MlflowClient(tracking_uri=uri)
                 # A server keeps the artifacts of its runs, unless a folder is given.
-                served = remote and settings.artifacts is None
+                served = is_server(uri) and settings.artifacts is None
                 location = None if served else (artifacts / settings.experiment).resolve().as_uri()
                 identity = _experiment(client, settings.experiment, location)
         except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
@@ -90,9 +113,7 @@ class Store:
                 f"cannot use the runs in {uri}: {reason}: give another place, as in "
                 "tracking.uri=sqlite:////FOLDER/runs.db"
             ) from error
-        store = cls(client, uri, identity, settings.recorded)
-        if isinstance(client, OutboxClient):
-            client.upload()
+        store = cls(client, uri, identity)
         store._close_abandoned()
         return store
 
@@ -107,7 +128,7 @@ class Store:
         """
         uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
         if uri.startswith("sqlite:///") and not _database(uri).exists():
-            return cls(cast(MlflowClient, None), uri, "", settings.recorded)
+            return cls(cast(MlflowClient, None), uri, "")
         return cls.open(settings)
 
     def find(self, status: str | None = None, **tags: str) -> list[Run]:
@@ -116,24 +137,17 @@ class Store:
             return []
         terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
         terms += [f"attributes.status = '{status}'"] if status else []
-        found = self.client.search_runs(
+        return self.client.search_runs(
             [self.experiment],
             " and ".join(terms),
             ViewType.ACTIVE_ONLY,
             max_results=SEARCH_MAX_RESULTS_THRESHOLD,
             order_by=["attributes.start_time DESC"],
         )
-        return [run for run in found if self.recorded or RECORDED not in run.data.tags]
 
-    def create(self, name: str, tags: dict[str, str], start: int | None = None) -> Run:
-        """Return a new run, tagged with this process; the caller must end it.
-
-        Args:
-            name: of the run.
-            tags: of the run.
-            start: when it began, ms since 1970; None: now.
-        """
-        return self.client.create_run(self.experiment, start, tags | {PROCESS: _me()}, name)
+    def create(self, name: str, tags: dict[str, str]) -> Run:
+        """Return a new run, tagged with this process; the caller must end it."""
+        return self.client.create_run(self.experiment, tags=tags | {PROCESS: _me()}, run_name=name)
 
     def _close_abandoned(self) -> None:
         """Set the status of runs whose process no longer exists to KILLED.
@@ -141,7 +155,7 @@ class Store:
         Only processes of this machine can be checked. Runs without the tag are left unchanged.
         """
         for run in self.find("RUNNING"):
-            if is_gone(run.data.tags.get(PROCESS, "")):
+            if _is_gone(run.data.tags.get(PROCESS, "")):
                 self.client.set_terminated(run.info.run_id, "KILLED")
 
     @contextmanager
@@ -150,11 +164,16 @@ class Store:
     ) -> Iterator[Run]:
         """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal.
 
+        A request to a server that is away waits for it for twelve minutes.
+
         Args:
             name: of the run.
             tags: of the run.
             parent: id of the run of its sweep.
             again: a killed run to open instead of a new one.
+
+        Raises:
+            InputError: the server stayed away.
         """
         tags = tags | source_tags() | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
         run = again or self.create(name, tags)
@@ -164,14 +183,36 @@ class Store:
                 self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
         try:
-            with ends_on_signal(lambda: self.client.set_terminated(run.info.run_id, status)):
+            with ends_on_signal(lambda: self._end(run, status)), _patience():
                 yield run
+                self.client.set_terminated(run.info.run_id, "FINISHED")
             status = "FINISHED"
         except Exception as error:
+            if self._lost(error):
+                raise InputError(
+                    f"the tracking server {self.uri} does not answer, and run {run.info.run_id} is not "
+                    "complete: repeat the command when it does; a training continues after its last epoch"
+                ) from error
             status = "FAILED"
-            self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
+            if answers(self.uri):
+                self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
             raise
         finally:
+            if status != "FINISHED":
+                self._end(run, status)
+
+    def _lost(self, error: Exception) -> bool:
+        """Return whether an error means that the server gives no answer; what it answers is another one."""
+        return (
+            is_server(self.uri)
+            and isinstance(error, MlflowException)
+            and not isinstance(error, RestException)
+            and str(error).startswith("API request to")
+        )
+
+    def _end(self, run: Run, status: str) -> None:
+        """End a run; without the server it stays RUNNING until the next start closes it."""
+        if answers(self.uri):
             self.client.set_terminated(run.info.run_id, status)
 
     def log_metrics(self, run: Run, values: dict[str, float]) -> None:
@@ -180,6 +221,17 @@ class Store:
         metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
         for start in range(0, len(metrics), 1000):
             self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
+
+
+@contextmanager
+def _patience() -> Iterator[None]:
+    """Let a request wait for a server that is away, unless a person chose otherwise."""
+    before = {name: os.environ[name] for name in _QUICK}
+    os.environ |= _PATIENT if before == _QUICK else {}
+    try:
+        yield
+    finally:
+        os.environ |= before
 
 
 def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
@@ -191,13 +243,23 @@ def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
             if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                 raise
             return _experiment(client, name, location)
-    tag_experiment(client, found)
+    _tag(client, found)
     return str(found.experiment_id)
+
+
+def _tag(client: MlflowClient, experiment: Experiment) -> None:
+    """Add the tags that an experiment lacks; they matter only to the UI, so that failures are ignored."""
+    for key, value in TAGS.items():
+        if experiment.tags.get(key) != value:
+            with suppress(MlflowException):
+                client.set_experiment_tag(experiment.experiment_id, key, value)
 
 
 def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
     """Print the link to the runs of ``mlflow.db`` in the current folder, at a server that shows them."""
-    print(f"runs: {table_link(address, Store.open(Tracking(None, None, 'skin', True, None)).experiment)}")
+    experiment = Store.open(Tracking(None, None, "skin", True, None)).experiment
+    table = f"{address}/#/experiments/{experiment}/runs"
+    print(f"runs: {table}?workflowType=machine_learning&viewStateShareKey={_VIEW}")
 
 
 def _where() -> str:
@@ -214,7 +276,7 @@ def _me() -> str:
     return json.dumps([_where(), os.getpid(), psutil.Process().create_time()])
 
 
-def is_gone(process: str) -> bool | None:
+def _is_gone(process: str) -> bool | None:
     """Return whether a tagged process no longer exists; None for those of other machines."""
     try:
         where, number, started = json.loads(process)
@@ -265,3 +327,34 @@ def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
         if not existed:  # MLflow makes the folder of the URI without decoding it, and leaves it empty
             with suppress(OSError):
                 os.removedirs(encoded)
+
+
+_reused: dict[str, str] = {}  # id -> name of reused runs of other code
+
+
+def note_reuse(run: Run) -> None:
+    """Note that this command uses a finished run.
+
+    At exit, one warning counts the runs of other code: of another commit, or with files that differ from the
+    commit then or now. Runs that began after this process do not count.
+    """
+    code, tags = source_tags(), run.data.tags
+    same = tags.get("source_commit") == code["source_commit"]
+    clean = "true" not in (tags.get("source_dirty"), code["source_dirty"])
+    if (same and clean) or run.info.start_time >= 1000 * psutil.Process().create_time():
+        return
+    _reused.setdefault(run.info.run_id, run.info.run_name)
+
+
+@atexit.register
+def _warn() -> None:
+    """Print the warning that :func:`note_reuse` announces."""
+    if not _reused:
+        return
+    count, first = len(_reused), next(iter(_reused.values()))
+    what = f"finished run {first}" if count == 1 else f"{count} finished runs, such as {first}"
+    _log.warning(
+        "warning: reused %s, of other code (tags source_commit and source_dirty): "
+        "tracking.resume=false repeats them",
+        what,
+    )

@@ -10,11 +10,11 @@ from skin.paths import CONF, ROOT
 # From the ground up; a name is a package or a module of skin/. Names on one line do not import each other.
 LAYERS = """
 errors interrupt paths option safe_loading
-trust earlier_settings checksum suggestions
+trust checksum suggestions
 settings
-error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body gesture_measures server shard run_table
-files recording_metadata layout summary plausibility outbox
+error_messages fingerprint labels rng material model sensor_dynamics sensors
+config recording body gesture_measures shard
+files recording_metadata layout summary plausibility
 recording_file touch tracking array_cache
 simulator data_set
 contact sensor_geometry skin_distribution
@@ -26,7 +26,7 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished claim run_logger pretrained
+evaluation build pretrained
 stored_run run_overrides skin_settings model_card fine_tuning
 trained
 adaptation_target
@@ -34,7 +34,7 @@ exported
 hardware
 plot
 design
-console variants
+console
 run generation
 sweep adaptation
 commands

@@ -7,7 +7,7 @@ import pytest
 
 from skin.build import build_device
 from skin.class_balance import accuracy_from_shape, balance_table, check_label_leakage, class_balance
-from skin.config import fingerprint, validate_config
+from skin.config import validate_config
 from skin.errors import InputError
 from skin.touch.gesture import GestureSettings
 
@@ -69,10 +69,3 @@ def test_a_shape_that_tells_a_label_is_warned_of_and_refused_if_strict(device):
 def test_the_default_gestures_pass(device):
     report = class_balance(device.recording(None, complete=False), device.sampler.shapes.names)
     check_label_leakage(report, GestureSettings(strict=True))
-
-
-def test_settings_that_came_later_leave_the_fingerprint_of_older_runs(configured):
-    """A run of f889bde has none of them, neither under touch nor under device.touch."""
-    config, old = configured(), configured("~touch.stretch", "~touch.leak", "~touch.strict")
-    assert fingerprint(config) == fingerprint(old)
-    assert fingerprint(configured("touch.leak=0.5")) != fingerprint(config)

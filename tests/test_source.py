@@ -4,8 +4,8 @@ import subprocess
 
 import pytest
 
-from skin import __version__, source
-from skin.source import source_tags
+from skin import __version__, fingerprint
+from skin.fingerprint import source_tags
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -28,9 +28,9 @@ def repository(tmp_path, monkeypatch):
     (tmp_path / "skin" / "a.py").write_text("1")
     git("add", ".")
     git("commit", "-m", "code")
-    monkeypatch.setattr(source, "ROOT", tmp_path)
-    monkeypatch.setattr(source, "BUNDLED", tmp_path)
-    monkeypatch.setattr(source, "_FOLDERS", ("skin",))
+    monkeypatch.setattr(fingerprint, "ROOT", tmp_path)
+    monkeypatch.setattr(fingerprint, "BUNDLED", tmp_path)
+    monkeypatch.setattr(fingerprint, "_FOLDERS", ("skin",))
     return git
 
 
@@ -54,8 +54,8 @@ def test_the_commit_is_the_last_one_that_changed_code(repository, tmp_path):
 
 
 def test_without_git_the_version_stands_for_the_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(source, "ROOT", tmp_path)
-    monkeypatch.setattr(source, "BUNDLED", tmp_path)
+    monkeypatch.setattr(fingerprint, "ROOT", tmp_path)
+    monkeypatch.setattr(fingerprint, "BUNDLED", tmp_path)
     assert (tags()["source_commit"], tags()["source_dirty"]) == (__version__, "unknown")
 
 

@@ -11,12 +11,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import Evaluation, Tracking, plain, validate_config
-from skin.earlier_settings import in_seconds
+from skin.config import Evaluation, Tracking, validate_config
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.fingerprint import RENAMED
-from skin.paths import CONF, ROOT
+from skin.paths import CONF
 from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
@@ -72,7 +70,7 @@ def tagged(text=None):
 
 
 def settings(rate=0.02):
-    return Evaluation(devices=0, layouts=0, gestures=1, false_alarm_rate=rate)
+    return Evaluation(devices=0, layouts=0, false_alarm_rate=rate)
 
 
 def test_an_operating_point_comes_back_as_it_was_stored(caplog):
@@ -185,29 +183,6 @@ def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store,
     assert "\n" not in str(refused.value)
 
 
-def test_a_class_that_moved_since_is_found_under_its_name_of_now(store, monkeypatch):
-    monkeypatch.setitem(RENAMED, "skin.learners.thresholds.Rules", "skin.learner.rules.Rules")
-    with store.run("moved", {"learned": "rules.json"}) as run:
-        text = "learner: {_target_: skin.learners.thresholds.Rules}"
-        store.client.log_text(run.info.run_id, text, "config.yaml")
-    found = load_configuration(store, run)
-    assert found == {"learner": {"_target_": "skin.learner.rules.Rules"}}
-
-
-def test_gestures_in_frames_are_loaded_in_seconds(store):
-    touch = "touch: {window: 20, tap: [1, 3], speed: [0.003, 0.02], thresholds: {frames: 3}}"
-    text = f"{touch}\ndevice: {{rate: 10.0}}"
-    with store.run("frames", {"learned": "rules.json"}) as run:
-        store.client.log_text(run.info.run_id, text, "config.yaml")
-    assert load_configuration(store, run).touch == {
-        "rate": 10.0,
-        "window": 2.0,
-        "tap": [0.1, 0.3],
-        "speed": [0.03, 0.2],
-        "thresholds": {"duration": 0.3},
-    }
-
-
 def test_a_run_without_its_files_is_refused(store):
     with store.run("bare", {"learned": "rules.json"}) as run:
         pass
@@ -216,27 +191,8 @@ def test_a_run_without_its_files_is_refused(store):
         load_learner(store, store.client.get_run(run.info.run_id), build_learner(config), None)
 
 
-@pytest.mark.slow
-def test_a_run_of_an_earlier_version_is_evaluated(run, tmp_path):
-    """Its configuration lacks what was added later, and lists settings of commands that are gone."""
-    stored = OmegaConf.load(ROOT / "tests" / "earlier_run.yaml")
-    stored.device.update(gestures=64, test_gestures=32)
-    config = validate_config(OmegaConf.create(in_seconds(plain(stored))))
-    learner = build_learner(config)
-    data = build_data(config, build_device(config))
-    data.touches("train")
-    learner.build(data)
-    tracking = Tracking(f"sqlite:///{tmp_path}/m.db", f"{tmp_path}/a", "skin", True, None)
-    store = Store.open(tracking)
-    with store.run("old", {"learned": "weights.pt"}) as trained:
-        gone = dict.fromkeys(("rows", "stream", "moving", "dead", "direction", "physics", "run", "out"))
-        text = OmegaConf.to_yaml(OmegaConf.merge(stored, gone))
-        store.client.log_text(trained.info.run_id, text, "config.yaml")
-        store.client.log_artifact(trained.info.run_id, str(learner.save(tmp_path)))
-    small = ["devices=1", "layouts=1", "safe_gestures=64"]
-    done = run(tmp_path, "evaluate", "run=latest", *(f"evaluation.{one}" for one in small))
-    assert done.returncode == 0, done.stderr
-    assert "stores no alarm threshold" in done.stderr
-    assert [one.info.run_name for one in store.find("FINISHED", evaluated=trained.info.run_id)] == [
-        "evaluation of old"
-    ]
+def test_a_run_of_another_version_is_refused(store):
+    with store.run("other", {"learned": "rules.json"}) as run:
+        store.client.log_text(run.info.run_id, "evaluation: {gestures: 5}", "config.yaml")
+    with pytest.raises(InputError, match=r"does not fit this version: .*gestures.*: train it again$"):
+        load_configuration(store, run)

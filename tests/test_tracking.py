@@ -11,11 +11,10 @@ import pytest
 
 from skin import tracking
 from skin.config import Tracking
+from skin.fingerprint import source_tags
 from skin.paths import ROOT
-from skin.run_table import TAGS
-from skin.source import source_tags
 from skin.stored_run import fetch
-from skin.tracking import Store, print_table_link
+from skin.tracking import TAGS, Store, print_table_link
 from skin.trained import load_run
 
 # MLflow's own business with SQLAlchemy.

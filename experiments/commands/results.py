@@ -2,11 +2,8 @@
 
     skin results
     skin results results.part=table
-    skin results results.action=check
 
-Writes into docs/results; rerun to resume. Results of finished runs are kept in docs/results/runs.parquet:
-results.action=import logs them in the database, results.action=export writes those that published files name.
-results.action=check trains three models again and compares them with this file.
+Writes into docs/results; rerun to resume.
 """
 
 import sys
@@ -23,7 +20,7 @@ from omegaconf import DictConfig
 
 from experiments import peers
 from skin.command import command
-from skin.config import Tracking, overrides, plain
+from skin.config import overrides, plain
 from skin.errors import InputError
 from skin.settings import check_settings, configured
 
@@ -45,15 +42,6 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Check:
-    """Trainings that the release check repeats: each of ``rows`` on a simulator with a seed."""
-
-    rows: Sequence[str]
-    simulator: str
-    seed: Annotated[int, Ge(0)]
-
-
-@dataclass(frozen=True)
 class Results:
     """The settings of ``conf/results.yaml``.
 
@@ -61,19 +49,15 @@ class Results:
         InputError: a part that there is not.
     """
 
-    action: Literal["publish", "import", "export", "check"]
     part: str
     optional: Sequence[str]
     budget: Literal["full", "smoke"]
-    file: str
     jobs: Annotated[int, Ge(1)]
     fresh: bool
     parts: Mapping[str, Sequence[Mapping[str, Any]]]
     smoke: Mapping[str, Sequence[str]]
-    check: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        check_settings(Check, dict(self.check), "results.check")
         for name, steps in self.parts.items():
             for number, step in enumerate(steps):
                 check_settings(Step, dict(step), f"results.parts.{name}[{number}]")
@@ -91,17 +75,14 @@ class Results:
 
 @command("results")
 def main(config: DictConfig) -> None:
-    """Publish, import, export or check; exit code 1 if a command failed or a value differs."""
+    """Publish; exit code 1 if a command failed."""
     settings = plain(config)["results"]
     chosen = configured(Results, settings, "results")
 
     from skin.console import quiet
 
     quiet()
-    code = {"publish": _publish, "import": _import, "export": _export, "check": _check}[chosen.action](
-        chosen, config
-    )
-    sys.exit(code)
+    sys.exit(_publish(chosen, config))
 
 
 def _publish(chosen: Results, config: DictConfig) -> int:
@@ -109,8 +90,6 @@ def _publish(chosen: Results, config: DictConfig) -> int:
     from skin.progress import SweepProgress, format_duration
 
     full, failed = chosen.budget == "full", []
-    if full and not chosen.fresh:
-        _import(chosen, config)
     lines = list(_lines(chosen, config))
     progress = SweepProgress([3600 * hours if full else None for hours, _ in lines])
     for number, (hours, line) in enumerate(lines):
@@ -125,8 +104,6 @@ def _publish(chosen: Results, config: DictConfig) -> int:
         progress.finish(number, took, full and took < 0.05 * 3600 * hours)
     if failed:
         print("failed:", *failed, sep="\n", file=sys.stderr)
-    elif full:
-        _export(chosen, config)
     return 1 if failed else 0
 
 
@@ -179,36 +156,3 @@ def _folder(chosen: Results, config: DictConfig) -> Path:
     from skin.files import results
 
     return results(config.out or ("docs/results" if chosen.budget == "full" else "results"))
-
-
-def _tracking(chosen: Results, config: DictConfig) -> Tracking:
-    """Return the settings of the database that the commands use."""
-    given = plain(config)["tracking"]
-    own = {name: value for name, value in _FRESH.items() if chosen.fresh and given[name] is None}
-    return Tracking(**given | own)
-
-
-def _import(chosen: Results, config: DictConfig) -> int:
-    """Log the recorded runs that the database lacks."""
-    from experiments.studies.recorded_runs import import_runs
-
-    count = import_runs(_tracking(chosen, config), Path(chosen.file))
-    print(f"imported {count} runs from {chosen.file}", flush=True)
-    return 0
-
-
-def _export(chosen: Results, config: DictConfig) -> int:
-    """Write the runs that published files name."""
-    from experiments.studies.recorded_runs import export_runs
-
-    count = export_runs(_tracking(chosen, config), Path(chosen.file), _folder(chosen, config))
-    print(f"wrote {count} runs to {chosen.file}")
-    return 0
-
-
-def _check(chosen: Results, config: DictConfig) -> int:
-    """Train again and compare; return 1 if a value differs."""
-    from experiments.studies.release_check import release_check
-
-    given = [one for one in overrides() if not one.startswith(("results.", "out=", "tracking."))]
-    return release_check(Path(chosen.file), **chosen.check, words=given)

@@ -17,9 +17,8 @@ from skin.evaluation.report import columns, evaluate
 from skin.labels import Task
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_report, simulator, tags
-from skin.source import note_reuse
 from skin.stored_run import load_learner
-from skin.tracking import Store
+from skin.tracking import Store, note_reuse
 
 Way = Callable[[Tensor, Task], Tensor]
 

@@ -24,9 +24,8 @@ from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.run import SWEPT, simulator
 from skin.shard import LEFT_OUT, Shard
-from skin.source import note_reuse
 from skin.stored_run import find_run
-from skin.tracking import Store
+from skin.tracking import Store, note_reuse
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,9 +26,8 @@ from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.run_overrides import apply_overrides
-from skin.source import note_reuse
-from skin.stored_run import TAG, MissingWeightsError, load_configuration
-from skin.tracking import Store
+from skin.stored_run import TAG, load_configuration
+from skin.tracking import Store, note_reuse
 from skin.trained import Trained, load_trained
 
 
@@ -67,18 +65,12 @@ def run_trials(
 ) -> Iterator[Trial]:
     """Yield the results of a study for a run; earlier results are read from MLflow.
 
-    Where the study is about all rows, runs that were imported without weights are left out unless all their
-    results were imported, too.
-
     Args:
         store: of the run; results are logged there.
         planned: the run.
         study: what to measure.
         config: of the command.
         folder: for the files of a measure.
-
-    Raises:
-        MissingWeightsError: an imported run of a named row would have to be measured.
     """
     if planned.run is None:
         yield Trial(planned.variant, planned.seed, "", "", "", {})
@@ -89,14 +81,7 @@ def run_trials(
         outcomes = load_outcomes(store, planned.run)
         yield Trial(planned.variant, planned.seed, "", "", identity, own, outcomes=outcomes)
         return
-    try:
-        results = list(_measured(study, planned, _Run(store, planned.run, config)))
-    except MissingWeightsError as error:
-        if study.rows != "all":
-            raise
-        print(f"left out: {error}", file=sys.stderr, flush=True)
-        return
-    for condition, number, found in results:
+    for condition, number, found in _measured(study, planned, _Run(store, planned.run, config)):
         files = _fetched(store, found, folder)
         metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
         at = planned.variant, planned.seed, condition, number, identity

@@ -25,7 +25,7 @@ from skin.evaluation.operating_point import (
 from skin.evaluation.report import evaluate
 from skin.labels import TOUCH, TOUCH_OR_NOT, Task
 
-SETTINGS = Evaluation(devices=0, layouts=0, gestures=32, false_alarm_rate=0.1, safe_gestures=64)
+SETTINGS = Evaluation(devices=0, layouts=0, false_alarm_rate=0.1, safe_gestures=64)
 POINT = OperatingPoint(0.25, 0.02, 2048, 40, 3)
 GESTURES = Task(("stroke", "dangerous", "slap"), "exclusive")
 

@@ -6,13 +6,11 @@ import time
 import pytest
 
 from experiments.studies import trials
-from experiments.studies.runs import Planned
-from experiments.studies.study import Study, Variant
-from experiments.studies.trials import _Run, numbered_settings, run_trials
+from experiments.studies.study import Study
+from experiments.studies.trials import _Run, numbered_settings
 from skin.config import fingerprint
 from skin.errors import InputError
 from skin.pretrained import find_pretrained
-from skin.stored_run import MissingWeightsError
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -95,44 +93,3 @@ def test_a_trial_of_an_earlier_training_is_not_reused(measured):
     time.sleep(0.01)  # MLflow counts milliseconds
     again = measured()
     assert [again(), again()] == [2, 2]
-
-
-@pytest.fixture
-def imported(configured, tmp_path, monkeypatch):
-    """Return a function that yields the trials of a run without weights on two devices, one of them known."""
-    config = configured("experiment=rules", f"tracking.uri=sqlite:///{tmp_path}/m.db")
-    store = Store.open(config.tracking)
-    with store.run("rules", {"fingerprint": "a" * 16}) as run:
-        pass
-    run, said = store.client.get_run(run.info.run_id), {"outcome": "known"}
-
-    def measured(self, study, base, line):
-        if "device.dead=1" in line:
-            raise MissingWeightsError("no weights")
-        with store.run("trial", said) as trial:
-            pass
-        return store.client.get_run(trial.info.run_id)
-
-    monkeypatch.setattr(_Run, "measured", measured)
-    monkeypatch.setattr(trials, "passed_overrides", list)
-
-    def of(rows, **conditions):
-        asked = study(rows=rows, conditions=conditions)
-        return run_trials(store, Planned(Variant("rules", {}, {}), "0", run), asked, config, tmp_path)
-
-    return of
-
-
-def test_an_imported_run_without_all_results_is_left_out_of_all_rows(imported, capsys):
-    """No part of it, so that a row has the same runs under all conditions."""
-    assert not list(imported("all", known={}, unknown={"device.dead": 1}))
-    assert capsys.readouterr().err == "left out: no weights\n"
-
-
-def test_an_imported_run_with_all_results_is_not_left_out(imported):
-    assert [(one.condition, one.line) for one in imported("all", known={})] == [("known", "known")]
-
-
-def test_an_imported_run_of_a_named_row_has_to_be_trained(imported):
-    with pytest.raises(MissingWeightsError):
-        list(imported(["rules"], known={}, unknown={"device.dead": 1}))

@@ -90,7 +90,7 @@ reproduce-table: $(READY)  ## train the models of the results table and print it
 		$(if $(SIMULATORS),'table.simulators=[$(SIMULATORS)]')
 
 # The smoke budget leaves peers out where their environment is missing.
-results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$(PART)),$(PEERS)/.ready))  ## publish all results in 30 h: PART=table 9.3 h, peers 1.2 h, shifts 3 h, sensors 4.1 h, any_skin 3.6 h, adapt 2.5 h, studies 6.3 h, design 0.17 h; not of all: tracking 0.5 h, images 7.5 h (JOBS=2, FRESH=1, BUDGET=smoke)
+results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$(PART)),$(PEERS)/.ready))  ## publish all results in 25 h: PART=table 9.3 h, peers 1.2 h, shifts 2.85 h, sensors 2.2 h, any_skin 3.45 h, studies 5.9 h, design 0.17 h; not of all: images 7.5 h (JOBS=2, FRESH=1, BUDGET=smoke)
 	$(BIN)/skin results results.part=$(PART) results.budget=$(BUDGET) $(if $(FRESH),results.fresh=true) $(if $(JOBS),results.jobs=$(JOBS))
 
 wheel-check: $(READY)  ## install the wheel in an empty environment; train and evaluate a small model and run the demo there

@@ -3,4 +3,4 @@
 import sys
 
 if __name__ == "__main__":
-    sys.exit("experiments/moving.py is now: skin study study=misplaced, study=motion or study=tracking")
+    sys.exit("experiments/moving.py is now: skin study study=misplaced")

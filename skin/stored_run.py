@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from hydra.errors import InstantiationException
 from mlflow.artifacts import download_artifacts
@@ -91,11 +92,19 @@ def load_configuration(store: Store, run: Run, trust: bool = False) -> DictConfi
     if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
         raise InputError(f"run {run.info.run_id} has no readable config.yaml: it holds no settings")
     with described(run):
-        stored = in_seconds(stored)
+        stored = _without_tracking(in_seconds(stored))
     if not trust:
         check_targets(stored, f"config.yaml of run {run.info.run_id}")
     # Older runs list the settings of all commands of their time, unset.
     return OmegaConf.create({key: value for key, value in stored.items() if value is not None})
+
+
+def _without_tracking(stored: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration without ``device.track=none``, which runs had while sensors could move."""
+    device = stored.get("device")
+    if not isinstance(device, dict) or device.get("track") != "none":
+        return stored
+    return stored | {"device": {name: value for name, value in device.items() if name != "track"}}
 
 
 @contextmanager

@@ -3,10 +3,9 @@
 They import heavy packages when called, so that errors in their settings are reported early.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from annotated_types import Ge, Gt
 
@@ -195,25 +194,6 @@ class TouchAlarms:
         return Measurement(metrics, Page("\n".join(lines), {}, []))
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Displacements of sensors under touches, and how well readings predict them; needs no run.
-
-    Args:
-        gestures: number of test gestures.
-    """
-
-    gestures: Annotated[int, Ge(1)] = 1000
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.motion import motion_change
-        from experiments.studies.tables import Page
-
-        device = subject.device.simulated("how sensors move is known in simulation only")
-        found = motion_change(device, self.gestures)
-        return Measurement({}, Page(f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"))
-
-
 class Embeddings(ProbeSettings):
     """Accuracy of an SVM on graph embeddings, readings, and the encoder of a run, if one is given."""
 
@@ -232,39 +212,3 @@ class Embeddings(ProbeSettings):
         found = list(track(steps, "probing", count, console=Console(stderr=True)))
         names = device.task.names
         return Measurement({}, build_embeddings_page(found, names))
-
-
-@dataclass(frozen=True)
-class UnseenSkins:
-    """Accuracy on each of the skins that ``device=skins`` tests on.
-
-    Args:
-        gestures: number of touches on each.
-    """
-
-    gestures: Annotated[int, Ge(1)] = 1000
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.unseen_skins import measure_unseen_skins
-
-        return measure_unseen_skins(subject, self.gestures)
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """Accuracy after fine-tuning on the gestures of a device, beside rows that are trained on them.
-
-    Args:
-        rows: names of experiments.
-        epochs: of their trainings; None: those of the experiments.
-        adapt: settings of the fine-tuning that differ from ``conf/adapt.yaml``.
-    """
-
-    rows: Sequence[str] = ("features", "best")
-    epochs: Annotated[int, Ge(1)] | None = None
-    adapt: Mapping[str, Any] = field(default_factory=dict)
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.adaptation_curve import measure_adaptation
-
-        return measure_adaptation(subject, self.rows, self.epochs, self.adapt)

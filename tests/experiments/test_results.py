@@ -23,7 +23,6 @@ PARTS = [
     "results.parts.peers=[]",
     "results.parts.sensors=[]",
     "results.parts.any_skin=[]",
-    "results.parts.adapt=[]",
     "results.parts.design=[]",
     "results.file=runs.parquet",
     "out=docs",
@@ -95,8 +94,8 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     [
         (
             ["results.part=tables"],
-            "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, adapt, studies, "
-            "design, tracking, images",
+            "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, studies, "
+            "design, images",
         ),
         (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
         (["results.optional=[image]"], "results.optional=['image']: there is no part image"),

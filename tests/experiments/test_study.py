@@ -213,18 +213,6 @@ def test_a_run_is_probed_beside_graph_embeddings(run, trained):
 
 
 @pytest.mark.slow
-def test_a_skin_itself_is_measured(run, tmp_path):
-    words = ["study=motion", "study.measure.gestures=40", "out=r"]
-    done = run(tmp_path, "study", *words)
-    assert done.returncode == 0, done.stderr
-    assert "below 1 %, no effect possible" in done.stdout
-    assert "mm into the skin" in (tmp_path / "r" / "study_motion.md").read_text()
-    done = run(tmp_path, "study", *words, "simulator=naive")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert "constraint" in done.stderr
-
-
-@pytest.mark.slow
 def test_every_simulator_against_every_other(run, tmp_path):
     skin = ["body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100",
             "touch.small_area=[0.1,0.3]", "study.rows=[rules]", "study.seeds=[0]", "out=r"]  # fmt: skip

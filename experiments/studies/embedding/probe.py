@@ -120,7 +120,7 @@ def _graph_vectors(
     GL2Vec gives half its width to the graph and half to its line graph.
     """
     if any(touches.positions.ndim > 2 for touches in sets):
-        raise InputError("graph embeddings need sensors that stay in place: set device.track=none")
+        raise InputError("graph embeddings need sensors that stay in place, these have one layout per touch")
     frames = [strongest(touches) for touches in sets]
     places = [touches.positions.double().numpy() for touches in sets]
     edges, count, weight = (settings.graph[name] for name in ("edges", "count", "weight"))

@@ -3,4 +3,4 @@
 import sys
 
 if __name__ == "__main__":
-    sys.exit("experiments/moving.py is now: skin study study=misplaced")
+    sys.exit("experiments/moving.py is now: skin study study=robustness study.part=misplaced")

@@ -1,6 +1,8 @@
-"""Replaced by `skin study study=pair`; the next release removes this file."""
+"""Replaced by `skin study study=table`; the next release removes this file."""
 
 import sys
 
 if __name__ == "__main__":
-    sys.exit("experiments/paired.py is now: skin study study=pair study.rows=[sequence_image,temporal_image]")
+    sys.exit(
+        "experiments/paired.py is now: skin study study=table study.rows=[...] study.differences=greater"
+    )

@@ -12,7 +12,7 @@ from skin.cli import main, verbs
 from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
-OTHERS = ["bench", "results", "study", "table", "validate"]
+OTHERS = ["bench", "results", "study", "validate"]
 NEW = ["adapt", "demo", "design", "export", "publish"]  # never were scripts
 MOVED = ["animate", "calibrate", "compare", "emulate", "listen"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}

@@ -1,16 +1,18 @@
-"""The figure of a study."""
+"""The figure of a study, and those of measures of single runs."""
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.studies.outcomes import UNITS, group_trials, heading, mean_and_margin
 from experiments.studies.study import Study
 from experiments.studies.trials import Trial
-from skin.plot.figures import COLOURS
+from skin.plot.figures import COLOURS, MARKS
 
 _NUMBERED = re.compile(r"(.+) (\d+)")
 _MARKERS = "osD^v<>pP*"
@@ -108,3 +110,46 @@ def _panel(axis: Axes, lines: dict[tuple[str, str], list[tuple[int, float, float
 def _label(metric: str) -> str:
     unit = UNITS.get(metric, "%")
     return f"{heading(metric)}{f', {unit}' if unit else ''}"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines with the same axes.
+
+    Attributes:
+        across: label of the axis across.
+        up: label of the axis up.
+        lines: name -> rows of x and y, and of the ends of their intervals where there are some, (2 or 4, N).
+        ticks: labels of x = 0, 1, ...; none: numbers on a logarithmic axis.
+        limits: of x.
+    """
+
+    across: str
+    up: str
+    lines: Mapping[str, np.ndarray]
+    ticks: Sequence[str] = ()
+    limits: tuple[float, float] | None = None
+
+
+def draw_panels(title: str, panels: Sequence[Panel]) -> Figure:
+    """Draw panels side by side, under a title."""
+    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    figure.suptitle(title, fontsize=10)
+    for panel, axis in zip(panels, figure.subplots(ncols=len(panels), squeeze=False)[0], strict=True):
+        for (name, line), colour, marker in zip(panel.lines.items(), COLOURS, MARKS, strict=False):
+            if not len(line):
+                continue
+            x, y, *ends = line
+            spread = (y - ends[0], ends[1] - y) if ends else None
+            axis.errorbar(x, y, spread, label=name, color=colour, marker=marker, ms=4, lw=1, capsize=2)
+        if panel.ticks:
+            axis.set_xticks(range(len(panel.ticks)), panel.ticks, fontsize=7)
+        else:
+            axis.axvline(1, color="black", lw=0.8, ls=":")
+            axis.set_xscale("log")
+        axis.set_xlim(panel.limits)
+        axis.set_ylim(bottom=0)
+        axis.set_xlabel(panel.across)
+        axis.set_ylabel(panel.up)
+        axis.legend(fontsize=8)
+    return figure

@@ -4,9 +4,9 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.studies.outcomes import UNITS, group_trials, heading, mean_and_margin
@@ -16,7 +16,6 @@ from skin.plot.figures import COLOURS, MARKS
 
 _NUMBERED = re.compile(r"(.+) (\d+)")
 _MARKERS = "osD^v<>pP*"
-_STYLES = ("-", "--", ":", "-.")
 
 
 def study_figure(study: Study, trials: Sequence[Trial]) -> Figure:
@@ -66,45 +65,23 @@ def _lines(study: Study, trials: Sequence[Trial]) -> Figure:
 
     Names of several words before the number, as "arm grid 9", get a panel for each beginning.
     """
-    metric, found = study.metrics[0], group_trials(trials)
-    single = len({variant for variant, _ in found}) == 1
-    every: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
-    for (variant, condition), each in found.items():
+    metric, groups = study.metrics[0], group_trials(trials)
+    single = len({variant for variant, _ in groups}) == 1
+    points: dict[tuple[str, str], list[tuple[float, ...]]] = defaultdict(list)
+    for (variant, condition), group in groups.items():
         numbered = _NUMBERED.fullmatch(condition if single else variant)
-        if numbered and any(metric in one.metrics for one in each):
-            key = numbered[1], "" if single else condition
-            mean, _, margin = mean_and_margin(each, metric)
-            every[key].append((int(numbered[2]), mean, margin))
-    lines = {key: points for key, points in every.items() if len(points) > 1}
-    panels = list(dict.fromkeys(name.rpartition(" ")[0] for name, _ in lines)) or [""]
-    drawn = Figure(figsize=(7 if len(panels) == 1 else 4 * len(panels), 4.5), layout="constrained")
-    for panel, axis in zip(panels, drawn.subplots(ncols=len(panels), squeeze=False)[0], strict=True):
-        named = {(name.rpartition(" "), condition): points for (name, condition), points in lines.items()}
-        _panel(axis, {(parts[2], key): points for (parts, key), points in named.items() if parts[0] == panel})
-        axis.set_title(panel, fontsize=9)
-        axis.set_xlabel(study.axis or "")
-    drawn.axes[0].set_ylabel(f"{_label(metric)}: mean and 95 % interval")
-    drawn.suptitle(study.about, fontsize=9, wrap=True)
-    return drawn
-
-
-def _panel(axis: Axes, lines: dict[tuple[str, str], list[tuple[int, float, float]]]) -> None:
-    """Draw a line per name and condition; the name gives colour and marker, the condition the style."""
-    names, conditions = (list(dict.fromkeys(key[part] for key in lines)) for part in (0, 1))
-    for (name, condition), points in lines.items():
-        x, y, margins = zip(*sorted(points), strict=True)
-        number, label = names.index(name), ", ".join(filter(None, (name, condition)))
-        axis.errorbar(
-            x, y, yerr=margins, label=label, ms=4, capsize=2, lw=1.2,
-            color=COLOURS[number % len(COLOURS)], marker=_MARKERS[number % len(_MARKERS)],
-            linestyle=_STYLES[conditions.index(condition) % len(_STYLES)],
-        )  # fmt: skip
-    numbers = sorted({x for points in lines.values() for x, *_ in points})
-    axis.set_xscale("log")
-    axis.set_xticks(numbers, [str(x) for x in numbers], fontsize=7)
-    axis.set_xticks([], minor=True)
-    axis.legend(fontsize=8)
-    axis.grid(alpha=0.3)
+        if numbered and any(metric in trial.metrics for trial in group):
+            panel, _, name = numbered[1].rpartition(" ")
+            mean, _, margin = mean_and_margin(group, metric)
+            label = ", ".join(filter(None, (name, "" if single else condition)))
+            points[panel, label].append((int(numbered[2]), mean, mean - margin, mean + margin))
+    lines = {key: np.array(sorted(line)).T for key, line in points.items() if len(line) > 1}
+    up = f"{_label(metric)}: mean and 95 % interval"
+    panels = [
+        Panel(study.axis or "", up, {name: line for (at, name), line in lines.items() if at == panel}, panel)
+        for panel in dict.fromkeys(panel for panel, _ in lines)
+    ]
+    return draw_panels(study.about, panels or [Panel(study.axis or "", up, {})])
 
 
 def _label(metric: str) -> str:
@@ -120,36 +97,39 @@ class Panel:
         across: label of the axis across.
         up: label of the axis up.
         lines: name -> rows of x and y, and of the ends of their intervals where there are some, (2 or 4, N).
-        ticks: labels of x = 0, 1, ...; none: numbers on a logarithmic axis.
-        limits: of x.
+        title: of the panel.
+        ticks: labels of x = 0, 1, ...; none: x is a number on a logarithmic axis.
+        limits: of x, a ratio to a threshold.
     """
 
     across: str
     up: str
     lines: Mapping[str, np.ndarray]
+    title: str = ""
     ticks: Sequence[str] = ()
     limits: tuple[float, float] | None = None
 
 
 def draw_panels(title: str, panels: Sequence[Panel]) -> Figure:
     """Draw panels side by side, under a title."""
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    figure.suptitle(title, fontsize=10)
+    figure = Figure(figsize=(max(7, 4.5 * len(panels)), 4), layout="constrained")
+    figure.suptitle(title, fontsize=9, wrap=True)
     for panel, axis in zip(panels, figure.subplots(ncols=len(panels), squeeze=False)[0], strict=True):
-        for (name, line), colour, marker in zip(panel.lines.items(), COLOURS, MARKS, strict=False):
-            if not len(line):
-                continue
+        lines = {name: line for name, line in panel.lines.items() if len(line)}
+        for (name, line), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(MARKS), strict=False):
             x, y, *ends = line
             spread = (y - ends[0], ends[1] - y) if ends else None
             axis.errorbar(x, y, spread, label=name, color=colour, marker=marker, ms=4, lw=1, capsize=2)
         if panel.ticks:
             axis.set_xticks(range(len(panel.ticks)), panel.ticks, fontsize=7)
+            axis.set_ylim(bottom=0)
         else:
-            axis.axvline(1, color="black", lw=0.8, ls=":")
+            numbers = sorted({x for line in lines.values() for x in line[0]})
+            numbers = [0.5, 0.8, 1, 1.25, 2] if panel.limits else numbers
             axis.set_xscale("log")
-        axis.set_xlim(panel.limits)
-        axis.set_ylim(bottom=0)
-        axis.set_xlabel(panel.across)
-        axis.set_ylabel(panel.up)
+            axis.set_xticks(numbers, [f"{number:g}" for number in numbers], fontsize=7)
+            axis.set_xticks([], minor=True)
+        axis.set(title=panel.title, xlabel=panel.across, ylabel=panel.up, xlim=panel.limits)
+        axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
     return figure

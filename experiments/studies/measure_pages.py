@@ -101,7 +101,7 @@ def _margins_figure(report: MarginReport, title: str) -> Figure:
         title,
         [
             Panel(label, "touches called so, %, with 95 %", said, limits=(0.4, 2.5)),
-            Panel("highest reading above idle, N; touches", "wrong, %", wrong, ticks),
+            Panel("highest reading above idle, N; touches", "wrong, %", wrong, ticks=ticks),
         ],
     )
 
@@ -233,9 +233,14 @@ def _streams_figure(report: WindowReport, title: str) -> Figure:
                 "share of the touch in the window, number of windows",
                 "accuracy, %",
                 shares,
-                [f"{part.name}\n{part.count}" for part in bins],
+                ticks=[f"{part.name}\n{part.count}" for part in bins],
             ),
-            Panel(f"{_idle_hours(report):.2f} h without touch", "false alarms per hour, 95 %", heard, gates),
+            Panel(
+                f"{_idle_hours(report):.2f} h without touch",
+                "false alarms per hour, 95 %",
+                heard,
+                ticks=gates,
+            ),
         ],
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from experiments.studies.comparison import paired
+from experiments.studies.runs import row_and_simulator
 from experiments.studies.tables import csv_text
 from experiments.studies.trials import Trial
 from skin.build import build_device
@@ -35,13 +36,13 @@ def draw_report(trials: Sequence[Trial], folder: Path) -> list[Path]:
     paths, skins = list[Path](), dict[str, AbstractSimulated]()
     codes: dict[str, dict[str, list[np.ndarray]]] = {}
     for trial in trials:
-        chosen = trial.variant.chosen
+        row, simulator = row_and_simulator(trial.variant)
         if trial.outcomes is not None:
-            rows = codes.setdefault(chosen["simulator"], {})
-            rows.setdefault(chosen.get("experiment", "vote"), []).append(trial.outcomes)
+            rows = codes.setdefault(simulator, {})
+            rows.setdefault(row or "vote", []).append(trial.outcomes)
         for config in trial.variant.configs.values():
-            if chosen["simulator"] not in skins:
-                skins[chosen["simulator"]] = build_device(config).simulated(_SIMULATED)
+            if simulator not in skins:
+                skins[simulator] = build_device(config).simulated(_SIMULATED)
     for simulator, outcomes in codes.items():
         skin = skins[simulator]
         speeds = skin.recording("test", complete=False).parameters["speed"].numpy() * skin.model_rate

@@ -98,6 +98,15 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     return [newest[key] for key in sorted(newest)]
 
 
+def row_and_simulator(variant: Variant) -> tuple[str, str]:
+    """Return the names of row and simulator of a variant; empty where they are not known."""
+    for config in variant.configs.values():
+        return str(config.row), simulator(config)
+    return variant.chosen.get("row", variant.chosen.get("experiment", "")), variant.chosen.get(
+        "simulator", ""
+    )
+
+
 def newest_finished(store: Store, config: DictConfig) -> Run | None:
     """Return the newest finished run of a configuration."""
     found = store.find("FINISHED", fingerprint=fingerprint(config))

@@ -22,6 +22,7 @@ from experiments.studies.outcomes import (
     mean_and_margin,
     values,
 )
+from experiments.studies.runs import row_and_simulator
 from experiments.studies.study import Study
 from experiments.studies.tables import Page, csv_text, print_table, publish_page
 from experiments.studies.trials import Trial
@@ -199,9 +200,7 @@ def _identity(trial: Trial, names: Sequence[str]) -> list[str]:
 def _referred(trial: Trial, metric: str, reference: Reference) -> float | None:
     """Return the value of the reference for a metric of a trial; None: it has none."""
     label = metric.removeprefix("same/").removesuffix("/accuracy")
-    return reference.get(
-        (trial.variant.chosen.get("experiment", ""), trial.variant.chosen.get("simulator", ""), label)
-    )
+    return reference.get((*row_and_simulator(trial.variant), label))
 
 
 def _cell(trials: Sequence[Trial], metric: str, reference: Reference | None = None) -> str:

@@ -23,7 +23,7 @@ from mlflow.entities import Run
 from omegaconf import DictConfig
 
 from experiments.studies.measures import Accuracy, Finished, Measure, Subject
-from experiments.studies.runs import Planned, load_outcomes
+from experiments.studies.runs import Planned, load_outcomes, row_and_simulator
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
 from experiments.studies.tables import publish_page
 from skin.build import build_device
@@ -253,10 +253,11 @@ def votes(study: Study, trials: Sequence[Trial]) -> Iterator[Trial]:
     """
     groups: dict[tuple[tuple[tuple[str, str], ...], str], list[Trial]] = {}
     for trial in trials:
-        chosen = trial.variant.chosen
-        others = tuple((key, value) for key, value in chosen.items() if key != "experiment")
-        if trial.outcomes is not None and (study.vote == "all" or chosen.get("experiment") in study.vote):
-            groups.setdefault((others, trial.seed), []).append(trial)
+        row, simulator = row_and_simulator(trial.variant)
+        others = {**trial.variant.chosen, "simulator": simulator}
+        settings = tuple(item for item in others.items() if item[0] not in ("experiment", "row"))
+        if trial.outcomes is not None and (study.vote == "all" or row in study.vote):
+            groups.setdefault((settings, trial.seed), []).append(trial)
     several = len({settings for settings, _ in groups}) > 1
     for (settings, seed), members in groups.items():
         codes = [trial.outcomes for trial in members if trial.outcomes is not None]

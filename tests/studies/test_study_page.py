@@ -210,7 +210,7 @@ def test_files_of_several_runs_become_one(tmp_path, capsys):
 
 
 def reported(name, accuracy, simulator="fem", **more):
-    chosen = {"experiment": name, "simulator": simulator}
+    chosen = {"row": name, "simulator": simulator}
     return replace(trial(name, "0", accuracy), variant=Variant(name, chosen, {}), **more)
 
 

@@ -19,7 +19,7 @@ TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist load
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
 NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/calibration hardware/record layout learner model \
-	representation signal simulator studies/embedding test_classifier.py test_labels.py test_material.py touch \
+	representation signal simulator studies/test_embeddings.py studies/test_embedding_probe.py test_classifier.py test_labels.py test_material.py touch \
 	validation wire/test_segmentation.py wire/test_tare.py)
 
 # Hundreds of tests start a command of this project; without bytecode each of them would compile the modules again.
@@ -86,11 +86,11 @@ ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 
 reproduce-table: $(READY)  ## train the models of the results table and print it (BUDGET=smoke, SEEDS=3, SIMULATORS=naive,fem,solid)
-	$(BIN)/skin table table.budget=$(BUDGET) table.seeds=$(SEEDS) \
-		$(if $(SIMULATORS),'table.simulators=[$(SIMULATORS)]')
+	$(BIN)/skin study study=table 'study.seeds=[$(shell seq -s , 0 $$(($(SEEDS) - 1)))]' \
+		$(if $(filter smoke,$(BUDGET)),smoke=true) $(if $(SIMULATORS),'study.trainings.0.simulator=[$(SIMULATORS)]')
 
 # The smoke budget leaves peers out where their environment is missing.
-results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$(PART)),$(PEERS)/.ready))  ## publish all results in 30 h: PART=table 9.3 h, peers 1.2 h, shifts 3 h, sensors 4.1 h, any_skin 3.6 h, adapt 2.5 h, studies 6.3 h, design 0.17 h; not of all: tracking 0.5 h, images 7.5 h (JOBS=2, FRESH=1, BUDGET=smoke)
+results: $(READY) $(if $(filter full,$(BUDGET)),$(if $(filter all peers design,$(PART)),$(PEERS)/.ready))  ## publish all results in 7.92 h: PART=best_fresh 2.1 h, table 1.9 h, peers 0.25 h, shifts 0.95 h, sensors 0.4 h, any_skin 0.7 h, studies 1.45 h, design 0.17 h; not of all: weights 1.1 h, graphs 1.9 h, other_skins 0.7 h, image_head 0.9 h, image_size 1.2 h, image_representation 2.4 h (JOBS=2, FRESH=1, BUDGET=smoke)
 	$(BIN)/skin results results.part=$(PART) results.budget=$(BUDGET) $(if $(FRESH),results.fresh=true) $(if $(JOBS),results.jobs=$(JOBS))
 
 wheel-check: $(READY)  ## install the wheel in an empty environment; train and evaluate a small model and run the demo there

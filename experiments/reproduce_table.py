@@ -1,8 +1,8 @@
-"""Short for `skin table`."""
+"""Short for `skin study study=table`."""
 
 import sys
 
 from skin.cli import main
 
 if __name__ == "__main__":
-    main(["table", *sys.argv[1:]])
+    main(["study", "study=table", *sys.argv[1:]])

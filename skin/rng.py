@@ -18,7 +18,6 @@ class Stream(IntEnum):
     NOISE = 6
     POSITION = 7
     MODULUS = 8
-    TRACKING = 9
     ALARM = 10
     PLACEMENT = 11
     SKIN = 12

@@ -19,7 +19,7 @@ import logging
 import platform
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -338,12 +338,16 @@ def note_reuse(run: Run) -> None:
     At exit, one warning counts the runs of other code: of another commit, or with files that differ from the
     commit then or now. Runs that began after this process do not count.
     """
-    code, tags = source_tags(), run.data.tags
+    if run.info.start_time < 1000 * psutil.Process().create_time():
+        note_source(run.info.run_id, run.info.run_name, run.data.tags)
+
+
+def note_source(identity: str, name: str, tags: Mapping[str, str]) -> None:
+    """Note that this command uses an earlier result with some tags (:func:`source_tags`)."""
+    code = source_tags()
     same = tags.get("source_commit") == code["source_commit"]
-    clean = "true" not in (tags.get("source_dirty"), code["source_dirty"])
-    if (same and clean) or run.info.start_time >= 1000 * psutil.Process().create_time():
-        return
-    _reused.setdefault(run.info.run_id, run.info.run_name)
+    if not same or "true" in (tags.get("source_dirty"), code["source_dirty"]):
+        _reused.setdefault(identity, name)
 
 
 @atexit.register

@@ -12,7 +12,7 @@ from skin.cli import main, verbs
 from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
-OTHERS = ["results", "study", "table"]
+OTHERS = ["results", "study"]
 SCRIPTS = ["evaluate", "generate", "live", "record", "train"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 

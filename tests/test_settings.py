@@ -142,7 +142,6 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["device.clip=0"], "device.clip=0 must be greater than 0"),
         (["device.stuck=0.5"], "device.stuck=0.5 must be a valid integer"),
         (["device.dead=[4,2]"], "device.dead must be a number from 0 up or a range"),
-        (["device.track=camera"], "device.track=camera must be 'none', 'oracle' or 'estimated'"),
         (
             ["+device.noize=1"],
             "device has no setting noize: did you mean noise[?] it has .*gain_spread, offset",

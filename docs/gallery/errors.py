@@ -3,8 +3,8 @@ Which touches are misclassified
 ===============================
 
 Figures 7 and 8 of the report: wrong labels by the speed of the slide, and the confusion matrix of dangerous
-and safe touches. ``skin table`` draws them from the trainings of the results table. This page trains one
-small model instead, so its errors are not those of the table.
+and safe touches. ``skin study study=table`` draws them from the trainings of the results table. This page
+trains one small model instead, so its errors are not those of the table.
 """
 
 from contextlib import chdir

@@ -8,20 +8,65 @@ An overview of one touch, and figures 2, 3, 4, 10 and 11 of the report, drawn fr
 from pathlib import Path
 from tempfile import mkdtemp
 
+import numpy as np
+import torch
 from hydra import compose, initialize_config_dir
 
 from experiments.studies.report_figures import draw_skin
 from skin.build import build_device
 from skin.paths import CONF
+from skin.plot import figures
+from skin.plot.surface import deflection, surface
+from skin.representation.fourier import Fourier
+from skin.representation.image import Image
+from skin.representation.interp import Interpolation
 
 with initialize_config_dir(str(CONF), version_base="1.3"):
     config = compose("train", ["simulator=fem", "device.test_gestures=160"])
 device = build_device(config).simulated("the figures of the report are of a simulated skin")
+folder, size = Path(mkdtemp()), device.size
+
+
+def press(labels):
+    """Return 64 gestures with given labels, and which of them is a hand's."""
+    movie = device.sampler.sample(64, np.random.default_rng(0), np.tile(labels, (64, 1)))
+    hand = movie.parameters["shape"] == device.sampler.shapes.names.index("hand")
+    return movie, int(hand.int().argmax())
+
 
 # %%
-# In order: the pressure of a hand with the readings of the sensors; the displacement of the surface (figure
-# 2) and of the interface below the top layer (figure 3); the frame with the largest readings in each
-# representation (figure 4); the same touch on two simulators (figure 10); force and reading of four presses
-# (figure 11).
+# The pressure of a sliding hand with the readings of the sensors, and the frame with the largest readings in
+# each representation (figure 4).
 
-paths = draw_skin(device, Path(mkdtemp()))
+movie, hand = press([True] * 4)
+readings = device.model.respond(movie).readings[hand]
+strongest = int(readings.sum(1).argmax())
+positions = torch.from_numpy(device.sensors.positions).float()
+makers = {"image": Image(positions, size), "fourier": Fourier(positions, size)} | {
+    method: Interpolation(positions, size, method=method) for method in ("nearest", "linear", "cubic")
+}
+frame = readings[None, strongest : strongest + 1]
+pictures = {name: make(frame, torch.ones_like(frame) > 0).x[0, 0, 0] for name, make in makers.items()}
+pressure, layout = movie.pressure()[hand, strongest], device.sensors.positions
+overview = figures.overview(
+    pressure, pictures["cubic"], readings, strongest, layout, (size, device.model_rate)
+)
+figures.save_figure(overview, folder / "overview.png")
+figures.save_figure(figures.images(pictures, layout, size), folder / "figure04_interpolations.png")
+
+# %%
+# The displacement of the surface under a resting hand (figure 2) and of the interface below the top layer
+# (figure 3).
+
+movie, hand = press([True, False, True, False])
+index = movie.index[hand, int(movie.scale[hand].argmax())]
+moved = deflection(device.body, movie.frames[index : index + 1])[0]
+for level, name in ((-1, "figure02_hand_top"), (-2, "figure03_hand_bottom")):
+    depth = device.body.interfaces[level]
+    drawn = surface(moved[level], depth, size, f"finite elements, hand, {1e3 * depth:g} mm below the surface")
+    figures.save_figure(drawn, folder / f"{name}.png")
+
+# %%
+# The same touch on two simulators (figure 10); force and reading of four presses (figure 11).
+
+paths = draw_skin(device, folder)

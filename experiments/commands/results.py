@@ -138,11 +138,13 @@ def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[st
             words += [f"tracking.{name}={value}" for name, value in _FRESH.items() if chosen.fresh]
         if chosen.jobs > 1 and verb == "train":
             words += ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={chosen.jobs}"]
+        if chosen.jobs > 1 and verb == "study":
+            words += [f"study.jobs={chosen.jobs}"]
         folder = _folder(chosen, config)
         if verb == "design":  # has no runs, and takes no settings of trainings
             yield step.hours, [verb, *_within(folder, words)]
             continue
-        words += [f"out={folder}"] if verb in ("table", "study") else []
+        words += [f"out={folder}"] if verb == "study" else []
         yield step.hours, [verb, *words, *given]
 
 

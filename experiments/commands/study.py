@@ -1,53 +1,65 @@
 """Compare variants of trainings, or finished runs under conditions; give verdicts on statements.
 
-    skin study study=norm
-    skin study -m study=norm,activation simulator=naive
-    skin study study=dead study.rows=[features,gru]
+    skin study study=table
+    skin study study=graphs study.part=norm
+    skin study -m study=graphs,late_early simulator=naive
+    skin study study=robustness study.part=dead study.rows=[features,gru]
     skin study study=margins study.run=latest
 
-A study is a file of conf/study. It trains the runs that are missing, with the budget in that file; rerun to
-resume. Writes study_<name>.md, .csv and .png into out=. A measure of single runs, such as margins, writes
-files for each, and of several runs study_<name>.csv with all values. study.rows=all leaves out runs that
-were imported without the results that it needs.
+A study is a file of conf/study; study.part=NAME chooses a comparison of a file with several. It trains the
+runs that are missing, with the budget in that file; rerun to resume. Writes study_<name>.md, .csv and .png
+into out=, with the name of the study or the part. A measure of single runs, such as margins, writes files for
+each, and of several runs study_<name>.csv with all values. Evaluations are kept in results/trials.
 """
 
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from experiments.studies.study import SMOKE, Study, as_overrides, passed_overrides
+from experiments.studies.study import Study, as_overrides, chosen_studies, passed_overrides
 from skin.command import command
 from skin.config import validate_config
 from skin.errors import InputError
 from skin.files import results
 
+if TYPE_CHECKING:
+    from experiments.studies.trials import Trial
+    from skin.tracking import Store
+
 
 @command("study")
 def main(config: DictConfig) -> None:
     """Train or find the runs of a study, measure them, and write and print the results."""
-    study = Study.of(config)
+    studies = chosen_studies(config)
     folder = results(config.out) / ("smoke" if config.smoke else "")
 
     from skin.console import quiet
 
     quiet()
-    if not study.trainings and study.rows is None and study.run is None:
-        if config.shard is not None:
-            raise InputError(f"study={study.name} has no runs to divide: leave out shard={config.shard}")
-        _measure_skin(study, folder)
-    else:
-        _compare(study, config, folder)
+    missing = False
+    for study in studies:
+        if not study.trainings and study.rows is None and study.run is None:
+            if config.shard is not None:
+                raise InputError(f"study={study.name} has no runs to divide: leave out shard={config.shard}")
+            _measure_skin(study, folder)
+        else:
+            missing |= _compare(study, config, folder)
+    if missing:
+        sys.exit(1)
 
 
-def _compare(study: Study, config: DictConfig, folder: Path) -> None:
-    """Measure the runs of a study; exit code 1 if one is missing."""
+def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
+    """Measure the runs of a study, publish the results, and return whether a run is missing."""
     from rich.console import Console
     from rich.progress import track
 
     from experiments.studies.runs import find_runs, train_study
-    from experiments.studies.study_page import publish_files, publish_study
-    from experiments.studies.trials import run_trials
+    from experiments.studies.trials import run_trials, votes
+    from skin.files import whole
     from skin.shard import Shard
     from skin.tracking import Store
 
@@ -58,34 +70,71 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> None:
         store = Store.open(config.tracking)
         planned = find_runs(study, config, store)
         if shard:
-            own = shard.part(one.run.data.tags["fingerprint"] for one in planned if one.run)
-            planned = [one for one in planned if one.run and one.run.data.tags["fingerprint"] in own]
-    found, console = [], Console(stderr=True)
-    shown = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
-    for trial in (trial for one in shown for trial in run_trials(store, one, study, config, folder)):
-        found.append(trial)
+            own = shard.part(run.run.data.tags["fingerprint"] for run in planned if run.run)
+            planned = [run for run in planned if run.run and run.run.data.tags["fingerprint"] in own]
+    trials, console = list["Trial"](), Console(stderr=True)
+    runs = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
+    for trial in (trial for run in runs for trial in run_trials(store, run, study, config)):
+        trials.append(trial)
+        for name, content in trial.files.items():
+            with whole(folder / name) as partial:
+                partial.write_bytes(content)
         if trial.line:
-            print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *trial.files, sep="\n", flush=True)
+            names = [folder / name for name in trial.files]
+            print(f"{trial.variant.name} ({trial.run[:8]}): {trial.line}", *names, sep="\n", flush=True)
     if shard:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
-    elif not found:
-        raise InputError(f"study={study.name} has nothing to publish: all its runs were left out")
-    elif study.metrics:
+    else:
+        _publish(study, [*trials, *votes(study, trials)], store, config, folder)
+    return any(run.run is None for run in planned)
+
+
+def _publish(
+    study: Study, trials: Sequence["Trial"], store: "Store", config: DictConfig, folder: Path
+) -> None:
+    """Write and print the results of a study, and log their summary."""
+    from experiments.studies.study_page import publish_files, publish_study
+
+    path = folder / f"study_{study.name}"
+    if not study.metrics:
+        paths = publish_files(study, trials, path.with_suffix(".csv"))
+    else:
         smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
-        title = smoke + ", ".join([f"{study.name}: {study.about}", *(SMOKE if smoke else ()), *settings])
-        publish_study(study, title, found, folder / f"study_{study.name}")
-    else:
-        publish_files(study, found, folder / f"study_{study.name}.csv")
-    if any(one.run is None for one in planned):
-        sys.exit(1)
+        small = study.small if smoke else ()
+        title = smoke + ", ".join([f"{study.name}: {study.about}", *small, *settings])
+        paths = publish_study(study, title, trials, path)
+        _log_summary(study, trials, store, paths)
+    if study.report_figures:
+        from experiments.studies.report_figures import draw_report
+
+        paths = draw_report(trials, folder)
+        print(f"{len(paths)} figures of the report in {folder}")
+
+
+def _log_summary(study: Study, trials: Sequence["Trial"], store: "Store", paths: Sequence[Path]) -> None:
+    """Log the means and the files of a study in its run in MLflow, the same one each time."""
+    from experiments.studies.outcomes import group_trials, values
+
+    earlier = store.find(study=study.name)
+    with store.run(f"study {study.name}", {"study": study.name}, again=next(iter(earlier), None)) as run:
+        means = {}
+        for (variant, condition), group in group_trials(trials).items():
+            for metric in study.metrics:
+                if figures := values(group, metric):
+                    # MLflow takes these characters only.
+                    name = re.sub(r"[^\w\-. :/]", "_", "/".join(filter(None, (variant, condition, metric))))
+                    means[name] = sum(figures.values()) / len(figures)
+        store.log_metrics(run, means)
+        for path in paths:
+            store.client.log_artifact(run.info.run_id, str(path))
 
 
 def _measure_skin(study: Study, folder: Path) -> None:
     """Apply the measure of a study without runs to the skin."""
     from hydra import compose
 
-    from experiments.studies.subject import Subject
+    from experiments.studies.measures import Subject
     from experiments.studies.tables import publish_page
     from skin.build import build_device
 
@@ -93,8 +142,5 @@ def _measure_skin(study: Study, folder: Path) -> None:
         raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")
     config = validate_config(compose("train", [*as_overrides(study.test), *passed_overrides()]))
     page = study.measure(Subject(config, build_device(config))).page
-    print(
-        page.about,
-        *publish_page(page, f"{study.name}: {study.about}", folder / f"study_{study.name}"),
-        sep="\n",
-    )
+    paths = publish_page(page, f"{study.name}: {study.about}", folder / f"study_{study.name}")
+    print(page.about, *paths, sep="\n")

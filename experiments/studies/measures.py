@@ -6,16 +6,116 @@ They import heavy packages when called, so that errors in their settings are rep
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, MinLen
 
-from experiments.studies.embedding.probe_settings import ProbeSettings
-from experiments.studies.subject import Measurement, Subject
 from skin.errors import InputError
 from skin.evaluation.stream_settings import StreamSettings
 
+if TYPE_CHECKING:
+    import numpy as np
+    from mlflow.entities import Run
+    from omegaconf import DictConfig
+
+    from experiments.studies.tables import Page
+    from skin.device.base import AbstractDevice
+    from skin.evaluation.operating_point import OperatingPoint
+    from skin.learner.base import AbstractLearner
+    from skin.tracking import Store
+    from skin.trained import Trained
+
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run.
+
+    Attributes:
+        store: where it is.
+        run: as MLflow has it.
+        stored: its configuration.
+        trained: what it learned, and the device that it was trained on.
+    """
+
+    store: "Store"
+    run: "Run"
+    stored: "DictConfig"
+    trained: "Trained"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The subject of a measure.
+
+    Attributes:
+        config: of the run, with the changes of the condition; that of the command without a run.
+        device: as ``config`` describes it.
+        finished: the run; None where a study has none.
+    """
+
+    config: "DictConfig"
+    device: "AbstractDevice"
+    finished: Finished | None = None
+
+    @property
+    def of(self) -> Finished:
+        """The run.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.finished is None:
+            raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
+        return self.finished
+
+    @property
+    def title(self) -> str:
+        """The name of the run, for pages and figures."""
+        run = self.of.run
+        # As in the published tables; the id of a run differs between databases.
+        return f"{run.info.run_name}, run {run.data.tags.get('fingerprint', run.info.run_id)[:8]}"
+
+    @property
+    def learner(self) -> "AbstractLearner":
+        """What the run learned."""
+        return self.of.trained.learner
+
+    def point(self) -> "OperatingPoint":
+        """Return where the run raises the alarm on this device."""
+        from skin.evaluation.operating_point import OperatingPoint
+        from skin.trained import choose_for_skin
+
+        drawn = "skins" in self.config.device
+        point = None if drawn else choose_for_skin(self.learner, self.of.stored, self.config)
+        return (
+            point or self.of.trained.point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
+        )
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The result of a measure.
+
+    Attributes:
+        metrics: name -> value; shares are of 1.
+        page: what is published; None where the metrics tell everything.
+        outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
+        cannot: why the learner does not accept the touches; empty where it does.
+    """
+
+    metrics: dict[str, float]
+    page: "Page | None" = None
+    outcomes: "np.ndarray | None" = None
+    cannot: str = ""
+
+
+class Measure(Protocol):
+    """A frozen dataclass of settings that measures."""
+
+    def __call__(self, subject: Subject) -> Measurement:
+        """Measure; InputError where the device or the learner cannot be measured so."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +166,11 @@ class Margins:
     gestures: Annotated[int, Ge(1)] = 20000
 
     def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.margins_page import build_margins_page
+        from experiments.studies.measure_pages import margins_page
         from skin.evaluation.margins import margins
 
         found = margins(subject.learner, subject.device, self.gestures, subject.point())
-        return Measurement(found.metrics, build_margins_page(found, subject.title))
+        return Measurement(found.metrics, margins_page(found, subject.title))
 
 
 class Streams(StreamSettings):
@@ -80,13 +180,13 @@ class Streams(StreamSettings):
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.streams_page import build_streams_page
+        from experiments.studies.measure_pages import streams_page
         from skin.evaluation.sliding_windows import evaluate_windows
 
         console = Console(stderr=True)
         shown = partial(track, description=subject.title, console=console, transient=True)
         found = evaluate_windows(subject.learner, subject.device, self, subject.point(), shown)
-        return Measurement(found.metrics(), build_streams_page(found, subject.title))
+        return Measurement(found.metrics(), streams_page(found, subject.title))
 
 
 @dataclass(frozen=True)
@@ -196,22 +296,19 @@ class TouchAlarms:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """Displacements of sensors under touches, and how well readings predict them; needs no run.
+class ProbeSettings:
+    """What is probed; ``conf/study/embeddings.yaml`` explains the fields."""
 
-    Args:
-        gestures: number of test gestures.
-    """
-
-    gestures: Annotated[int, Ge(1)] = 1000
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.motion import motion_change
-        from experiments.studies.tables import Page
-
-        device = subject.device.simulated("how sensors move is known in simulation only")
-        found = motion_change(device, self.gestures)
-        return Measurement({}, Page(f"Over {self.gestures} gestures {found.sentence}.\n\n{found.motion}"))
+    attributes: Annotated[Sequence[Literal["degree", "reading"]], MinLen(1)] = ("degree", "reading")
+    train: Annotated[int, Ge(20)] = 800
+    test: Annotated[int, Ge(10)] = 400
+    seeds: Annotated[Sequence[int], MinLen(1)] = (0, 1, 2)
+    layouts: Annotated[int, Ge(1)] = 3
+    levels: Annotated[int, Ge(2)] = 8
+    depth: Annotated[int, Ge(0)] = 2
+    width: Annotated[int, Ge(2)] = 128
+    epochs: Annotated[int, Ge(1)] = 50
+    graph: Mapping[str, Any] = field(default_factory=lambda: {"edges": "knn", "count": 6, "weight": "exp"})
 
 
 class Embeddings(ProbeSettings):
@@ -221,8 +318,8 @@ class Embeddings(ProbeSettings):
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.embedding.probe import probe
-        from experiments.studies.embedding_spaces import build_embeddings_page
+        from experiments.studies.embedding_page import build_embeddings_page
+        from experiments.studies.embeddings import probe
         from skin.class_balance import report_balance
 
         device, learner = subject.device, subject.learner if subject.finished else None
@@ -232,39 +329,3 @@ class Embeddings(ProbeSettings):
         found = list(track(steps, "probing", count, console=Console(stderr=True)))
         names = device.task.names
         return Measurement({}, build_embeddings_page(found, names))
-
-
-@dataclass(frozen=True)
-class UnseenSkins:
-    """Accuracy on each of the skins that ``device=skins`` tests on.
-
-    Args:
-        gestures: number of touches on each.
-    """
-
-    gestures: Annotated[int, Ge(1)] = 1000
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.unseen_skins import measure_unseen_skins
-
-        return measure_unseen_skins(subject, self.gestures)
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """Accuracy after fine-tuning on the gestures of a device, beside rows that are trained on them.
-
-    Args:
-        rows: names of experiments.
-        epochs: of their trainings; None: those of the experiments.
-        adapt: settings of the fine-tuning that differ from ``conf/adapt.yaml``.
-    """
-
-    rows: Sequence[str] = ("features", "best")
-    epochs: Annotated[int, Ge(1)] | None = None
-    adapt: Mapping[str, Any] = field(default_factory=dict)
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.adaptation_curve import measure_adaptation
-
-        return measure_adaptation(subject, self.rows, self.epochs, self.adapt)

@@ -22,6 +22,7 @@ from skin.evaluation.outcomes import decodable, decode
 from skin.labels import TOUCH
 
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
+"""Metrics that are no shares -> their unit."""
 
 _HEADINGS = {
     "same/dangerous/alarm_recall": "recall",
@@ -31,8 +32,9 @@ _HEADINGS = {
     "self_share": "self",
     "same/direction/degrees": "degrees",
     "same/direction/accuracy": "within 45°",
+    "device_shift/dangerous/alarm_recall": "its recall",
+    "device_shift/dangerous/false_alarm_rate": "its false alarms",
 }
-"""Metrics that are no shares -> their unit."""
 
 
 @dataclass(frozen=True)

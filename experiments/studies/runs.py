@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
@@ -16,10 +15,9 @@ from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
-from experiments.studies.row_ensembles import combine
-from experiments.studies.study import SMOKE, Study, Variant, as_overrides, passed_overrides, sweeps, variants
+from experiments.studies.study import Study, Variant, sweeps, variants
 from skin.commands import train
-from skin.config import PARENT, fingerprint, validate_config
+from skin.config import PARENT, fingerprint
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
 from skin.run import SWEPT, simulator
@@ -47,21 +45,22 @@ def train_study(study: Study, shard: Shard | None, smoke: bool = False) -> tuple
     """Train the missing runs of a study, or of a shard of it.
 
     Returns:
-        The store, and all runs of the study or the shard; only all runs together make ensembles.
+        The store, and all runs of the study or the shard.
     """
     every = variants(study, smoke)
     store = Store.open(next(iter(every[0].configs.values())).tracking)
     if shard:
-        own = shard.part(fingerprint(config) for one in every for config in one.configs.values())
-        every = [replace(one, configs=_those(one.configs, own)) for one in every]
-    if study.train and any(one.run is None for one in _look(store, every)):
-        for _, line in sweeps(study, smoke):
-            multirun([*line, f"+hydra.callbacks.sweep.runs={sorted(own)}"] if shard else line)
-    planned = _look(store, every)
-    return store, planned if shard else planned + _ensembles(study, store, planned, smoke)
+        own = shard.part(fingerprint(config) for variant in every for config in variant.configs.values())
+        every = [replace(variant, configs=_only(variant.configs, own)) for variant in every]
+    if study.train and any(run.run is None for run in _look(store, every) if run.variant.trained):
+        parallel = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={study.jobs}"] if study.jobs > 1 else []
+        for _, line in sweeps(study, study.trainings, smoke):
+            divided = [f"+hydra.callbacks.sweep.runs={sorted(own)}"] if shard else []
+            multirun([*line, *parallel, *divided])
+    return store, [run for run in _look(store, every) if run.run is not None or run.variant.trained]
 
 
-def _those(configs: Mapping[str, DictConfig], fingerprints: Collection[str]) -> dict[str, DictConfig]:
+def _only(configs: Mapping[str, DictConfig], fingerprints: Collection[str]) -> dict[str, DictConfig]:
     """Return the configurations with these fingerprints."""
     return {seed: config for seed, config in configs.items() if fingerprint(config) in fingerprints}
 
@@ -77,16 +76,17 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     if study.rows is None:
         assert study.run is not None
         run = find_run(store, study.run)
-        return [Planned(Variant(_name(run), {}, {}), run.data.tags.get("seed", ""), run)]
-    found: dict[tuple[str, str], Planned] = {}
+        row, seed = run.data.tags.get("row", ""), run.data.tags.get("seed", "")
+        return [Planned(Variant(_name(run), {"row": row}, {}), seed, run)]
+    newest: dict[tuple[str, str], Planned] = {}
     data = simulator(config)
     for run in store.find("FINISHED", simulator=data):
-        row = run.data.tags["row"]
-        wanted = study.rows == "all" or row in study.rows
-        if wanted and "learned" in run.data.tags and int(run.data.tags["seed"]) in study.seeds:
-            one = Planned(Variant(_name(run), {"row": row}, {}), run.data.tags["seed"], run)
-            found.setdefault((one.variant.name, one.seed), one)
-    rows = {one.variant.chosen["row"] for one in found.values()}
+        tags, name = run.data.tags, _name(run)
+        chosen = study.rows == "all" or tags["row"] in study.rows
+        if chosen and "learned" in tags and int(tags["seed"]) in study.seeds:
+            planned = Planned(Variant(name, {"row": tags["row"]}, {}), tags["seed"], run)
+            newest.setdefault((name, tags["seed"]), planned)
+    rows = {planned.variant.chosen["row"] for planned in newest.values()}
     missing = [] if study.rows == "all" else [row for row in study.rows if row not in rows]
     missing = missing or ([] if rows else ["features"])
     if missing:
@@ -94,7 +94,16 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
             f"no finished run of {', '.join(missing)} on {data} data in {store.uri}: "
             f"skin train experiment={missing[0]} simulator={data} makes one"
         )
-    return [found[key] for key in sorted(found)]
+    return [newest[key] for key in sorted(newest)]
+
+
+def row_and_simulator(variant: Variant) -> tuple[str, str]:
+    """Return the names of row and simulator of a variant; empty where they are not known."""
+    for config in variant.configs.values():
+        return str(config.row), simulator(config)
+    return variant.chosen.get("row", variant.chosen.get("experiment", "")), variant.chosen.get(
+        "simulator", ""
+    )
 
 
 def newest_finished(store: Store, config: DictConfig) -> Run | None:
@@ -111,7 +120,7 @@ def multirun(line: Sequence[str]) -> int:
     Failed runs are reported and skipped.
     """
     sources = HydraConfig.get().runtime.config_sources
-    folder = [one.path for one in sources if one.provider == "command-line"]  # of --config-dir
+    folder = [source.path for source in sources if source.provider == "command-line"]  # of --config-dir
     return run_command(train.main, ["-m", *(["--config-dir", *folder] if folder else []), *line])
 
 
@@ -149,7 +158,7 @@ def _another_command() -> Iterator[None]:
 
 def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
     """Return the outcomes of the test gestures of a run, (B,), uint8; None if it has none."""
-    if OUTCOMES not in artifact_names(store, run):
+    if OUTCOMES not in {file.path for file in store.client.list_artifacts(run.info.run_id)}:
         return None
     with TemporaryDirectory() as folder:
         path = download_artifacts(
@@ -159,37 +168,12 @@ def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
         return outcomes
 
 
-def artifact_names(store: Store, run: Run) -> set[str]:
-    """Return the names of the files and folders that were logged with a run."""
-    return {one.path for one in store.client.list_artifacts(run.info.run_id)}
-
-
 def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
     return [
         Planned(variant, seed, newest_finished(store, config))
         for variant in every
         for seed, config in variant.configs.items()
     ]
-
-
-def _ensembles(study: Study, store: Store, members: Sequence[Planned], smoke: bool) -> list[Planned]:
-    """Return the ensembles of the finished runs of each seed, in each way that the study names."""
-    suffix = "" if study.rows is None else "_of_" + "_".join(study.rows)
-    ways = {way: Variant(way, {"row": way}, {}) for way in study.ensembles}
-    planned = []
-    for seed in dict.fromkeys(one.seed for one in members) if ways else ():
-        for way, variant in ways.items():
-            line = [*as_overrides(study.common), *(SMOKE if smoke else ()), *passed_overrides()]
-            line += [f"seed={seed}", f"row={way}{suffix}"]
-            variant.configs[seed] = validate_config(compose("train", line))
-        present = {
-            one.variant.name: (one.variant.configs[seed], one.run)
-            for one in members
-            if one.seed == seed and one.run is not None
-        }
-        runs = combine(store, present, {way: variant.configs[seed] for way, variant in ways.items()})
-        planned += [Planned(ways[way], seed, run) for way, run in runs.items()]
-    return planned
 
 
 def _name(run: Run) -> str:

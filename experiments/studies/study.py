@@ -7,25 +7,17 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, MinLen
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from experiments import peers
 from skin.config import overrides, plain, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
 from skin.settings import check_settings, configured
 from skin.sweep import sweep_jobs
 
-SMOKE = (
-    "data.gestures=80",
-    "device.test_gestures=48",
-    "trainer.max_epochs=1",
-    "evaluation.devices=0",
-    "evaluation.layouts=0",
-    "evaluation.safe_gestures=48",
-    "tracking.experiment=smoke",
-)
-"""Overrides that shrink every run to a second; its scores are to be ignored."""
 _OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")
 
@@ -57,11 +49,13 @@ class Variant:
         name: what tells it from the others of its study.
         chosen: the settings that its study gives it, as key -> value.
         configs: seed -> configuration.
+        trained: whether the study trains it; else it is shown where it has finished.
     """
 
     name: str
     chosen: Mapping[str, str]
     configs: dict[str, DictConfig]
+    trained: bool = True
 
 
 @dataclass(frozen=True)
@@ -78,7 +72,12 @@ class Study:
     trainings: Sequence[Any] = ()
     common: Mapping[str, Any] = field(default_factory=dict)
     train: bool = True
-    ensembles: Sequence[str] = ()
+    finished: Sequence[Any] = ()
+    vote: str | Sequence[str] = ()
+    reference: str | None = None
+    report_figures: bool = False
+    jobs: Annotated[int, Ge(1)] = 1
+    small: Sequence[str] = ()
     rows: str | Sequence[str] | None = None
     run: str | None = None
     conditions: Mapping[str, Any] = field(default_factory=dict)
@@ -92,31 +91,59 @@ class Study:
     minutes: float | None = None
     axis: str | None = None
 
-    @classmethod
-    def of(cls, config: DictConfig) -> "Study":
-        """Return the study of a configuration of ``skin study``.
 
-        Raises:
-            InputError: none is chosen, or a setting that it does not have or take.
-        """
-        name = HydraConfig.get().runtime.choices.get("study")
-        if not name:
-            known = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
-            raise InputError(f"which study? choose one of {known}, as in study=norm")
-        settings = plain(config)["study"]
-        settings["name"] = settings["name"] or name
-        check_settings(cls, settings, "study")
-        statements = [
-            configured(Statement, one, f"study.statements[{number}]")
-            for number, one in enumerate(settings["statements"])
-        ]
-        if settings["measure"]:
-            part = settings["measure"]
-            check_settings(get_object(part["_target_"]), part, "study.measure")
-            settings["measure"] = instantiate(part)
-        if isinstance(settings["rows"], str) and settings["rows"] != "all":
-            settings["rows"] = [settings["rows"]]
-        return cls(**settings | {"statements": statements})
+def chosen_studies(config: DictConfig) -> list[Study]:
+    """Return the comparisons that a configuration of ``skin study`` chooses: its study, or parts of it.
+
+    A part has the settings of the study, then its own, then those of the command line.
+
+    Raises:
+        InputError: no study or part is chosen, or a setting that it does not have or take.
+    """
+    option = HydraConfig.get().runtime.choices.get("study")
+    if not option:
+        options = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
+        raise InputError(f"which study? choose one of {options}, as in study=graphs")
+    settings = plain(config)["study"]
+    parts, part = settings.pop("parts"), settings.pop("part")
+    names = [*parts] if part is None else [part] if isinstance(part, str) else part
+    if unknown := [name for name in names if name not in parts]:
+        options = ", ".join(parts) or "none"
+        raise InputError(f"study.part={unknown[0]} is none of the parts of study={option}: {options}")
+    if not parts:
+        return [_configured(settings, option)]
+    if settings["name"] and len(names) > 1:
+        raise InputError(
+            f"study.name={settings['name']} names one part: choose it, as in study.part={names[0]}"
+        )
+    return [_configured(_with_command_line(settings | parts[name]), name) for name in names]
+
+
+def _with_command_line(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a part with those of the command line, which are not for the choice of parts."""
+    changed = OmegaConf.create({**settings})
+    words = [word.lstrip("+") for word in overrides() if word.lstrip("+").startswith("study.")]
+    for override in OverridesParser.create().parse_overrides(words):
+        key = override.key_or_group.removeprefix("study.")
+        if key.split(".")[0] not in ("part", "parts"):
+            OmegaConf.update(changed, key, override.value(), force_add=True)
+    return OmegaConf.to_container(changed, resolve=False)  # type: ignore[return-value]
+
+
+def _configured(settings: dict[str, Any], name: str) -> Study:
+    """Return the study with some settings, checked."""
+    settings["name"] = settings["name"] or name
+    check_settings(Study, settings, "study")
+    settings["statements"] = [
+        configured(Statement, statement, f"study.statements[{number}]")
+        for number, statement in enumerate(settings["statements"])
+    ]
+    if measure := settings["measure"]:
+        check_settings(get_object(measure["_target_"]), measure, "study.measure")
+        settings["measure"] = instantiate(measure)
+    if isinstance(settings["rows"], str) and settings["rows"] != "all":
+        settings["rows"] = [settings["rows"]]
+    return Study(**settings)
 
 
 def passed_overrides() -> list[str]:
@@ -124,8 +151,8 @@ def passed_overrides() -> list[str]:
 
     What the default training does not have must be added (``+``), though a study's trainings may have it.
     """
-    found = [one for one in overrides() if _key(one).split(".")[0] not in _OWN]
-    return [f"++{one.lstrip('+')}" if one.startswith("+") else one for one in found]
+    words = [word for word in overrides() if _key(word).split(".")[0] not in _OWN]
+    return [f"++{word.lstrip('+')}" if word.startswith("+") else word for word in words]
 
 
 def as_overrides(settings: Mapping[str, Any]) -> list[str]:
@@ -133,29 +160,38 @@ def as_overrides(settings: Mapping[str, Any]) -> list[str]:
     return [f"{key}={_text(value)}" for key, value in settings.items()]
 
 
-def sweeps(study: Study, smoke: bool = False) -> Iterator[tuple[Mapping[str, Any], list[str]]]:
-    """Yield each sweep that trains a study's variants: its own settings, and all of its overrides."""
-    last = [f"seed={_text(study.seeds)}", *(SMOKE if smoke else ()), *passed_overrides()]
+def sweeps(
+    study: Study, blocks: Sequence[Mapping[str, Any]], smoke: bool = False
+) -> Iterator[tuple[Mapping[str, Any], list[str]]]:
+    """Yield each sweep of a study's trainings: its own settings, and all of its overrides."""
+    last = [f"seed={_text(study.seeds)}", *(study.small if smoke else ()), *passed_overrides()]
     rows = {} if study.rows is None else {"experiment": study.rows}
-    fixed = {_key(one) for one in last}
-    for block in study.trainings:
-        own = {key: value for key, value in (block | rows).items() if key not in fixed}
+    fixed = {_key(word) for word in last}
+    for block in blocks:
+        own = {key: value for key, value in {**block, **rows}.items() if key not in fixed}
         settings = {key: value for key, value in own.items() if key != "name"}
         shared = {key: value for key, value in study.common.items() if key not in own}
         yield own, [*as_overrides(settings), *as_overrides(shared), *last]
 
 
 def variants(study: Study, smoke: bool = False) -> list[Variant]:
-    """Return every variant that a study trains, with its configurations."""
-    found = [one for block, line in sweeps(study, smoke) for one in _variants(block, line)]
-    shared = set.intersection(*(set(named.items()) for named, _ in found)) if found else set()
+    """Return every variant that a study trains or shows, with its configurations."""
+    shown = () if study.rows is not None else study.finished
+    pairs = [pair for block, line in sweeps(study, study.trainings, smoke) for pair in _variants(block, line)]
+    for block, line in sweeps(study, shown, smoke):
+        # Rows of peers are in a folder of their own.
+        found = _variants(block, line, (f"hydra.searchpath=['file://{peers.CONF}']",))
+        pairs += [(named, replace(variant, trained=False)) for named, variant in found]
+    shared = set.intersection(*(set(named.items()) for named, _ in pairs)) if pairs else set()
     return [
-        replace(one, name=" ".join(_short(*item) for item in named.items() if item not in shared))
-        for named, one in found
+        replace(variant, name=" ".join(_short(*item) for item in named.items() if item not in shared))
+        for named, variant in pairs
     ]
 
 
-def _variants(block: Mapping[str, Any], line: Sequence[str]) -> list[tuple[dict[str, str], Variant]]:
+def _variants(
+    block: Mapping[str, Any], line: Sequence[str], places: Sequence[str] = ()
+) -> list[tuple[dict[str, str], Variant]]:
     """Return each variant of a sweep, with what may name it."""
     name, found = block.get("name"), dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
     for job in sweep_jobs(list(line), {}):
@@ -165,7 +201,8 @@ def _variants(block: Mapping[str, Any], line: Sequence[str]) -> list[tuple[dict[
             for key, value in chosen.items()
             if isinstance(block[key], list) or (not name and key in _NAMED)
         }
-        config = validate_config(compose("train", [f"{key}={value}" for key, value in job.items()]))
+        words = [*places, *(f"{key}={value}" for key, value in job.items())]
+        config = validate_config(compose("train", words))
         start = {"name": name} if name else {}
         _, variant = found.setdefault(
             tuple(chosen.values()), (start | named, Variant("", start | chosen, {}))

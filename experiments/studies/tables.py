@@ -16,7 +16,7 @@ from skin.plot.figures import save_figure
 
 Table = Sequence[Sequence[str]]
 
-_WIDEST = 200  # characters
+_WIDEST = 250  # characters, more than the table of the report needs
 
 
 @dataclass(frozen=True)
@@ -52,24 +52,10 @@ def csv_text(table: Iterable[Sequence[object]]) -> str:
     return buffer.getvalue()
 
 
-def read_csv(path: Path) -> list[list[str]]:
-    """Return a CSV file as a table."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.reader(file))
-
-
 def markdown(table: Table, title: str) -> str:
     """Return a table as Markdown, below its title."""
     lines = ["| " + " | ".join(line) + " |" for line in table]
     return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
-
-
-def percent(value: str, spread: str = "") -> str:
-    """Return a share in per cent, with its spread if there is one; what is no number stays as it is."""
-    if value in ("", "failed", "cannot"):
-        return value
-    shown = f" ± {100 * float(spread):.1f}" if spread else ""
-    return f"{100 * float(value):.1f}{shown}"
 
 
 def print_table(
@@ -84,13 +70,13 @@ def print_table(
         wrapped: the columns that may be broken into lines.
     """
     console = console or Console()
-    shown = terminal.Table(title=escape(title), box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    printed = terminal.Table(title=escape(title), box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for name in table[0]:
-        shown.add_column(escape(name), no_wrap=name not in wrapped)
+        printed.add_column(escape(name), no_wrap=name not in wrapped)
     for line in table[1:]:
-        shown.add_row(*map(escape, line))
+        printed.add_row(*map(escape, line))
     if not set(wrapped) & set(table[0]):
         # A number cut short would be another number: rather let a narrow terminal wrap.
-        needed = console.measure(shown, options=console.options.update(width=_WIDEST)).maximum
+        needed = console.measure(printed, options=console.options.update(width=_WIDEST)).maximum
         console.width = max(console.width, needed)
-    console.print(shown)
+    console.print(printed)

@@ -1,34 +1,67 @@
-"""Trials: results of a study for its runs, under each condition, on each device, stored in MLflow."""
+"""Trials: results of a study for its runs, under each condition, on each device.
+
+A trial that needs an evaluation is a Parquet file of one row in ``results/trials/<study>``, named by the
+training and by all that the result depends on. A file has one writer and is written whole, so parallel jobs
+and shards share none. All files of a folder together are one table: ``pandas.read_parquet`` reads it.
+"""
 
 import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from hydra import compose
-from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
-from experiments.studies.measures import Accuracy
-from experiments.studies.runs import Planned, artifact_names, load_outcomes
+from experiments.studies.measures import Accuracy, Finished, Measure, Subject
+from experiments.studies.runs import Planned, load_outcomes, row_and_simulator
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
-from experiments.studies.subject import Finished, Measure, Subject
 from experiments.studies.tables import publish_page
 from skin.build import build_device
+from skin.checksum import check_seal, write_parquet
 from skin.config import fingerprint, validate_config
 from skin.errors import InputError
-from skin.evaluation.outcomes import OUTCOMES
+from skin.evaluation.outcomes import decode, disagreement, vote
+from skin.files import whole
+from skin.labels import TOUCH
 from skin.run_overrides import apply_overrides
 from skin.stored_run import TAG, load_configuration
-from skin.tracking import Store, note_reuse
+from skin.tracking import Store, note_source, source_tags
 from skin.trained import Trained, load_trained
+
+FOLDER = Path("results/trials")
+"""Of all trials, in the current folder; those of a study are in a folder of its name."""
+
+_SCHEMA = pa.schema(
+    {
+        "run": pa.string(),
+        "name": pa.string(),
+        "condition": pa.string(),
+        "device": pa.string(),
+        "measure": pa.string(),
+        "source": pa.map_(pa.string(), pa.string()),
+        "metrics": pa.map_(pa.string(), pa.float64()),
+        "line": pa.string(),
+        "cannot": pa.string(),
+        "outcomes": pa.binary(),
+        "files": pa.map_(pa.string(), pa.binary()),
+    }
+)
+_MAPS = ("source", "metrics", "files")
+_SHARES = (
+    *(f"{label}/accuracy" for label in ("overall", *TOUCH.names)),
+    "dangerous/alarm_recall",
+    "dangerous/false_alarm_rate",
+)
 
 
 @dataclass(frozen=True)
@@ -43,9 +76,9 @@ class Trial:
         run: its fingerprint; empty where none finished.
         metrics: name -> value.
         line: for a person; empty where there is only a table.
-        files: of the measure.
+        files: of the measure, name -> content.
         outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
-        cannot: why the run does not accept the touches of the condition; empty where it does.
+        cannot: the columns (``same``, ``unseen_layout``) whose touches the run does not accept.
     """
 
     variant: Variant
@@ -55,51 +88,51 @@ class Trial:
     run: str
     metrics: Mapping[str, float]
     line: str = ""
-    files: Sequence[Path] = ()
+    files: Mapping[str, bytes] = field(default_factory=dict)
     outcomes: np.ndarray | None = None
-    cannot: str = ""
+    cannot: Sequence[str] = ()
 
 
-def run_trials(
-    store: Store, planned: Planned, study: Study, config: DictConfig, folder: Path
-) -> Iterator[Trial]:
-    """Yield the results of a study for a run; earlier results are read from MLflow.
+def run_trials(store: Store, planned: Planned, study: Study, config: DictConfig) -> Iterator[Trial]:
+    """Yield the results of a study for a run; those that exist are not measured again.
 
     Args:
-        store: of the run; results are logged there.
+        store: of the run.
         planned: the run.
         study: what to measure.
         config: of the command.
-        folder: for the files of a measure.
     """
-    if planned.run is None:
-        yield Trial(planned.variant, planned.seed, "", "", "", {})
+    variant, seed, run = planned.variant, planned.seed, planned.run
+    if run is None:
+        yield Trial(variant, seed, "", "", "", {})
         return
-    own = planned.run.data.metrics if planned.variant.configs else {}
-    identity = planned.run.data.tags.get("fingerprint", "")
+    tags, metrics = run.data.tags, run.data.metrics if variant.configs else {}
+    identity = tags.get("fingerprint", "")
     if study.measure is None and not study.conditions:
-        outcomes = load_outcomes(store, planned.run)
-        yield Trial(planned.variant, planned.seed, "", "", identity, own, outcomes=outcomes)
+        refused = [name.removeprefix("cannot_") for name in tags if name.startswith("cannot_")]
+        outcomes = load_outcomes(store, run)
+        yield Trial(variant, seed, "", "", identity, metrics, outcomes=outcomes, cannot=refused)
         return
-    for condition, number, found in _measured(study, planned, _Run(store, planned.run, config)):
-        files = _fetched(store, found, folder)
-        metrics, said = {**({} if condition else own), **found.data.metrics}, found.data.tags["outcome"]
-        at = planned.variant, planned.seed, condition, number, identity
-        cannot = found.data.tags.get("cannot", "")
-        yield Trial(*at, metrics, said, files, load_outcomes(store, found), cannot)
-
-
-def _measured(study: Study, planned: Planned, subject: "_Run") -> Iterator[tuple[str, str, Run]]:
-    """Yield each condition, the number of the device, and the MLflow run with the results."""
-    given, selected = passed_overrides(), f"simulator={subject.run.data.tags.get('simulator')}"
+    words, selected = passed_overrides(), f"simulator={tags.get('simulator')}"
     # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
-    base, changes = (
-        (given, []) if planned.variant.configs else ([], [one for one in given if one != selected])
-    )
+    base, changes = (words, []) if variant.configs else ([], [word for word in words if word != selected])
+    restored = RestoredRun(store, run, config)
     for condition, settings in (study.conditions or {"": {}}).items():
-        for number, own_settings in numbered_settings(study, settings):
-            line = as_overrides({**study.test, **own_settings})
-            yield condition, number, subject.measured(study, base, [*line, *changes])
+        for number, numbered in numbered_settings(study, settings):
+            line = [*as_overrides({**study.test, **numbered}), *changes]
+            row = restored.measure(study, condition, number, base, line)
+            yield Trial(
+                variant,
+                seed,
+                condition,
+                number,
+                identity,
+                {**({} if condition else metrics), **row["metrics"]},
+                row["line"],
+                row["files"],
+                None if row["outcomes"] is None else np.frombuffer(row["outcomes"], np.uint8),
+                ["same"] if row["cannot"] else (),
+            )
 
 
 def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -113,68 +146,129 @@ def numbered_settings(study: Study, condition: Mapping[str, Any]) -> Iterator[tu
     if not lists:
         yield "", condition
         return
-    if len({len(each) for each in lists.values()}) > 1:
+    if len({len(values) for values in lists.values()}) > 1:
         raise InputError(f"the lists of a condition number its devices, so they need one length, got {lists}")
     for number, values in enumerate(zip(*lists.values(), strict=True), start=1):
         yield str(number), {**condition, **dict(zip(lists, values, strict=True))}
 
 
-class _Run:
-    """A finished run, which is restored at most once."""
+class RestoredRun:
+    """A finished run, which is restored at most once.
+
+    Args:
+        store: of the run.
+        run: the run.
+        config: of the command.
+    """
 
     def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
         self.store, self.run, self.config = store, run, config
 
     @cached_property
     def stored(self) -> DictConfig:
+        """Its configuration."""
         return load_configuration(self.store, self.run, self.config.trust)
 
     @cached_property
     def trained(self) -> Trained:
+        """What it learned."""
         return load_trained(self.store, self.run, validate_config(self.stored), self.stored)
 
-    def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
-        """Return the MLflow run with the results of a study on the device that the overrides describe."""
-        own = apply_overrides(self.stored, compose("train", [*base, *line]), line)
-        what = study.measure or Accuracy()
-        asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]
-        key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
-        # Not the id of the run, which another database does not have.
-        tags = {"evaluated": self.run.data.tags["fingerprint"], "study": key}
-        known = self.store.find("FINISHED", **tags) if self.config.tracking.resume else []
-        # A trial that began before the training ended is of an earlier training of this configuration.
-        known = [one for one in known if one.info.start_time >= self.run.info.end_time]
-        if not known:
-            changed = any(not one.startswith("tracking.") for one in line)
-            known = [self._measure(what, own, f"{study.name} of {self.run.info.run_name}", tags, changed)]
-        note_reuse(known[0])
-        return known[0]
+    def measure(
+        self, study: Study, condition: str, device: str, base: Sequence[str], line: Sequence[str]
+    ) -> dict[str, Any]:
+        """Return the row with the results of a study on the device that the overrides describe."""
+        config = apply_overrides(self.stored, compose("train", [*base, *line]), line)
+        measure, run = study.measure or Accuracy(), self.run
+        # A training that was repeated has other weights, and ended at another time.
+        depends = [repr(measure), fingerprint(config), run.data.tags.get(TAG), run.info.end_time]
+        key = hashlib.sha256(json.dumps(depends).encode()).hexdigest()[:16]
+        path = FOLDER / study.name / f"{run.data.tags['fingerprint']}-{key}.parquet"
+        row = read_row(path) if self.config.tracking.resume else None
+        if row is None:
+            changed = any(not word.startswith("tracking.") for word in line)
+            name = f"{type(measure).__name__.lower()}_" + re.sub(r"\W+", "_", run.info.run_name)
+            row = self._measured(measure, config, name + (f"_{key[:8]}" if changed else ""))
+            row |= {"condition": condition, "device": device}
+            write_row(row, path)
+        else:
+            note_source(str(path), f"{study.name} of {run.info.run_name}", row["source"])
+        return row
 
-    def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str], changed: bool) -> Run:
-        """Measure, and log it beside the run; ``changed``: not on the run's own device."""
-        subject = Subject(own, build_device(own), Finished(self.store, self.run, self.stored, self.trained))
-        with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
-            found = what(subject)
-            self.store.log_metrics(logged, found.metrics)
-            about = {"outcome": found.page.about if found.page else "", "cannot": found.cannot}
-            for name, text in about.items():
-                self.store.client.set_tag(logged.info.run_id, name, text)
-            if found.page is not None:
-                run = re.sub(r"\W+", "_", self.run.info.run_name)
-                stem = f"{type(what).__name__.lower()}_{run}" + (f"_{tags['study'][:8]}" if changed else "")
-                publish_page(found.page, subject.title, Path(made) / stem)
-            if found.outcomes is not None:
-                np.save(Path(made) / OUTCOMES, found.outcomes)
-            self.store.client.log_artifacts(logged.info.run_id, made)
-        return self.store.client.get_run(logged.info.run_id)
+    def _measured(self, measure: Measure, config: DictConfig, name: str) -> dict[str, Any]:
+        """Measure, and return the row; its files have a name."""
+        subject = Subject(
+            config, build_device(config), Finished(self.store, self.run, self.stored, self.trained)
+        )
+        result = measure(subject)
+        files: dict[str, bytes] = {}
+        if result.page is not None:
+            with TemporaryDirectory() as folder:
+                paths = publish_page(result.page, subject.title, Path(folder) / name)
+                files = {path.name: path.read_bytes() for path in paths}
+        return {
+            "run": self.run.data.tags["fingerprint"],
+            "name": self.run.info.run_name,
+            "measure": repr(measure),
+            "source": source_tags(),
+            "metrics": {metric: value for metric, value in result.metrics.items() if value == value},
+            "line": result.page.about if result.page else "",
+            "cannot": result.cannot,
+            "outcomes": None if result.outcomes is None else result.outcomes.tobytes(),
+            "files": files,
+        }
 
 
-def _fetched(store: Store, run: Run, folder: Path) -> list[Path]:
-    """Copy the files of a measure to a folder and return their paths there."""
-    if not artifact_names(store, run) - {OUTCOMES}:
-        return []
-    folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=folder) as holder:
-        fetched = download_artifacts(run_id=run.info.run_id, dst_path=holder, tracking_uri=store.uri)
-        made = (path for path in sorted(Path(fetched).iterdir()) if path.name != OUTCOMES)
-        return [path.replace(folder / path.name) for path in made]
+def read_row(path: Path) -> dict[str, Any] | None:
+    """Return the row of a file; None without the file.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    if not path.exists():
+        return None
+    try:
+        check_seal(path)
+        table = pq.read_table(path, partitioning=None)
+        if table.schema.remove_metadata() != _SCHEMA or len(table) != 1:
+            raise ValueError("it is not one row of results")
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise InputError(f"{path} cannot be read: {error}: remove it, and it is measured again") from error
+    (row,) = table.to_pylist()
+    return row | {name: dict(row[name]) for name in _MAPS}
+
+
+def write_row(row: Mapping[str, Any], path: Path) -> None:
+    """Write a row as a file, whole."""
+    table = pa.Table.from_pylist([{**row, **{name: [*row[name].items()] for name in _MAPS}}], schema=_SCHEMA)
+    with whole(path) as partial:
+        write_parquet(table, partial, compression="zstd")
+
+
+def votes(study: Study, trials: Sequence[Trial]) -> Iterator[Trial]:
+    """Yield what the models in ``study.vote`` decide together, for each seed and for equal other settings.
+
+    It is computed from the outcomes of the runs on the same test gestures (report, 4.2).
+    """
+    groups: dict[tuple[tuple[tuple[str, str], ...], str], list[Trial]] = {}
+    for trial in trials:
+        row, simulator = row_and_simulator(trial.variant)
+        others = {**trial.variant.chosen, "simulator": simulator}
+        settings = tuple(item for item in others.items() if item[0] not in ("experiment", "row"))
+        if trial.outcomes is not None and (study.vote == "all" or row in study.vote):
+            groups.setdefault((settings, trial.seed), []).append(trial)
+    several = len({settings for settings, _ in groups}) > 1
+    for (settings, seed), members in groups.items():
+        codes = [trial.outcomes for trial in members if trial.outcomes is not None]
+        if len(codes) < 2 or len({len(code) for code in codes}) > 1:
+            continue
+        outcomes = vote(np.stack(codes))
+        metrics = {"same/any/disagreement": disagreement(np.stack(codes))}
+        for name in _SHARES:
+            counted = decode(outcomes, name, TOUCH)
+            if not np.isnan(counted).all():  # without dangerous gestures there is no recall
+                metrics[f"same/{name}"] = float(np.nanmean(counted))
+        name = " ".join([*(value for _, value in settings if several), "vote"])
+        variant = Variant(name, {**dict(settings), "name": "vote"}, {})
+        run = " ".join(trial.run for trial in members)
+        yield Trial(variant, seed, "", "", run, metrics, outcomes=outcomes)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from skin.contact.prescribed import Prescribed
 from skin.device._metadata import describe
 from skin.device._split import split_rows, split_slices
 from skin.device._threads import grouped, joined
-from skin.device._tracking import Tracker, estimated, oracle
 from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
 from skin.device.base import AbstractSimulated, Split
 from skin.errors import InputError
@@ -68,8 +67,6 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
-        track: motion of the sensors in touches (docs/adr/0006): ``none``, ``oracle`` (from the simulator) or
-            ``estimated`` from readings; both need sensors that move along the sheet.
 
     Raises:
         InputError: invalid settings.
@@ -91,7 +88,6 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     calibration: str | None = None
     randomise: bool = False
     position_error: Annotated[float, Ge(0)] = 0.0
-    track: Literal["none", "oracle", "estimated"] = "none"
 
     def __post_init__(self) -> None:
         self._refuse()
@@ -108,7 +104,6 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self.imperfection = Imperfection.of(self, self.calibration)
         drawn = generator(Stream.CONSTANTS, self.seed)
         self.constants = draw_constants(self.imperfection, len(self.sensors), self.model_rate, drawn)
-        self.tracker = self._tracker()
         self._kept: dict[str, Recording] = {}
 
     def _refuse(self) -> None:
@@ -117,26 +112,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         check_settings(type(self), settings, "device")
         if self.stream and self.direction:
             raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
-        if self.stream or self.track != "none":
-            refuse_relaxation(self.body, "data.stream=true" if self.stream else f"device.track={self.track}")
+        if self.stream:
+            refuse_relaxation(self.body, "data.stream=true")
 
     def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
         contact, settings = self.contact(body, model), GestureSettings.of(self.touch)
         judged = sensors if settings.over_sensors else everywhere(body, sensors.footprint)
         return TouchSampler(body, body.footprints(judged), contact, settings, self.padded)
-
-    def _tracker(self) -> Tracker:
-        """Return the tracker that ``track`` selects."""
-        if self.track == "none":
-            return Tracker()
-        if self.track == "oracle":
-            return oracle(self.model, self.body.shape)
-        # As for a real skin, whose true sensor positions and layer variations are unknown.
-        body = replace(self.body, variation=0.0)
-        model = self.simulator(body, self.sensors)
-        sampler = self._sampler(body, self.sensors, model)
-        randomness = generator(Stream.TRACKING, self.data_seed)
-        return estimated(model, sampler, self.imperfection, len(self.sensors), randomness)
 
     @cached_property
     def geometry(self) -> Tensor:
@@ -282,8 +264,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        motion = self.tracker.motion(movie)
-        touches = Touches(readings, valid, positions, labels, self.model_rate, motion, geometry=self.geometry)
+        touches = Touches(readings, valid, positions, labels, self.model_rate, geometry=self.geometry)
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.
@@ -298,4 +279,4 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         readings, valid, saturated = measure(self.imperfection, constants, force, rate, noise)
         clipped = {"clipped": saturated.flatten(1).any(1).float()}
         touches = replace(true.touches, readings=readings, valid=valid, saturated=saturated)
-        return replace(true, touches=self.tracker.estimate(touches), parameters=true.parameters | clipped)
+        return replace(true, touches=touches, parameters=true.parameters | clipped)

@@ -75,3 +75,23 @@ def decode(outcomes: np.ndarray, metric: str, task: Task) -> np.ndarray:
     names = task.names if label == "overall" else (label,)
     right: np.ndarray = np.mean([(outcomes >> task.names.index(name) & 1) == 0 for name in names], axis=0)
     return right
+
+
+def vote(outcomes: np.ndarray) -> np.ndarray:
+    """Return the outcomes of what several models decide together, (B,), by a majority for each label.
+
+    A tie is a wrong answer, and no alarm.
+
+    Args:
+        outcomes: (M, B), uint8, of M models on the same gestures.
+    """
+    bits = np.arange(8)
+    shares = (outcomes[..., None] >> bits & 1).mean(axis=0)
+    decided = np.where(1 << bits == _ALARM, shares > 0.5, shares >= 0.5)
+    return (decided << bits).sum(axis=-1).astype(np.uint8)
+
+
+def disagreement(outcomes: np.ndarray) -> float:
+    """Return the share of gestures for which models (M, B) differ in a label."""
+    wrong = outcomes & ((1 << _LABELS) - 1)
+    return float((wrong != wrong[0]).any(axis=0).mean())

@@ -67,7 +67,7 @@ class TransformerHead(nn.Module):
     """Two layers of self-attention over the frames, and the mean over time.
 
     Position encodings are sinusoidal instead of learned, so that windows of any length are accepted. Three of
-    five trainings with Adam at 1e-3 stayed at chance (``study=temporal_head_graph``): use 3e-4 and a warm-up.
+    five trainings with Adam at 1e-3 stayed at chance (study ``temporal_head_graph``): use 3e-4, a warm-up.
     """
 
     def __init__(self, width: int, hidden: int) -> None:

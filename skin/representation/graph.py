@@ -200,8 +200,8 @@ class Graph(AbstractRepresentation):
         if self.positions == "deformed":
             if motion is None:
                 raise InputError(
-                    "representation.positions=deformed needs touches with displacements of sensors: add "
-                    "device.track=oracle simulator.constraint=free, or set representation.positions=layout"
+                    "representation.positions=deformed needs touches with displacements of sensors: give "
+                    "Touches(motion=...), or set representation.positions=layout"
                 )
             places = self.layout + motion
             matrix = self.adjacency if self.weight == "none" else self._adjacency_at(places)

@@ -44,7 +44,7 @@ class Augmentation:
             InputError: touches whose sensors move, for which shifts are not defined.
         """
         if touches.motion is not None:
-            raise InputError("data.augment does not support sensors that move: set device.track=none")
+            raise InputError("data.augment does not support touches with motion: leave out data.augment")
         count, time, sensors = touches.readings.shape
         order = torch.arange(time).expand(count, time)
         if self.shift:

@@ -1,6 +1,5 @@
 """A run of drawn skins is used on a skin of its own: simulated, recorded, and at a port."""
 
-import csv
 import re
 from contextlib import ExitStack
 from time import monotonic, sleep
@@ -44,20 +43,6 @@ def test_a_recording_gets_the_geometry_of_the_configured_skin(run, folder):
     done = run(folder, "evaluate", "device=recording", *own, *OWN)
     assert done.returncode == 0, done.stderr
     assert 0 < metrics(folder)[-1]["same/overall/accuracy"] < 1
-
-
-@pytest.mark.slow
-def test_each_unseen_skin_has_a_line(run, folder):
-    own = ["simulator=solid", "study.seeds=[0]", "study.measure.gestures=40", "out=studied"]
-    done = run(folder, "study", "study=unseen_skins", *own)
-    assert done.returncode == 0, done.stderr
-    (path,) = (folder / "studied").glob("unseenskins_*.csv")
-    with path.open() as file:
-        lines = list(csv.DictReader(file))
-    shares = [float(line["overall/accuracy"]) for line in lines]
-    assert len(shares) == 2
-    assert 0 < shares[0] <= shares[1] <= 100
-    assert "2 skins with 40 touches each" in done.stdout
 
 
 @pytest.mark.slow

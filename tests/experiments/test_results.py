@@ -3,11 +3,17 @@
 import re
 import sqlite3
 from contextlib import closing
+from shlex import split
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from experiments.studies.study import chosen_studies
+from skin.config import validate_config
 from skin.paths import CONF, ROOT
+from skin.sweep import sweep_jobs
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -16,14 +22,15 @@ SMALL = ["simulator=naive", "data.gestures=160", "device.test_gestures=64", "eva
          "evaluation.layouts=0", "evaluation.safe_gestures=64", "trainer.max_epochs=1"]  # fmt: skip
 PARTS = [
     "results.parts.table=[{run: 'train -m experiment=rules seed=0,1,2,3', hours: 1}, "
-    "{run: 'table table.seeds=4 experiment=rules', hours: 1}]",
-    "results.parts.studies=[{run: 'study study=pair study.rows=[rules] study.seeds=[0,1]', hours: 1}]",
+    "{run: 'study study=table study.rows=[rules] study.seeds=[0,1,2,3]', hours: 1}]",
+    "results.parts.studies=[{run: 'study study=ensemble study.rows=[rules] study.seeds=[0,1] "
+    "study.train=false', hours: 1}]",
     "results.parts.shifts=[]",
     "results.parts.peers=[]",
     "results.parts.sensors=[]",
     "results.parts.any_skin=[]",
-    "results.parts.adapt=[]",
     "results.parts.design=[]",
+    "results.parts.best_fresh=[]",
     "out=docs",
 ]
 
@@ -54,21 +61,20 @@ def test_a_killed_command_goes_on_where_it_was(run, begin, tmp_path):
         f"rules naive max_epochs=1 seed {seed}" if "max_epochs" in finished[0] else f"rules naive seed {seed}"
         for seed in range(4)
     ]
-    assert {"table.csv", "table_seeds.csv", "study_pair.csv"} <= {
-        path.name for path in (tmp_path / "docs").iterdir()
-    }
+    assert {"study_table.csv", "study_ensemble.csv"} <= {path.name for path in (tmp_path / "docs").iterdir()}
     again = run(tmp_path, "results", *PARTS, *SMALL)
     assert (again.returncode, again.stdout.count("took")) == (0, 0), again.stderr
     fresh = run(
         tmp_path, "results", *PARTS, *SMALL, "results.fresh=true", "results.part=studies", store=False
     )
-    assert fresh.returncode == 1, "study=pair trains nothing"
+    assert fresh.returncode == 1, "the study trains nothing"
     assert (tmp_path / "results" / "fresh.db").is_file()
 
 
 @pytest.mark.slow
 def test_a_command_that_fails_does_not_stop_the_others(run, tmp_path):
-    lines = "{run: 'study study=nope', hours: 1}, {run: 'study study=pair study.rows=[rules]', hours: 1}"
+    lines = "{run: 'study study=nope', hours: 1}, "
+    lines += "{run: 'study study=ensemble study.rows=[rules] study.train=false', hours: 1}"
     words = [f"results.parts.studies=[{lines}]", "results.part=studies"]
     done = run(tmp_path, "results", *PARTS, *words, *SMALL)
     assert done.returncode == 1
@@ -89,10 +95,10 @@ def test_bounds_are_published_in_a_folder_of_their_own(run, tmp_path):
     [
         (
             ["results.part=tables"],
-            "results.part=tables is none of all, table, peers, shifts, sensors, any_skin, adapt, studies, "
-            "design, tracking, images",
+            "results.part=tables is none of all, best_fresh, table, peers, shifts, sensors, any_skin, "
+            "studies, design, weights, graphs, other_skins, image_head, image_size, image_representation",
         ),
-        (["results.parts.table=[{run: table, hours: 0}]"], "hours"),
+        (["results.parts.table=[{run: study, hours: 0}]"], "hours"),
         (["results.optional=[image]"], "results.optional=['image']: there is no part image"),
         (["results.jobs=0"], "results.jobs"),
     ],
@@ -111,25 +117,40 @@ def test_runs_in_another_precision_are_found(run, tmp_path):
         words = [f"experiment={row}", f"seed={seed}", "trainer.precision=bf16-mixed"]
         done = run(tmp_path, "train", *words, *SMALL)
         assert done.returncode == 0, done.stderr
-    table = ["table.simulators=[naive]", "experiment=rules", *small]
-    done = run(tmp_path, "table", *table)
+    rows = "study.trainings.0.experiment=[rules]"
+    done = run(tmp_path, "study", "study=table", "study.trainings.0.simulator=[naive]", rows, *small)
     assert done.returncode == 0, done.stderr
-    assert "was finished before" in done.stdout
-    assert "best_fresh" in (tmp_path / "results" / "table.md").read_text()
-    pair = ["study=pair", "study.rows=[best_fresh,rules]", "study.seeds=[0]"]
-    done = run(tmp_path, "study", *pair, *SMALL)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert "…" not in done.stdout, "nothing was to be trained"
+    assert "best_fresh" in (tmp_path / "results" / "study_table.md").read_text()
 
 
-def test_every_study_of_the_parts_exists():
-    text = (CONF / "results.yaml").read_text()
-    named = {
-        line.split("study=")[1].split(",")[0].split()[0]
-        for line in text.splitlines()
-        if "study study=" in line
-    }
-    assert named <= {path.stem for path in (CONF / "study").glob("*.yaml")}
-    assert len(named) > 10
+LINES = [step.run for steps in OmegaConf.load(CONF / "results.yaml").results.parts.values() for step in steps]
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_every_command_of_the_plan_composes(line):
+    verb, *words = split(line)
+    words = [word for word in words if word != "-m"]
+    search = []
+    if "--config-dir" in words:
+        place = words.index("--config-dir")
+        search = [f"hydra.searchpath=['file://{ROOT / words[place + 1]}']"]
+        del words[place : place + 2]
+    jobs = [[f"{key}={value}" for key, value in job.items()] for job in sweep_jobs(words, {})]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for job in jobs:
+            config = compose(verb, [*search, *job], return_hydra_config=True)
+            HydraConfig.instance().set_config(config)
+            own = validate_config(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
+            for study in chosen_studies(own) if verb == "study" else []:
+                assert study.about
+
+
+def test_the_plan_takes_a_night_and_each_part_an_evening():
+    settings = OmegaConf.load(CONF / "results.yaml").results
+    hours = {name: sum(step.hours for step in steps) for name, steps in settings.parts.items()}
+    assert max(hours.values()) <= 2.5
+    assert sum(each for name, each in hours.items() if name not in settings.optional) <= 8
 
 
 def test_make_help_states_the_hours_of_each_part():

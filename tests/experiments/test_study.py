@@ -9,7 +9,6 @@ from contextlib import closing
 import pytest
 from PIL import Image
 
-from experiments.studies.study import SMOKE
 from skin.config import fingerprint, validate_config
 from skin.paths import ROOT
 from skin.tracking import Store
@@ -52,7 +51,9 @@ def folder(tmp_path_factory, configured):
 
 
 def test_finished_runs_are_found_and_judged(run, folder):
-    done = run(folder, "study", "study=activation", "study.seeds=[0,1,2]", f"out={folder}/r")
+    done = run(
+        folder, "study", "study=graphs", "study.part=activation", "study.seeds=[0,1,2]", f"out={folder}/r"
+    )
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout, "nothing was to be trained"
     page = (folder / "r" / "study_activation.md").read_text()
@@ -66,10 +67,11 @@ def test_finished_runs_are_found_and_judged(run, folder):
     ("arguments", "named"),
     [
         ((), "which study"),
-        (["study=pooling"], "graph_pooling"),
-        (["study=norm", "study.seeds=[]"], "seeds"),
-        (["study=norm", "study.statements.0.claim=fewer"], "study.statements[0].claim=fewer must be"),
-        (["study=norm", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
+        (["study=margin"], "margins"),
+        (["study=graphs", "study.part=pooling"], "graph_pooling"),
+        (["study=graphs", "study.seeds=[]"], "seeds"),
+        (["study=layouts", "study.statements.0.claim=fewer"], "study.statements[0].claim=fewer must be"),
+        (["study=graphs", "study.statements=[{id: a, says: b}]"], "study.statements[0]"),
     ],
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, tmp_path):
@@ -89,10 +91,13 @@ def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, 
 def test_what_is_missing_is_trained_and_what_failed_is_told(run, tmp_path):
     # graph convolutions know this pooling, the transformer does not
     few = ["smoke=true", "study.seeds=[0]", "simulator=naive", "+model.pooling=attention", "out=r"]
-    done = run(tmp_path, "study", "study=transformer", *few)
+    done = run(tmp_path, "study", "study=graphs", "study.part=transformer", *few)
     assert done.returncode == 1, done.stderr
     assert done.stdout.count("took") == 1
-    assert all(setting in done.stdout.replace("\n", "") for setting in SMOKE[:2])
+    assert all(
+        setting in done.stdout.replace("\n", "")
+        for setting in ("data.gestures=80", "device.test_gestures=48")
+    )
     page = (tmp_path / "r" / "smoke" / "study_transformer.md").read_text()
     assert "SMOKE" in done.stdout
     assert "SMOKE" in page
@@ -113,7 +118,8 @@ def trained(run, tmp_path_factory):
 
 @pytest.mark.slow
 def test_finished_runs_are_tried_under_conditions_once(run, trained):
-    words = ["study=dead", "simulator=naive", "study.devices=2", "device.test_gestures=48", "out=dead"]
+    words = ["study=robustness", "study.part=dead", "simulator=naive", "study.devices=2"]
+    words += ["device.test_gestures=48", "out=dead"]
     done = run(trained, "study", *words)
     assert done.returncode == 0, done.stderr
     found = lines(trained / "dead" / "study_dead.csv")
@@ -121,12 +127,15 @@ def test_finished_runs_are_tried_under_conditions_once(run, trained):
     assert {line["variant"].split()[0] for line in found} == {"rules", "temporal_graph"}
     assert all(0.25 < float(line["same/overall/accuracy"]) < 1 for line in found)
     assert "undecided" in done.stdout
-    before = runs(trained)
+    before, files = runs(trained), {path: path.stat().st_mtime_ns for path in trained.rglob("*-*.parquet")}
+    assert len(files) == 2 * 4 * 2
     again = run(trained, "study", *words)
     assert (again.returncode, again.stdout) == (0, done.stdout), again.stderr
     assert runs(trained) == before
+    assert [name for name, _ in before].count("study dead") == 1
+    assert {path: path.stat().st_mtime_ns for path in trained.rglob("*-*.parquet")} == files
     assert lines(trained / "dead" / "study_dead.csv") == found
-    refused = run(trained, "study", "study=dead", "simulator=naive", "study.rows=[gru]")
+    refused = run(trained, "study", *words[:3], "study.rows=[gru]")
     assert refused.returncode == 2
     assert "no finished run of gru" in refused.stderr
 
@@ -141,7 +150,7 @@ def test_a_condition_changes_the_device_as_an_evaluation_does(run, trained):
         "device.test_gestures=48",
         "out=misplaced",
     ]
-    done = run(trained, "study", "study=misplaced", *few)
+    done = run(trained, "study", "study=robustness", "study.part=misplaced", *few)
     assert done.returncode == 0, done.stderr
     found = {line["condition"]: line for line in lines(trained / "misplaced" / "study_misplaced.csv")}
     device = ["device.seed=1", "device.position_error=0.005", "device.test_gestures=48"]
@@ -213,18 +222,6 @@ def test_a_run_is_probed_beside_graph_embeddings(run, trained):
 
 
 @pytest.mark.slow
-def test_a_skin_itself_is_measured(run, tmp_path):
-    words = ["study=motion", "study.measure.gestures=40", "out=r"]
-    done = run(tmp_path, "study", *words)
-    assert done.returncode == 0, done.stderr
-    assert "below 1 %, no effect possible" in done.stdout
-    assert "mm into the skin" in (tmp_path / "r" / "study_motion.md").read_text()
-    done = run(tmp_path, "study", *words, "simulator=naive")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert "constraint" in done.stderr
-
-
-@pytest.mark.slow
 def test_every_simulator_against_every_other(run, tmp_path):
     skin = ["body.cells=[8,8]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.redraws=100",
             "touch.small_area=[0.1,0.3]", "study.rows=[rules]", "study.seeds=[0]", "out=r"]  # fmt: skip
@@ -263,8 +260,8 @@ def test_rows_decide_together(run, trained):
     done = run(trained, "study", *words, *NAIVE, "out=ensemble")
     assert done.returncode == 0, done.stderr
     found = {line["variant"]: line for line in lines(trained / "ensemble" / "study_ensemble.csv")}
-    assert list(found) == ["rules", "temporal_graph", "ensemble_vote", "ensemble_average"]
-    assert 0 < float(found["ensemble_vote"]["same/any/disagreement"]) < 1
+    assert list(found) == ["rules", "temporal_graph", "vote"]
+    assert 0 < float(found["vote"]["same/any/disagreement"]) < 1
 
 
 @pytest.mark.slow
@@ -287,12 +284,12 @@ def test_a_study_of_ones_own_needs_a_file_only(run, tmp_path):
 
 @pytest.mark.slow
 def test_a_multirun_of_studies_is_no_run_itself(run, trained):
-    few = ["study=pair", "study.seeds=[0]", "study.rows=[rules]", "out=one,two"]
+    few = ["study=ensemble", "study.train=false", "study.seeds=[0]", "study.rows=[rules]", "out=one,two"]
     before = runs(trained)
     done = run(trained, "study", "-m", *few, *NAIVE)
     assert done.returncode == 0, done.stderr
-    assert [(trained / name / "study_pair.md").is_file() for name in ("one", "two")] == [True, True]
-    assert runs(trained) == before
+    assert [(trained / name / "study_ensemble.md").is_file() for name in ("one", "two")] == [True, True]
+    assert {*runs(trained)} - {*before} <= {("study ensemble", "FINISHED")}
 
 
 @pytest.mark.slow
@@ -301,7 +298,14 @@ def test_a_simulator_that_selects_runs_keeps_their_settings(run, tmp_path):
     done = run(tmp_path, "train", "experiment=rules", "simulator=fem", "simulator.reading=interface", *SMALL)
     assert done.returncode == 0, done.stderr
     few = ["device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0"]
-    words = ["study=dead", "simulator=fem", "study.rows=rules", "study.devices=1", few[0]]
+    words = [
+        "study=robustness",
+        "study.part=dead",
+        "simulator=fem",
+        "study.rows=rules",
+        "study.devices=1",
+        few[0],
+    ]
     done = run(tmp_path, "study", *words)
     assert done.returncode == 0, done.stderr
     found = lines(tmp_path / "results" / "study_dead.csv")[0]
@@ -313,3 +317,29 @@ def test_a_simulator_that_selects_runs_keeps_their_settings(run, tmp_path):
             "and key = 'same/overall/accuracy'"
         ).fetchone()
     assert float(found["same/overall/accuracy"]) == pytest.approx(value)
+
+
+@pytest.mark.slow
+def test_the_table_is_a_study_with_the_reports_numbers_and_its_figures(run, trained):
+    """Rows that it does not train stand in it once they have finished; two trainings run at a time."""
+    done = run(trained, "train", "experiment=best_fresh", "trainer.max_epochs=1", *NAIVE)
+    assert done.returncode == 0, done.stderr
+    rows = "study.trainings.0.experiment=[rules,temporal_graph,gru]"
+    words = [
+        "study=table",
+        "study.trainings.0.simulator=[naive]",
+        rows,
+        "study.jobs=2",
+        "trainer.max_epochs=1",
+    ]
+    done = run(trained, "study", *words, *SMALL, "out=table")
+    assert done.returncode == 0, done.stderr
+    found = {line["variant"]: line for line in lines(trained / "table" / "study_table.csv")}
+    assert list(found) == ["rules", "temporal_graph", "gru", "best_fresh"]
+    assert found["temporal_graph"]["reference"] == "0.85"
+    assert " (85.0) | " in (trained / "table" / "study_table.md").read_text()
+    names = {path.name for path in (trained / "table").iterdir()}
+    assert names >= {"figure07_speed_naive.csv", "figure08_confusion_naive.png", "figure10_naive_naive.png"}
+    assert "took" in done.stdout
+    again = run(trained, "study", *words, *SMALL, "out=table")
+    assert "took" not in again.stdout

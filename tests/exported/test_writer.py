@@ -9,6 +9,7 @@ from skin.exported.model import ExportedModel
 from skin.hardware.live.engine_builder import describe
 from skin.learner.rules import Rules
 from skin.recording import Touches
+from skin.representation.graph import Graph
 
 pytest.importorskip("onnxruntime")
 from skin.exported.writer import TOLERANCE, write_model
@@ -76,13 +77,12 @@ def test_a_learner_that_is_no_network_is_refused():
 
 
 def test_a_graph_per_frame_is_refused_and_nothing_is_written(untrained, tmp_path):
-    moving = ["device.track=oracle", "simulator=fem", "simulator.constraint=free"]
-    of = untrained("experiment=sequence_graph", "representation.positions=deformed", *moving)
-    described = describe(of, "abc", "row", 0.3)
+    of = untrained("experiment=sequence_graph")
+    described, touches = describe(of, "abc", "row", 0.3), of.device.touches("test")[:9]
+    pipeline = of.learner.pipeline(of.positions)
+    pipeline.representation = Graph(of.positions, of.device.size, positions="deformed")
     with pytest.raises(InputError, match="needs touches with displacements"):
-        write_model(
-            of.learner.pipeline(of.positions), described, of.device.touches("test")[:9], tmp_path / "x.onnx"
-        )
+        write_model(pipeline, described, touches, tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())
 
 

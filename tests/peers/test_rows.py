@@ -7,7 +7,6 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from experiments import peers
-from experiments.studies.table_rows import Entries
 from skin.build import build_learner
 from skin.config import Tracking, fingerprint, plain, validate_config
 from skin.datamodule import TouchData
@@ -27,10 +26,10 @@ SMALL = [
 ]
 
 
-def composed(row):
+def composed(row, *words):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         search = f"hydra.searchpath=['file://{peers.CONF}']"
-        return validate_config(compose("train", [search, f"experiment={row}"]))
+        return validate_config(compose("train", [search, f"experiment={row}", *words]))
 
 
 @pytest.mark.parametrize("row", peers.ROWS)
@@ -53,7 +52,14 @@ def ran(run, tmp_path_factory):
             return run(folder, verb, *words)
 
     train = ["--config-dir", str(peers.CONF), "experiment=ridge", "simulator=naive", *SMALL]
-    study = ["study=dead", "study.rows=[ridge]", "study.devices=1", "simulator=naive", f"out={folder}/out"]
+    study = [
+        "study=robustness",
+        "study.part=dead",
+        "study.rows=[ridge]",
+        "study.devices=1",
+        "simulator=naive",
+        f"out={folder}/out",
+    ]
     return folder, command("train", *train), command("study", *study)
 
 
@@ -62,10 +68,7 @@ def test_a_peer_is_a_run_that_the_table_finds(ran):
     folder, first, _ = ran
     assert first.returncode == 0, first.stderr
     store = Store.open(Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None))
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        entries = Entries(["sweep=table", "seed=0", "simulator=naive", *SMALL])
-    (config,) = [config for config in entries.others if config.row == "ridge"]
-    (run,) = store.find("FINISHED", fingerprint=fingerprint(config))
+    (run,) = store.find("FINISHED", fingerprint=fingerprint(composed("ridge", "simulator=naive", *SMALL)))
     for column in ("same", "holdout", "device_shift", "unseen_layout"):
         assert f"{column}/overall/accuracy" in run.data.metrics
     # Per label 25 sensors x 30 frames, an intercept, and two numbers of its logistic curve.

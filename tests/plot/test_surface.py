@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from experiments.studies.report_figures import draw_skin
 from skin.body.arm import Arm
 from skin.body.sheet import Sheet
-from skin.build import build_device
 from skin.layout.grid import Grid
 from skin.plot.surface import deflection, surface, surface_motion
 from skin.sensors import Sensors
@@ -82,19 +79,3 @@ def test_the_map_shows_millimetres():
     shown = figure.axes[1].images[0]
     assert np.asarray(shown.get_array()).max() == 2
     assert shown.get_extent() == pytest.approx((0, 60, 40, 0))
-
-
-@pytest.mark.slow
-def test_the_gallery_draws_the_skin(configured, tmp_path):
-    paths = draw_skin(build_device(configured("device.test_gestures=400")), tmp_path)
-    assert {path.name for path in paths} == {
-        "overview.png",
-        "figure02_hand_top.png",
-        "figure03_hand_bottom.png",
-        "figure04_interpolations.png",
-        "figure10_naive_fem.png",
-        "figure11_force_reading.png",
-    }
-    for path in paths:
-        with Image.open(path) as picture:
-            assert min(picture.size) > 200

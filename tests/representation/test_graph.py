@@ -232,7 +232,7 @@ def test_motion_moves_the_gradient_too():
 
 
 def test_a_deformed_graph_needs_to_know_the_motion():
-    with pytest.raises(InputError, match=r"device\.track=oracle simulator\.constraint=free"):
+    with pytest.raises(InputError, match=r"Touches\(motion=\.\.\.\), or set"):
         Graph(PLACES, BODY.size, positions="deformed").show(touches())
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from experiments.studies.comparison import Paired, combine_verdicts, estimate, paired, verdict
+from experiments.studies.comparison import Paired, Uncertainty, combine_verdicts, estimate, paired, verdict
 
 
 def test_a_paired_difference_is_that_of_the_paired_t_test():
@@ -132,3 +132,18 @@ def test_gestures_that_are_not_the_same_are_not_paired():
     assert found.error == pytest.approx(math.sqrt(1 / 3 + 2 / 2))
     same = np.array([1.0, 2.0, 9.0, np.nan])
     assert paired(*seeds, gestures=(same, same + 1)).error == 0
+
+
+@pytest.mark.parametrize(
+    ("row", "overall", "gestures", "margin"),
+    [
+        ("features", (0.9685624987, 0.9671875089, 0.9696249962), 0.0011895, 0.0038),
+        ("sequence_image", (0.8360625058, 0.8515625, 0.8457499892), 0.0020765, 0.0199),
+    ],
+)
+def test_the_margin_of_three_published_seeds_is_that_of_students_distribution(row, overall, gestures, margin):
+    """The published rows: features had ± 0.28 points with two standard errors, sequence_image ± 1.0."""
+    found = estimate(dict(enumerate(overall)), {}, None)
+    assert found.margin == pytest.approx(4.30265 * found.error, rel=1e-5)
+    both = Uncertainty.together(Uncertainty(*found[1:]), Uncertainty(gestures, 1.9606 * gestures))
+    assert both.margin == pytest.approx(margin, abs=5e-5), row

@@ -7,15 +7,17 @@ from omegaconf import OmegaConf
 
 from experiments import peers
 from experiments.studies.comparison import Paired, verdict
-from experiments.studies.study import Study, variants
+from experiments.studies.study import chosen_studies, variants
+from experiments.studies.study_page import read_reference
 from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.paths import CONF
 
-NAMES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
+FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "study").glob("*.yaml"))}
+NAMES = [(name, part) for name, file in FILES.items() for part in file.get("parts", {"": {}})]
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 KINDS = ("accuracy", "balanced_accuracy", "ece", "alarm_recall", "false_alarm_rate", "degrees")
-SENSORS = "study=sensors_other", "study.seeds=[0]"
+SENSORS = "study=sensors", "study.part=sensors_other", "study.seeds=[0]"
 SHARES = ("0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "whole")
 STREAMS = {f"share/{share}/overall/accuracy" for share in SHARES} | {
     f"gate/{gate}/accuracy" for gate in ("threshold", "learned")
@@ -25,7 +27,7 @@ OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "self_share", "sam
 
 @pytest.fixture(scope="module")
 def composed():
-    """Return a function from overrides to a study and its variants, as the command has them."""
+    """Return a function from overrides to the last chosen study and its variants, as the command has them."""
     made = {}
 
     def make(*words):
@@ -34,23 +36,28 @@ def composed():
                 config = compose("study", list(words), return_hydra_config=True)
                 HydraConfig.instance().set_config(config)
                 own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-                study = Study.of(validate_config(own))
+                *_, study = chosen_studies(validate_config(own))
                 made[words] = study, variants(study)
         return made[words]
 
     return make
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_study_composes_and_says_what_it_is_about(composed, name):
-    study, every = composed(f"study={name}", "study.seeds=[0]")
+def words(name, part):
+    return [f"study={name}", *([f"study.part={part}"] if part else []), "study.seeds=[0]"]
+
+
+@pytest.mark.parametrize(("name", "part"), NAMES)
+def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
+    study, every = composed(*words(name, part))
+    assert study.name == part or name
     assert study.about
-    assert bool(study.trainings) or study.rows is not None or study.measure is not None
+    assert study.trainings or study.rows or study.run or study.measure
     assert len({one.name for one in every}) == len(every)
     prints = [fingerprint(one.configs["0"]) for one in every]
     assert len(set(prints)) == len(every)
     if study.differences is None and study.trainings:
-        assert study.statements or study.conditions
+        assert study.statements or study.conditions or study.reference
     known = {f"{column}/{label}/{kind}" for column in ("same", "holdout", "device_shift", "unseen_layout")
              for label in (*LABELS, "direction") for kind in (*KINDS, "error")}  # fmt: skip
     known |= OTHER | {"same/direction/degrees"} | {f"train_accuracy_{label}" for label in LABELS}
@@ -63,7 +70,7 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name):
         lines = [
             one.chosen | {"condition": condition} for one in every for condition in study.conditions or ("",)
         ]
-        lines += [{"row": way} for way in study.ensembles]
+        lines += [{"name": "vote"}] if study.vote else []
         if not study.trainings:  # finished runs of any row
             rows = [path.stem for path in (CONF / "experiment").glob("*.yaml")] + peers.ROWS
             lines = [{"row": row, "condition": condition} for row in rows for condition in study.conditions]
@@ -73,7 +80,7 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name):
 
 
 def test_statements_have_their_own_names(composed):
-    names = [said.id for name in NAMES for said in composed(f"study={name}", "study.seeds=[0]")[0].statements]
+    names = [said.id for pair in NAMES for said in composed(*words(*pair))[0].statements]
     assert len(names) == len(set(names))
 
 
@@ -86,13 +93,13 @@ def test_studies_share_the_runs_that_they_have_in_common(composed):
     }
     prints = set()
     for study, name in picked.items():
-        _, every = composed(f"study={study}", "study.seeds=[0]")
+        _, every = composed(*words("graphs", study))
         prints |= {fingerprint(one.configs["0"]) for one in every if one.name == name}
     assert len(prints) == 1
 
 
 def test_variants_are_named_by_what_tells_them_apart(composed):
-    _, every = composed("study=image_representation", "study.seeds=[0,1]")
+    _, every = composed("study=images", "study.part=image_representation", "study.seeds=[0,1]")
     assert [one.name for one in every][1:3] == [
         "sequence_image representation=fourier",
         "interp method=nearest",
@@ -103,7 +110,7 @@ def test_variants_are_named_by_what_tells_them_apart(composed):
 
 
 def test_settings_of_the_command_line_hold_for_every_variant(composed):
-    _, every = composed("study=norm", "study.seeds=[0]", "device.noise=0.2", "trainer.max_epochs=3")
+    _, every = composed(*words("graphs", "norm"), "device.noise=0.2", "trainer.max_epochs=3")
     for one in every:
         config = one.configs["0"]
         assert (config.device.noise, config.trainer.max_epochs) == (0.2, 3)
@@ -119,17 +126,21 @@ def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
 
 def test_one_row_is_a_list_of_one(composed):
     """As text, best_fresh would contain best."""
-    assert composed("study=dead", "study.rows=best_fresh")[0].rows == ["best_fresh"]
-    assert composed("study=dead")[0].rows == "all"
+    assert composed(*words("robustness", "dead"), "study.rows=best_fresh")[0].rows == ["best_fresh"]
+    assert composed(*words("robustness", "dead"))[0].rows == "all"
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "which study.*norm"),
-        (("study=norm", "study.seeds=[]"), "study.seeds"),
-        (("study=norm", "study.seeds=[-1]"), "study.seeds"),
-        (("study=dead", "study.devices=-1"), "study.devices=-1"),
+        ((), "which study.*graphs"),
+        (("study=graphs", "study.part=norms"), "study.part=norms is none of the parts of study=graphs.*norm"),
+        (("study=layouts", "study.part=norm"), "none of the parts of study=layouts: none"),
+        (("study=graphs", "study.name=x"), "study.name=x names one part"),
+        (("study=table", "study.jobs=0"), "study.jobs=0"),
+        (("study=graphs", "study.seeds=[]"), "study.seeds"),
+        (("study=layouts", "study.seeds=[-1]"), "study.seeds"),
+        (("study=robustness", "study.part=dead", "study.devices=-1"), "study.devices=-1"),
         (("study=margins", "study.measure.gestures=0"), "study.measure.gestures=0"),
         (("study=holds", "study.measure.rate=0"), "study.measure.rate=0"),
         (("study=streams", "study.measure.hours=0"), "hours=0"),
@@ -142,3 +153,36 @@ def test_one_row_is_a_list_of_one(composed):
 def test_settings_that_cannot_be_used_are_refused_by_name(composed, words, said):
     with pytest.raises(InputError, match=said):
         composed(*words)
+
+
+def test_the_command_line_counts_for_every_part(composed):
+    """Also where the part has the setting itself."""
+    study, _ = composed("study=robustness", "study.devices=2", "+study.test.device=simulated")
+    assert (study.name, study.devices, study.test) == ("rate", 2, {"device": "simulated"})
+    study, _ = composed(*words("robustness", "dead"), "study.devices=2", "+study.test.device=simulated")
+    assert (study.devices, study.test["device"], study.test["device.test_gestures"]) == (2, "simulated", 800)
+    study, _ = composed("study=streams", "study.part=streams_trained", "study.measure.windows=[3.0]")
+    assert (study.rows, study.measure.windows) == (["features"], (3.0,))
+
+
+def test_the_table_has_the_rows_of_its_sweep_and_those_of_other_commands(composed):
+    """All rows, and on the simulators that are chosen."""
+    _, every = composed(*words("table", ""), "study.trainings.0.simulator=[solid]")
+    assert {one.chosen["simulator"] for one in every} == {"solid"}
+    rows = {path.stem for path in (CONF / "experiment").glob("*.yaml")} | {*peers.ROWS}
+    assert {one.chosen["experiment"] for one in every} == rows
+    assert {one.chosen["experiment"] for one in every if one.trained} == {
+        *OmegaConf.load(CONF / "sweep" / "table.yaml").hydra.sweeper.params.experiment.split(",")
+    }
+    _, few = composed(*words("table", ""), "study.rows=[rules,gru]")
+    assert [one.name for one in few] == ["naive rules", "naive gru", "fem rules", "fem gru"]
+
+
+def test_the_reports_numbers_belong_to_rows_of_the_table(composed):
+    known = read_reference("data/report_table.csv")
+    rows = {(one.chosen["experiment"], one.chosen["simulator"]) for one in composed(*words("table", ""))[1]}
+    assert {(row, simulator) for row, simulator, _ in known} <= rows
+    assert known["sequence_image", "fem", "overall"] == 0.771
+    for row in ("temporal_graph", "sequence_graph", "sequence_image"):
+        each = [known[row, "fem", label] for label in LABELS[1:]]
+        assert known[row, "fem", "overall"] == pytest.approx(sum(each) / 4, abs=2e-3)

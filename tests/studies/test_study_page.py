@@ -4,16 +4,24 @@ import csv
 import io
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
 from experiments.studies.comparison import Paired
+from experiments.studies.figures import study_figure
 from experiments.studies.outcomes import StatementResult
 from experiments.studies.study import Statement, Study, Variant
-from experiments.studies.study_figure import study_figure
-from experiments.studies.study_page import comparison_text, publish_files, publish_study, variants_table
+from experiments.studies.study_page import (
+    comparison_text,
+    publish_files,
+    publish_study,
+    read_reference,
+    variants_table,
+)
 from experiments.studies.trials import Trial
+from skin.errors import InputError
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
 METRICS = [
@@ -181,13 +189,13 @@ def test_several_variants_under_several_conditions_have_a_line_each_and_a_legend
 
 
 def test_files_of_several_runs_become_one(tmp_path, capsys):
-    files = [tmp_path / "a.csv", tmp_path / "b.csv"]
-    for number, file in enumerate(files):
-        file.write_text(f'course,alarms\n"hold, 1 s",{number}\n')
-        file.with_suffix(".md").touch()
     trials = [
-        replace(trial("a", str(n), None), run=f"run{n}", files=[file.with_suffix(".md"), file])
-        for n, file in enumerate(files)
+        replace(
+            trial("a", str(n), None),
+            run=f"run{n}",
+            files={"a.md": b"", "a.csv": f'course,alarms\n"hold, 1 s",{n}\n'.encode()},
+        )
+        for n in range(2)
     ]
     path = tmp_path / "study_edges.csv"
     publish_files(STUDY, trials[:1], path)
@@ -199,3 +207,44 @@ def test_files_of_several_runs_become_one(tmp_path, capsys):
         'a,1,run1,"hold, 1 s",1',
     ]
     assert capsys.readouterr().out == f"{path}\n"
+
+
+def reported(name, accuracy, simulator="fem", **more):
+    chosen = {"row": name, "simulator": simulator}
+    return replace(trial(name, "0", accuracy), variant=Variant(name, chosen, {}), **more)
+
+
+def test_the_reports_number_stands_where_it_has_one():
+    reference = {("temporal_graph", "fem", "overall"): 0.732}
+    metrics = [*METRICS[:2], "unseen_layout/overall/accuracy", "device_shift/overall/accuracy"]
+    runs = [reported("temporal_graph", 0.8, cannot=["unseen_layout"]), reported("gru", 0.9)]
+    assert variants_table(runs, metrics, reference)[1:] == [
+        ["temporal_graph", "80.0 (73.2)", "80.0", "cannot", ""],
+        ["gru", "90.0", "90.0", "", ""],
+    ]
+
+
+def test_the_margin_is_also_one_over_gestures():
+    """By hand: half of 100 gestures have one of four labels wrong."""
+    codes = np.repeat(np.array([0, 1], dtype=np.uint8), 50)
+    # a standard deviation of 0.125 sqrt(100 / 99) over gestures, by sqrt(100); 1.984 of them
+    assert variants_table([reported("rules", 0.875, outcomes=codes)], METRICS[:1])[1] == [
+        "rules",
+        "87.5 ± 2.5",
+    ]
+    right = np.zeros(100, dtype=np.uint8)
+    assert variants_table([reported("rules", 1.0, outcomes=right)], METRICS[:1])[1] == [
+        "rules",
+        "100.0 ± 0.0",
+    ]
+
+
+def test_the_csv_has_the_reference_and_another_file_may_be_chosen(tmp_path):
+    path = tmp_path / "report.csv"
+    path.write_text("row,simulator,label,value\ngru,fem,overall,0.5\n")
+    study = replace(STUDY, reference=str(path), statements=())
+    publish_study(study, "t", [reported("gru", 0.9), reported("rules", 0.8)], tmp_path / "s")
+    lines = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
+    assert [line["reference"] for line in lines] == ["0.5", ""]
+    with pytest.raises(InputError, match=r"study\.reference=nowhere"):
+        read_reference("nowhere")

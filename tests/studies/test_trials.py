@@ -2,12 +2,17 @@
 
 import functools
 import time
+from dataclasses import replace
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from experiments.studies import trials
-from experiments.studies.study import Study
-from experiments.studies.trials import _Run, numbered_settings
+from experiments.studies.measures import Margins
+from experiments.studies.study import Study, Variant
+from experiments.studies.trials import RestoredRun, Trial, numbered_settings, read_row, votes, write_row
 from skin.config import fingerprint
 from skin.errors import InputError
 from skin.pretrained import find_pretrained
@@ -15,6 +20,21 @@ from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+
+ROW = {
+    "run": "a" * 16,
+    "name": "rules",
+    "condition": "rough",
+    "device": "2",
+    "measure": "Accuracy()",
+    "source": {"source_commit": "0", "source_dirty": "false"},
+    "metrics": {"same/overall/accuracy": 0.5},
+    "line": "a line",
+    "cannot": "",
+    "outcomes": b"\x00\x01",
+    "files": {"a.csv": b"x\n1\n"},
+}
 
 
 def study(**settings):
@@ -46,29 +66,28 @@ def test_lists_of_different_lengths_are_refused():
 @pytest.fixture
 def measured(configured, tmp_path, monkeypatch):
     """Finish a training anew, or take a given run; return a function that counts its trials."""
+    monkeypatch.chdir(tmp_path)
     config = configured("experiment=rules", f"tracking.uri=sqlite:///{tmp_path}/m.db")
     store, count = Store.open(config.tracking), []
 
-    def measure(self, what, own, name, tags, changed):
+    def measure(self, what, own, name):
         count.append(name)
-        with store.run(name, tags) as run:
-            pass
-        return store.client.get_run(run.info.run_id)
+        return ROW | {"run": self.run.data.tags["fingerprint"], "name": name}
 
-    monkeypatch.setattr(_Run, "_measure", measure)
+    monkeypatch.setattr(RestoredRun, "_measured", measure)
     compose = functools.partial(configured, "experiment=rules")
     monkeypatch.setattr(trials, "compose", lambda name, words: compose(*words))
 
-    def train(run=None):
+    def train(run=None, **settings):
         if run is None:
             with store.run("rules", {"fingerprint": fingerprint(config)}) as run:
                 pass
             run = store.client.get_run(run.info.run_id)
-        own = _Run(store, run, config)
+        own = RestoredRun(store, run, config)
         own.stored = config
 
-        def trial():
-            own.measured(study(), [], ["device.dead=1"])
+        def trial(line="device.dead=1"):
+            assert own.measure(study(**settings), "a, b", "1", [], [line])["metrics"] == ROW["metrics"]
             return len(count)
 
         return trial
@@ -76,9 +95,13 @@ def measured(configured, tmp_path, monkeypatch):
     return train
 
 
-def test_a_trial_is_measured_once_for_a_training(measured):
+def test_a_trial_is_measured_once_for_a_training(measured, tmp_path):
     trial = measured()
     assert [trial(), trial()] == [1, 1]
+    assert [trial("device.dead=2"), trial("device.dead=2"), trial()] == [2, 2, 2]
+    table = pq.read_table(tmp_path / "results" / "trials" / "x").to_pylist()
+    assert [(row["condition"], row["device"]) for row in table] == [("a, b", "1")] * 2
+    assert measured(measure=Margins(100))() == 3
 
 
 def test_a_trial_of_a_pretrained_model_is_measured_once(measured):
@@ -93,3 +116,41 @@ def test_a_trial_of_an_earlier_training_is_not_reused(measured):
     time.sleep(0.01)  # MLflow counts milliseconds
     again = measured()
     assert [again(), again()] == [2, 2]
+
+
+def test_a_row_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path):
+    path = tmp_path / "new" / "a.parquet"
+    assert read_row(path) is None
+    write_row(ROW, path)
+    assert read_row(path) == ROW
+    assert [file.name for file in path.parent.iterdir()] == ["a.parquet"]
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="remove it, and it is measured again"):
+        read_row(path)
+    pq.write_table(pa.table({"run": ["a"]}), path)
+    with pytest.raises(InputError, match="not one row of results"):
+        read_row(path)
+
+
+def trial(model, seed, outcomes, **chosen):
+    codes = None if outcomes is None else np.array(outcomes, dtype=np.uint8)
+    return Trial(
+        Variant(model, {"experiment": model, **chosen}, {}), seed, "", "", f"run_{model}", {}, outcomes=codes
+    )
+
+
+def test_models_vote_by_seed_and_by_equal_other_settings():
+    """Of three gestures, the second is wrong in two of three models, the third in one."""
+    found = [trial("a", "0", [0, 1, 0]), trial("b", "0", [0, 1, 1]), trial("c", "0", [0, 0, 0])]
+    found += [trial("d", "0", [1, 1, 1]), trial("a", "1", [0, 0, 0]), trial("b", "1", None)]
+    (vote,) = votes(study(vote=["a", "b", "c"]), found)
+    assert (vote.variant.name, vote.seed, vote.run) == ("vote", "0", "run_a run_b run_c")
+    assert vote.metrics["same/big/accuracy"] == pytest.approx(2 / 3)
+    assert vote.metrics["same/dynamic/accuracy"] == 1
+    assert vote.metrics["same/any/disagreement"] == pytest.approx(2 / 3)
+    assert not list(votes(study(), found))
+    both = [replace(one, variant=replace(one.variant, chosen={**one.variant.chosen, "simulator": name}))
+            for name in ("naive", "fem") for one in found[:3]]  # fmt: skip
+    assert [one.variant.name for one in votes(study(vote="all"), both)] == ["naive vote", "fem vote"]

@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from experiments.studies.embedding.graphs import doc2vec, invariant, levels, line_graph, subtrees
+from experiments.studies.embeddings import doc2vec, invariant, levels, line_graph, subtrees
 
 
 def network(seed=0, nodes=9):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.embedding.probe import FRAME, accuracy, explained, probe, strongest
-from experiments.studies.embedding.probe_settings import ProbeSettings
+from experiments.studies.embeddings import FRAME, accuracy, explained, probe, strongest
+from experiments.studies.measures import ProbeSettings
 from skin.build import build_device
 from skin.recording import Touches
 

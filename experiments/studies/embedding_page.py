@@ -10,7 +10,7 @@ from sklearn.decomposition import PCA
 from sklearn.manifold import TSNE
 
 from experiments.studies.comparison import combine_verdicts, paired, verdict
-from experiments.studies.embedding.probe import FRAME, ProbeResult
+from experiments.studies.embeddings import FRAME, ProbeResult
 from experiments.studies.tables import Page
 from skin.plot.figures import COLOURS, MARKS
 

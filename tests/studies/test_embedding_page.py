@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.studies.embedding.probe import FRAME, ProbeResult, Space
-from experiments.studies.embedding_spaces import embedding_statements, embeddings_table, planes, spaces
+from experiments.studies.embedding_page import embedding_statements, embeddings_table, planes, spaces
+from experiments.studies.embeddings import FRAME, ProbeResult, Space
 
 NAMES = ("big", "press")
 

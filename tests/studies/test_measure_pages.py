@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from experiments.studies.streams_page import build_streams_page, streams_summary
+from experiments.studies.measure_pages import streams_page, streams_summary
 from experiments.studies.tables import publish_page
 from skin.evaluation.alarm import Alarms
 from skin.evaluation.operating_point import OperatingPoint
@@ -40,7 +40,7 @@ def test_the_line_says_what_matters():
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     return publish_page(
-        build_streams_page(FOUND, "rules fem 0"),
+        streams_page(FOUND, "rules fem 0"),
         "rules fem 0",
         tmp_path_factory.mktemp("results") / "stream_rules",
     )

@@ -1,1 +1,0 @@
-"""Graph embeddings without training, and what they tell of a touch."""

@@ -51,12 +51,6 @@ def test_a_benchmark_takes_its_settings(path):
     check_settings(import_target(part["_target_"], "benchmark"), part, "benchmark", whole=True)
 
 
-def test_the_table_refuses_bad_arguments(run, tmp_path):
-    done = run(tmp_path, "table", "table.seeds=0", store=False)
-    assert done.returncode == 2
-    assert "table.seeds=0 must be greater" in done.stderr
-
-
 @pytest.mark.slow
 def test_building_starts_cold_each_time(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))

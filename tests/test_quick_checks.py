@@ -33,7 +33,7 @@ def test_a_wrong_setting_is_refused(overrides, message):
         check(*overrides)
 
 
-@pytest.mark.parametrize("name", ["train", "live", "export", "adapt", "record", "listen", "emulate", "table"])
+@pytest.mark.parametrize("name", ["train", "live", "export", "adapt", "record", "listen", "emulate", "study"])
 def test_the_defaults_of_every_command_are_accepted(name):
     check(name=name)
 

@@ -70,8 +70,8 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
         store = Store.open(config.tracking)
         planned = find_runs(study, config, store)
         if shard:
-            own = shard.part(run.run.data.tags["fingerprint"] for run in planned if run.run)
-            planned = [run for run in planned if run.run and run.run.data.tags["fingerprint"] in own]
+            fingerprints = shard.part(run.run.data.tags["fingerprint"] for run in planned if run.run)
+            planned = [run for run in planned if run.run and run.run.data.tags["fingerprint"] in fingerprints]
     trials, console = list["Trial"](), Console(stderr=True)
     runs = track(planned, "measuring", console=console, transient=True, disable=not console.is_terminal)
     for trial in (trial for run in runs for trial in run_trials(store, run, study, config)):

@@ -28,23 +28,23 @@ def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
 
     Conditions have a line each, or share the line of their variant if there are several of both.
     """
-    metric, found = study.metrics[0], group_trials(trials)
-    variants, conditions = (list(dict.fromkeys(key[part] for key in found)) for part in (0, 1))
+    metric, groups = study.metrics[0], group_trials(trials)
+    variants, conditions = (list(dict.fromkeys(key[part] for key in groups)) for part in (0, 1))
     shared = len(variants) > 1 and len(conditions) > 1
-    lines = variants if shared else [", ".join(filter(None, key)) for key in found]
+    lines = variants if shared else [", ".join(filter(None, key)) for key in groups]
     height = 0.1 * max(len(conditions), 3) if shared else 0.3
-    drawn = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
-    axis = drawn.subplots()
+    figure = Figure(figsize=(8, 1.2 + height * len(lines)), layout="constrained")
+    axis = figure.subplots()
     scale, labelled = 1 if metric in UNITS else 100, set[str]()
-    for number, ((variant, condition), each) in enumerate(found.items()):
-        if not (every := [scale * one.metrics[metric] for one in each if metric in one.metrics]):
+    for number, ((variant, condition), group) in enumerate(groups.items()):
+        if not (figures := [scale * trial.metrics[metric] for trial in group if metric in trial.metrics]):
             continue
         style = conditions.index(condition) if shared else 0
         apart = 0.8 * ((style + 0.5) / len(conditions) - 0.5) if shared else 0.0
         place = (variants.index(variant) if shared else number) + apart
         colour, marker = COLOURS[style % len(COLOURS)], _MARKERS[style % len(_MARKERS)]
-        mean, _, margin = mean_and_margin(each, metric)
-        axis.plot(every, [place] * len(every), marker, color=colour, alpha=0.35, ms=4)
+        mean, _, margin = mean_and_margin(group, metric)
+        axis.plot(figures, [place] * len(figures), marker, color=colour, alpha=0.35, ms=4)
         ends = colour if shared else "black"
         label = condition or "no condition" if shared and condition not in labelled else None
         labelled.add(condition)
@@ -55,9 +55,9 @@ def _strips(study: Study, trials: Sequence[Trial]) -> Figure:
     axis.set_xlabel(f"{_label(metric)}: each run, mean and 95 % interval")
     axis.set_title(study.about, fontsize=9, wrap=True)
     if shared:
-        drawn.legend(loc="outside right center", fontsize=7)
+        figure.legend(loc="outside right center", fontsize=7)
         axis.grid(axis="y", alpha=0.2)
-    return drawn
+    return figure
 
 
 def _lines(study: Study, trials: Sequence[Trial]) -> Figure:

@@ -85,7 +85,7 @@ def margins_summary(report: MarginReport) -> str:
 
 def _margins_figure(report: MarginReport, title: str) -> Figure:
     """Draw what is said against measure over threshold, and errors against the highest reading."""
-    said = {
+    called = {
         name: np.array(
             [(s.mean, 100 * s.said / s.count, 100 * s.range[0], 100 * s.range[1]) for s in report.spans[name]]
         ).T
@@ -100,7 +100,7 @@ def _margins_figure(report: MarginReport, title: str) -> Figure:
     return draw_panels(
         title,
         [
-            Panel(label, "touches called so, %, with 95 %", said, limits=(0.4, 2.5)),
+            Panel(label, "touches called so, %, with 95 %", called, limits=(0.4, 2.5)),
             Panel("highest reading above idle, N; touches", "wrong, %", wrong, ticks=ticks),
         ],
     )

@@ -134,9 +134,9 @@ class Accuracy:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
             return Measurement({}, cannot=str(reason))
-        found = metrics(chances, touches.labels, task, point)
+        values = metrics(chances, touches.labels, task, point)
         outcomes = encode(chances, touches.labels, task, point)
-        return Measurement({f"same/{name}": value for name, value in found.items()}, outcomes=outcomes)
+        return Measurement({f"same/{name}": value for name, value in values.items()}, outcomes=outcomes)
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,8 @@ class Margins:
         from experiments.studies.measure_pages import margins_page
         from skin.evaluation.margins import margins
 
-        found = margins(subject.learner, subject.device, self.gestures, subject.point())
-        return Measurement(found.metrics, margins_page(found, subject.title))
+        report = margins(subject.learner, subject.device, self.gestures, subject.point())
+        return Measurement(report.metrics, margins_page(report, subject.title))
 
 
 class Streams(StreamSettings):
@@ -184,9 +184,9 @@ class Streams(StreamSettings):
         from skin.evaluation.sliding_windows import evaluate_windows
 
         console = Console(stderr=True)
-        shown = partial(track, description=subject.title, console=console, transient=True)
-        found = evaluate_windows(subject.learner, subject.device, self, subject.point(), shown)
-        return Measurement(found.metrics(), streams_page(found, subject.title))
+        progress = partial(track, description=subject.title, console=console, transient=True)
+        report = evaluate_windows(subject.learner, subject.device, self, subject.point(), progress)
+        return Measurement(report.metrics(), streams_page(report, subject.title))
 
 
 @dataclass(frozen=True)
@@ -217,15 +217,15 @@ class Holds:
         from skin.hardware.live.verdict import DebounceSettings
         from skin.trained import load_trained
 
-        of = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
-        engine = engine_builder.make_engine(of, DebounceSettings(), self.touch, self.drift)
-        device = of.device.simulated("held touches are simulated").replace(stream=False)
+        trained = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
+        engine = engine_builder.make_engine(trained, DebounceSettings(), self.touch, self.drift)
+        device = trained.device.simulated("held touches are simulated").replace(stream=False)
         table = [
             FIELDS,
             *time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True)),
         ]
-        told = (zip(FIELDS, values, strict=True) for values in table[1:])
-        lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in told]
+        courses = (zip(FIELDS, values, strict=True) for values in table[1:])
+        lines = [", ".join(f"{name} {value}" for name, value in line if value) for line in courses]
         return Measurement({}, Page("\n".join(lines), {"Time to alarm": table}, table))
 
 
@@ -257,35 +257,35 @@ class TouchAlarms:
         from skin.rng import Stream, generator
         from skin.touch.sampler import balanced
 
-        of, settings = subject.of.trained, subject.config.evaluation
+        trained, settings = subject.of.trained, subject.config.evaluation
         device = subject.device.simulated("touches are simulated")
-        contact = engine_builder.nominal_settings(of).detection.threshold
+        contact = engine_builder.nominal_settings(trained).detection.threshold
         patience = DebounceSettings().alarm
         aligned = device.rate <= device.model_rate
-        watching = watching_of(of, contact, device.rate, patience, aligned)
-        one = watching_of(of, contact, device.rate, 0.0, aligned)
+        watching = watching_of(trained, contact, device.rate, patience, aligned)
+        at_once = watching_of(trained, contact, device.rate, 0.0, aligned)
         target = settings.false_alarm_rate
         touch = choose_for_touches(subject.learner, device, watching, target)
         window = choose_operating_point(subject.learner, device, settings)
         assert window is not None  # it has the label
         labels = balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
         danger = labels[:, TOUCH.names.index(LABEL)]
-        wanted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
-        scores = touch_scores(subject.learner, device, watching, wanted, _COUNTED)
+        counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
+        scores = touch_scores(subject.learner, device, watching, counted, _COUNTED)
         few = min(self.safe, touch_alarm.SAFE)
-        single = touch_scores(subject.learner, device, one, wanted[:few], _COUNTED)
+        single = touch_scores(subject.learner, device, at_once, counted[:few], _COUNTED)
         tests = device.touches("test")
         chances = subject.learner.probabilities(tests)
         metrics, lines = dict[str, float](), list[str]()
         alarms = touch.alarm(scores)
-        found = {
+        alarms_of = {
             "touch": Reached(
                 self.dangerous, int(alarms[self.safe :].sum()), self.safe, int(alarms[: self.safe].sum())
             ),
-            "window": window.reached(chances, tests.known_labels, of.device.task),
+            "window": window.reached(chances, tests.known_labels, trained.device.task),
             "touch_at_window_threshold": Reached(0, 0, few, int(window.alarm(single).sum())),
         }
-        for name, reached in found.items():
+        for name, reached in alarms_of.items():
             low, high = reached.range
             metrics |= {f"{name}/false_alarm_rate": reached.false_alarm_rate}
             metrics |= {f"{name}/false_alarm_low": low, f"{name}/false_alarm_high": high}
@@ -326,6 +326,6 @@ class Embeddings(ProbeSettings):
         report_balance(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)
-        found = list(track(steps, "probing", count, console=Console(stderr=True)))
+        results = list(track(steps, "probing", count, console=Console(stderr=True)))
         names = device.task.names
-        return Measurement({}, build_embeddings_page(found, names))
+        return Measurement({}, build_embeddings_page(results, names))

@@ -71,10 +71,10 @@ class Difference:
 
 def group_trials(trials: Sequence[Trial]) -> dict[tuple[str, str], list[Trial]]:
     """Return the trials of each variant and condition, in their order."""
-    found: dict[tuple[str, str], list[Trial]] = {}
-    for one in trials:
-        found.setdefault((one.variant.name, one.condition), []).append(one)
-    return found
+    groups: dict[tuple[str, str], list[Trial]] = {}
+    for trial in trials:
+        groups.setdefault((trial.variant.name, trial.condition), []).append(trial)
+    return groups
 
 
 def values(trials: Sequence[Trial], metric: str, by: Literal["seed", "device"] = "seed") -> dict[str, float]:
@@ -85,19 +85,19 @@ def values(trials: Sequence[Trial], metric: str, by: Literal["seed", "device"] =
         metric: as logged; shares come in per cent. ``/error`` is what is missing of ``/accuracy``.
         by: attribute of the trials.
     """
-    first, *rest = metric.split(" - ")
+    first, *subtracted = metric.split(" - ")
     scale = 1 if metric in UNITS else 100
     groups: dict[str, list[float]] = {}
-    for one in trials:
-        known = dict(one.metrics) | {
+    for trial in trials:
+        figures = dict(trial.metrics) | {
             f"{name.removesuffix('accuracy')}error": 1 - value
-            for name, value in one.metrics.items()
+            for name, value in trial.metrics.items()
             if name.endswith("/accuracy")
         }
-        if all(name in known for name in (first, *rest)):
-            value = known[first] - sum(known[name] for name in rest)
-            groups.setdefault(getattr(one, by), []).append(scale * value)
-    return {key: fmean(each) for key, each in groups.items()}
+        if all(name in figures for name in (first, *subtracted)):
+            value = figures[first] - sum(figures[name] for name in subtracted)
+            groups.setdefault(getattr(trial, by), []).append(scale * value)
+    return {key: fmean(sample) for key, sample in groups.items()}
 
 
 def by_gesture(trials: Sequence[Trial], metric: str) -> np.ndarray | None:
@@ -107,15 +107,15 @@ def by_gesture(trials: Sequence[Trial], metric: str) -> np.ndarray | None:
         trials: of one line.
         metric: one of a run on its test gestures; others have no figures by gesture.
     """
-    codes = [one.outcomes for one in trials if one.outcomes is not None]
+    codes = [trial.outcomes for trial in trials if trial.outcomes is not None]
     plain, wrong = metric.removeprefix("same/"), metric.endswith("/error")
     plain = plain.removesuffix("error") + "accuracy" if wrong else plain
     if plain == metric or not decodable(plain, TOUCH):
         return None
     if not codes or len(codes) < len(trials) or len({len(code) for code in codes}) > 1:
         return None
-    found = decode(np.stack(codes), plain, TOUCH)
-    mean: np.ndarray = 100 * (1 - found if wrong else found).mean(axis=0)
+    figures = decode(np.stack(codes), plain, TOUCH)
+    mean: np.ndarray = 100 * (1 - figures if wrong else figures).mean(axis=0)
     return mean
 
 
@@ -146,38 +146,38 @@ def differences(study: Study, trials: Sequence[Trial]) -> list[Difference]:
         return []
     words = {"agree": "better", "disagree": "worse", "undecided": "undecided"}
     by: Literal["seed", "device"] = "device" if study.devices else "seed"
-    found, first = [], dict[str, list[Trial]]()
-    for (variant, condition), each in group_trials(trials).items():
-        base = first.setdefault(variant if study.conditions else "", each)
-        if base is not each:
-            compared = compare(each, base, study.metrics[0], by=by)
+    changes, first = [], dict[str, list[Trial]]()
+    for (variant, condition), group in group_trials(trials).items():
+        base = first.setdefault(variant if study.conditions else "", group)
+        if base is not group:
+            compared = compare(group, base, study.metrics[0], by=by)
             word = words[verdict(study.differences, compared)]
-            found.append(Difference(variant, condition, compared, word))
-    return found
+            changes.append(Difference(variant, condition, compared, word))
+    return changes
 
 
 def _outcome(statement: Statement, trials: Sequence[Trial]) -> StatementResult:
     metric, ratio = statement.metric, statement.claim in RATIOS
-    _, one = _line(statement.one, trials)
-    lines = dict(_line(other, trials) for other in statement.others)
-    compared = {name: compare(one, other, metric, ratio) for name, other in lines.items()}
+    _, first = _line(statement.one, trials)
+    lines = dict(_line(chosen, trials) for chosen in statement.others)
+    compared = {name: compare(first, line, metric, ratio) for name, line in lines.items()}
     if statement.level is not None:
-        own, gestures = values(one, metric), by_gesture(one, metric)
+        figures, gestures = values(first, metric), by_gesture(first, metric)
         level = (1 if metric in UNITS else 100) * statement.level
         even = None if gestures is None else np.full_like(gestures, level)
         compared[f"{statement.level:g}"] = paired(
-            own, dict.fromkeys(own, level), ratio, gestures=(gestures, even)
+            figures, dict.fromkeys(figures, level), ratio, gestures=(gestures, even)
         )
-    verdicts = [verdict(statement.claim, found, statement.by) for found in compared.values()]
+    verdicts = [verdict(statement.claim, comparison, statement.by) for comparison in compared.values()]
     return StatementResult(statement, compared, combine_verdicts(verdicts))
 
 
 def _line(chosen: Mapping[str, str], trials: Sequence[Trial]) -> tuple[str, list[Trial]]:
     """Return the name and the trials of the first line that was so chosen; no trials without one."""
-    for (variant, condition), each in group_trials(trials).items():
-        known = {**each[0].variant.chosen, "condition": condition}
-        if chosen.items() <= known.items():
-            return f"{variant}, {condition}" if condition else variant, each
+    for (variant, condition), group in group_trials(trials).items():
+        settings = {**group[0].variant.chosen, "condition": condition}
+        if chosen.items() <= settings.items():
+            return f"{variant}, {condition}" if condition else variant, group
     return " ".join(chosen.values()), []
 
 

@@ -74,8 +74,8 @@ def _confusion(codes: np.ndarray) -> np.ndarray:
     """Return the confusion matrix of ``dangerous``, (2, 2), over runs and gestures."""
     right = decode(codes, "dangerous/accuracy", TOUCH) > 0.5
     true = ~np.isnan(decode(codes, "dangerous/alarm_recall", TOUCH))
-    said = np.where(right, true, ~true)
-    return np.array([[np.sum((true == row) & (said == column)) for column in (0, 1)] for row in (0, 1)])
+    called = np.where(right, true, ~true)
+    return np.array([[np.sum((true == row) & (called == column)) for column in (0, 1)] for row in (0, 1)])
 
 
 def confusion_rows(codes: Mapping[str, np.ndarray]) -> list[list[str]]:
@@ -85,15 +85,15 @@ def confusion_rows(codes: Mapping[str, np.ndarray]) -> list[list[str]]:
         codes: row -> outcomes of its runs, (N, B).
     """
     lines = [["row", "safe_called_dangerous", "dangerous_called_safe", "difference", "error", "margin"]]
-    for row, each in codes.items():
-        wrong = decode(each, "dangerous/accuracy", TOUCH) < 0.5
-        dangerous = ~np.isnan(decode(each[0], "dangerous/alarm_recall", TOUCH))
+    for row, outcomes in codes.items():
+        wrong = decode(outcomes, "dangerous/accuracy", TOUCH) < 0.5
+        dangerous = ~np.isnan(decode(outcomes[0], "dangerous/alarm_recall", TOUCH))
         kinds = wrong[:, ~dangerous], wrong[:, dangerous]
-        one, other = ({str(run): float(share.mean()) for run, share in enumerate(kind)} for kind in kinds)
+        safe, missed = ({str(run): float(share.mean()) for run, share in enumerate(kind)} for kind in kinds)
         over = kinds[0].mean(axis=0), kinds[1].mean(axis=0)
-        found = paired(one, other, gestures=over)
-        assert found is not None
-        numbers = (over[0].mean(), over[1].mean(), found.mean, found.error, found.margin)
+        difference = paired(safe, missed, gestures=over)
+        assert difference is not None
+        numbers = (over[0].mean(), over[1].mean(), difference.mean, difference.error, difference.margin)
         lines.append([row, *(f"{number:.4f}" for number in numbers)])
     return lines
 

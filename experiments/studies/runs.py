@@ -50,12 +50,14 @@ def train_study(study: Study, shard: Shard | None, smoke: bool = False) -> tuple
     every = variants(study, smoke)
     store = Store.open(next(iter(every[0].configs.values())).tracking)
     if shard:
-        own = shard.part(fingerprint(config) for variant in every for config in variant.configs.values())
-        every = [replace(variant, configs=_only(variant.configs, own)) for variant in every]
+        fingerprints = shard.part(
+            fingerprint(config) for variant in every for config in variant.configs.values()
+        )
+        every = [replace(variant, configs=_only(variant.configs, fingerprints)) for variant in every]
     if study.train and any(run.run is None for run in _look(store, every) if run.variant.trained):
         parallel = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={study.jobs}"] if study.jobs > 1 else []
         for _, line in sweeps(study, study.trainings, smoke):
-            divided = [f"+hydra.callbacks.sweep.runs={sorted(own)}"] if shard else []
+            divided = [f"+hydra.callbacks.sweep.runs={sorted(fingerprints)}"] if shard else []
             multirun([*line, *parallel, *divided])
     return store, [run for run in _look(store, every) if run.run is not None or run.variant.trained]
 
@@ -108,10 +110,10 @@ def row_and_simulator(variant: Variant) -> tuple[str, str]:
 
 def newest_finished(store: Store, config: DictConfig) -> Run | None:
     """Return the newest finished run of a configuration."""
-    found = store.find("FINISHED", fingerprint=fingerprint(config))
-    if found:
-        note_reuse(found[0])
-    return found[0] if found else None
+    runs = store.find("FINISHED", fingerprint=fingerprint(config))
+    if runs:
+        note_reuse(runs[0])
+    return runs[0] if runs else None
 
 
 def multirun(line: Sequence[str]) -> int:
@@ -144,7 +146,7 @@ def run_command(main: Callable[[Sequence[str]], None], words: Sequence[str]) -> 
 @contextmanager
 def _another_command() -> Iterator[None]:
     """Let Hydra run a command inside of one."""
-    state, shown = Singleton.get_state(), os.environ.pop("HYDRA_FULL_ERROR", None)
+    state, traceback = Singleton.get_state(), os.environ.pop("HYDRA_FULL_ERROR", None)
     GlobalHydra.instance().clear()
     try:
         yield
@@ -152,8 +154,8 @@ def _another_command() -> Iterator[None]:
         Singleton.set_state(state)
         for name in (PARENT, SWEPT, LEFT_OUT):  # of a sweep, which has ended
             os.environ.pop(name, None)
-        if shown is not None:
-            os.environ["HYDRA_FULL_ERROR"] = shown
+        if traceback is not None:
+            os.environ["HYDRA_FULL_ERROR"] = traceback
 
 
 def load_outcomes(store: Store, run: Run) -> np.ndarray | None:

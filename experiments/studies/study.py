@@ -168,20 +168,20 @@ def sweeps(
     rows = {} if study.rows is None else {"experiment": study.rows}
     fixed = {_key(word) for word in last}
     for block in blocks:
-        own = {key: value for key, value in {**block, **rows}.items() if key not in fixed}
-        settings = {key: value for key, value in own.items() if key != "name"}
-        shared = {key: value for key, value in study.common.items() if key not in own}
-        yield own, [*as_overrides(settings), *as_overrides(shared), *last]
+        chosen = {key: value for key, value in {**block, **rows}.items() if key not in fixed}
+        settings = {key: value for key, value in chosen.items() if key != "name"}
+        shared = {key: value for key, value in study.common.items() if key not in chosen}
+        yield chosen, [*as_overrides(settings), *as_overrides(shared), *last]
 
 
 def variants(study: Study, smoke: bool = False) -> list[Variant]:
     """Return every variant that a study trains or shows, with its configurations."""
-    shown = () if study.rows is not None else study.finished
+    untrained = () if study.rows is not None else study.finished
     pairs = [pair for block, line in sweeps(study, study.trainings, smoke) for pair in _variants(block, line)]
-    for block, line in sweeps(study, shown, smoke):
+    for block, line in sweeps(study, untrained, smoke):
         # Rows of peers are in a folder of their own.
-        found = _variants(block, line, (f"hydra.searchpath=['file://{peers.CONF}']",))
-        pairs += [(named, replace(variant, trained=False)) for named, variant in found]
+        finished = _variants(block, line, (f"hydra.searchpath=['file://{peers.CONF}']",))
+        pairs += [(named, replace(variant, trained=False)) for named, variant in finished]
     shared = set.intersection(*(set(named.items()) for named, _ in pairs)) if pairs else set()
     return [
         replace(variant, name=" ".join(_short(*item) for item in named.items() if item not in shared))
@@ -193,7 +193,7 @@ def _variants(
     block: Mapping[str, Any], line: Sequence[str], places: Sequence[str] = ()
 ) -> list[tuple[dict[str, str], Variant]]:
     """Return each variant of a sweep, with what may name it."""
-    name, found = block.get("name"), dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
+    name, variants = block.get("name"), dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
     for job in sweep_jobs(list(line), {}):
         chosen = {key: job[key] for key in block if key != "name"}
         named = {
@@ -204,11 +204,11 @@ def _variants(
         words = [*places, *(f"{key}={value}" for key, value in job.items())]
         config = validate_config(compose("train", words))
         start = {"name": name} if name else {}
-        _, variant = found.setdefault(
+        _, variant = variants.setdefault(
             tuple(chosen.values()), (start | named, Variant("", start | chosen, {}))
         )
         variant.configs[str(config.seed)] = config
-    return list(found.values())
+    return list(variants.values())
 
 
 def _short(key: str, value: str) -> str:

@@ -67,6 +67,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
 
         def main(words: Sequence[str] | None = None) -> None:
             _log_to_stderr()
+            started.clear()  # where this process ran the command before
             arguments = sys.argv[1:] if words is None else words
             try:
                 _run(job, name, arguments)

@@ -346,6 +346,7 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     GlobalHydra.instance().clear()
     os.chdir(folder)
     sys.argv = ["skin", *words]
+    sys.path.insert(0, str(folder))
     code = 0
     try:
         with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
@@ -362,6 +363,10 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
         os.environ.update(environment)
         os.chdir(here)
         sys.argv = argv
+        sys.path.remove(str(folder))
+        for name, module in list(sys.modules.items()):
+            if str(getattr(module, "__file__", None) or "").startswith(f"{folder}{os.sep}"):
+                del sys.modules[name]
         torch.set_num_threads(threads)
         for number, handler in handlers.items():
             signal.signal(number, handler)

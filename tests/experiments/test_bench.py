@@ -81,9 +81,3 @@ def test_every_benchmark_is_a_function():
 def test_a_bad_setting_is_refused(word, reason):
     with pytest.raises(InputError, match=reason):
         main([word])
-
-
-def test_the_table_refuses_bad_arguments(run, tmp_path):
-    done = run(tmp_path, "table", "table.seeds=0", store=False)
-    assert done.returncode == 2
-    assert "table.seeds=0 must be greater" in done.stderr

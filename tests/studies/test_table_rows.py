@@ -12,5 +12,5 @@ def test_the_table_has_the_rows_of_its_sweep_and_those_of_other_commands():
     ours = [row for row, _, _ in entries.named(entries.rows)]
     others = [row for row, _, _ in entries.named(entries.others)]
     assert set(ours) >= {"rules", "features", "temporal_graph", "sequence_image", "best"}
-    assert set(others) >= {"best_fresh", "ensemble_vote", "lightgbm", "multirocket_hydra"}
+    assert set(others) >= {"best_fresh", "ensemble_vote", "minirocket", "multirocket_hydra"}
     assert len({*ours, *others}) == len(ours) + len(others)

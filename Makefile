@@ -73,9 +73,9 @@ $(PEERS)/.ready: experiments/peers/requirements.txt experiments/peers/constraint
 		--requirement experiments/peers/requirements.txt
 	touch $@
 
-peers: $(READY) $(PEERS)/.ready  ## train LightGBM and aeon's ROCKETs, with their defaults and tuned (SEEDS=3)
+peers: $(READY) $(PEERS)/.ready  ## train aeon's ROCKETs with their defaults (SEEDS=3)
 	$(BIN)/skin train --config-dir experiments/peers/conf -m 'seed=range($(SEEDS))' \
-		experiment=lightgbm,minirocket,multirocket_hydra,lightgbm_tuned,minirocket_tuned,multirocket_tuned
+		experiment=minirocket,multirocket_hydra
 
 demo: $(READY)  ## show the predictions of a pretrained model for an emulated skin on 127.0.0.1:8765; Ctrl-C stops
 	@$(BIN)/skin demo

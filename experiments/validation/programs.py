@@ -1,6 +1,6 @@
 """Laws that another program, the report, or another number of threads decides.
 
-``python -m experiments.validation.programs 2 16 out.npz`` computes with two threads.
+``python experiments/validation/programs.py 2 16 out.npz`` computes with two threads.
 """
 
 import os
@@ -23,6 +23,7 @@ from skin.body.sheet import Sheet
 from skin.contact._checkerboard import stabilise_checkerboard
 from skin.contact._unilateral import solve_contact
 from skin.errors import InputError
+from skin.paths import ROOT
 from skin.sensors import Sensors
 from skin.simulator import _pynite
 from skin.simulator._assembly import Structure
@@ -148,9 +149,9 @@ def threads(quick: bool) -> CheckResult:
         for count in ("1", "2"):
             path = Path(folder) / f"{count}.npz"
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-            command = [sys.executable, "-m", "experiments.validation.programs", count, cells, str(path)]
-            environment = os.environ | dict.fromkeys(names, count)
-            subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[2])
+            command = [sys.executable, "-P", __file__, count, cells, str(path)]
+            environment = os.environ | dict.fromkeys(names, count) | {"PYTHONPATH": str(ROOT)}
+            subprocess.run(command, check=True, env=environment)
             with np.load(path) as file:
                 found.append({name: file[name] for name in file.files})
     findings = []

@@ -1,15 +1,32 @@
-"""Convolution kernels of aeon and a ridge."""
+"""Fit and apply a model of aeon, in the environment of that library: nothing of ``skin`` is imported here.
 
+Reads requests from standard input, one JSON object per line, and answers each with a line of JSON:
+
+- ``{"do": "fit", "path": ..., "seed": ..., "jobs": ..., settings}`` fits a model to the arrays ``train``,
+  ``train_labels``, ``validation`` and ``validation_labels`` of an .npz file.
+- ``{"do": "load", "path": ..., ...}`` with the same settings restores the model that
+  ``{"do": "save", "path": ...}`` wrote as an .npz file.
+- ``{"do": "predict", "path": ..., "to": ...}`` reads inputs (B, ...) from an .npy file and writes
+  probabilities (B, L).
+
+The answer to ``fit`` and ``load`` has the keys ``seconds``, ``parameters``, ``shape`` (of one input) and
+``labels`` (their number); the answer to a request that fails has the key ``error``.
+"""
+
+import json
+import os
+import sys
 import time
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
-from sklearn.linear_model import RidgeCV
+from sklearn.linear_model import LogisticRegression, RidgeCV
 from sklearn.pipeline import FeatureUnion, Pipeline, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from experiments.peers.worker.ridge import normal_equations, platt
+Arrays = dict[str, np.ndarray]
 
 ALPHAS = np.logspace(-3, 6, 19)  # aeon stops at 1e3, but stronger ridges are selected here
 CHUNK = 1024  # touches that are transformed at a time: 54,000 features each
@@ -30,21 +47,15 @@ class KernelModel:
             TRANSFORMS[transform], jobs, seed, {} if kernels is None else {"n_kernels": kernels}
         )
 
-    def fit(self, data: dict[str, np.ndarray]) -> float:
+    def fit(self, data: Arrays) -> float:
         """Fit kernels, ridges and logistic curves; compilation is not part of the duration."""
         x, held = data["train"], data["validation_labels"]
         self.make().fit_transform(x[:32])
         began, self.first = time.perf_counter(), x[:FIRST]
         self.transform = self.make().fit(self.first)
-        truth, outside = 2 * data["train_labels"] - 1, 2 * held - 1
-        if len(x) <= self.transform.transform(x[:2]).shape[1]:
-            table = np.concatenate(list(self._parts(x)))
-            ridge = RidgeCV(ALPHAS, alpha_per_target=True).fit(table, truth)
-            self.weights, self.bias = ridge.coef_.T, ridge.intercept_
-        else:
-            pairs = zip(self._parts(x), np.split(truth, range(CHUNK, len(x), CHUNK)), strict=True)
-            validation = np.concatenate(list(self._parts(data["validation"])))
-            self.weights, self.bias = normal_equations(pairs, validation, outside)
+        table = np.concatenate(list(self._parts(x)))
+        ridge = RidgeCV(ALPHAS, alpha_per_target=True).fit(table, 2 * data["train_labels"] - 1)
+        self.weights, self.bias = ridge.coef_.T, ridge.intercept_
         self.curves = np.array(
             [platt(*pair) for pair in zip(self._scores(data["validation"]).T, held.T, strict=True)]
         )
@@ -70,11 +81,11 @@ class KernelModel:
         slope, offset = self.curves.T
         return 1 / (1 + np.exp(-(slope * self._scores(x) + offset)))
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> Arrays:
         """Return what :meth:`restore` needs."""
         return {"first": self.first, "weights": self.weights, "bias": self.bias, "curves": self.curves}
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, arrays: Arrays) -> None:
         """Fit the kernels again and set the weights."""
         self.first, self.weights, self.bias, self.curves = (
             arrays[name] for name in ("first", "weights", "bias", "curves")
@@ -128,3 +139,70 @@ TRANSFORMS = {
     "multirocket": multirocket,
     "multirocket_hydra": multirocket_hydra,
 }
+
+
+def platt(score: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Return slope and offset of the logistic curve through scores (B,), with the targets of Platt (1999)."""
+    positive = truth.sum()
+    target = np.where(truth == 1, (positive + 1) / (positive + 2), 1 / (len(truth) - positive + 2))
+    twice = np.concatenate([score, score])[:, None]
+    sides = np.repeat([1, 0], len(score))
+    curve = LogisticRegression(C=np.inf).fit(twice, sides, sample_weight=np.concatenate([target, 1 - target]))
+    return curve.coef_.item(), curve.intercept_.item()
+
+
+class Worker:
+    """Answers requests, each by the method of its name, on one model."""
+
+    model: KernelModel
+
+    def fit(self, path: str, **settings: Any) -> dict[str, Any]:
+        """Fit a model and describe it."""
+        self.model = KernelModel(**settings)
+        return self._described(self.model.fit(_load_arrays(path)))
+
+    def load(self, path: str, **settings: Any) -> dict[str, Any]:
+        """Restore a model and describe it."""
+        self.model = KernelModel(**settings)
+        self.model.restore(_load_arrays(path))
+        return self._described(0.0)
+
+    def save(self, path: str) -> dict[str, Any]:
+        """Write the model."""
+        np.savez_compressed(path, **self.model.arrays())  # type: ignore[arg-type]
+        return {}
+
+    def predict(self, path: str, to: str) -> dict[str, Any]:
+        """Write the probabilities of the labels of touches."""
+        np.save(to, self.model.predict(np.load(path, allow_pickle=False)))
+        return {}
+
+    def _described(self, seconds: float) -> dict[str, Any]:
+        model = self.model
+        parameters = int(model.parameters)
+        return {"seconds": seconds, "parameters": parameters, "shape": model.shape, "labels": model.labels}
+
+
+def _load_arrays(path: str) -> Arrays:
+    """Return the arrays of an .npz file."""
+    with np.load(path, allow_pickle=False) as file:
+        return dict(file)
+
+
+def main() -> None:
+    """Answer requests until standard input ends."""
+    # What libraries print must not be read as an answer.
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    worker = Worker()
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer = getattr(worker, request.pop("do"))(**request)
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Models of other libraries, in the environment of these libraries: nothing of ``skin`` is imported here."""

@@ -17,7 +17,7 @@ from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.engine_builder import window_classifier
 from skin.learner.network import Network
 from skin.signal.frame import Frame
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 
 RATE = 100.0  # Hz, of the device
 ROW = "best_fresh"
@@ -75,7 +75,7 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
 
 def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
     from skin.hardware.live import engine_builder
-    from skin.hardware.live.verdict import DebounceSettings
+    from skin.hardware.live.engine import DebounceSettings
     from skin.run_overrides import apply_overrides
     from skin.stored_run import find_run
     from skin.stored_run import load_configuration as stored

@@ -28,7 +28,7 @@ from skin.hardware.live.engine_builder import describe
 from skin.learner.network import Network
 from skin.paths import ROOT
 from skin.trained import Trained
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.protocol import Header, encode_header, encode_line
 
 _TOUCH = 0.3  # N
 

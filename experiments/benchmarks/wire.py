@@ -17,10 +17,9 @@ from pydantic import PositiveFloat
 
 from skin.signal.frame import Check, Frame
 from skin.wire.decoder import Decoder
-from skin.wire.errors import SkinTimeout
-from skin.wire.open import open_skin
-from skin.wire.skin import Skin, Stats
-from skin.wire.text import encode_line
+from skin.wire.protocol import encode_line
+from skin.wire.reader import SkinTimeout
+from skin.wire.skin import Skin, Stats, open_skin
 
 SENSORS = 25
 _SPOILT = 0.01

@@ -9,9 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from skin.paths import ROOT
-from skin.wire.binary import encode_frame
 from skin.wire.decoder import Decoder
-from skin.wire.text import encode_line, parse_line
+from skin.wire.protocol import encode_frame, encode_line, parse_line
 
 quickly = settings(
     max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from skin.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.simulator.solid import Solid as Solid
     from skin.trained import load_run as load_run
-    from skin.wire.open import open_skin as open_skin
+    from skin.wire.skin import open_skin as open_skin
 
 __version__ = "0.1.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
@@ -31,7 +31,7 @@ _PLACES = {
     "Sheet": "skin.body.sheet",
     "Solid": "skin.simulator.solid",
     "load_run": "skin.trained",
-    "open_skin": "skin.wire.open",
+    "open_skin": "skin.wire.skin",
     "read_recording": "skin.recording_file",
 }
 

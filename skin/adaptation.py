@@ -16,6 +16,7 @@ from skin.evaluation.metrics_table import metrics_table
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.evaluation.report import evaluate
 from skin.fine_tuning import Adaptation, FineTuning, fine_tune
+from skin.hardware.wired import AbstractWired
 from skin.learner.base import AbstractLearner
 from skin.progress import Steps
 from skin.recording import Touches, touches_hash
@@ -73,7 +74,7 @@ def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
     load_learner(store, parent, learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     steps.begin("reading or simulating the gestures")
-    steps.silent = target.device.wired is not None
+    steps.silent = isinstance(target.device, AbstractWired)
     touches, others = choose_gestures(target.device, settings)
     steps.silent = False
     steps.begin("choosing the threshold of the alarm")

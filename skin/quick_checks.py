@@ -1,7 +1,6 @@
 """Checks of a configuration that need no run, made before anything is loaded."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
 from omegaconf import DictConfig
@@ -24,8 +23,7 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
     """
     # They import numpy, for which a mistyped setting must not wait.
     from skin.plausibility import check_plausibility
-    from skin.wire.open import PortSettings
-    from skin.wire.transport import check_port
+    from skin.wire.reader import PortSettings, check_port
 
     groups: dict[str, Any] = {
         name: plain(config[name]) for name in _GROUPS if isinstance(config.get(name), DictConfig)
@@ -34,8 +32,7 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
     check_plausibility(groups)
     device = groups.get("device", {})
     if isinstance(port := device.get("port"), str):
-        names = {field.name for field in fields(PortSettings)}
-        PortSettings(**{name: value for name, value in device.items() if name in names and value is not None})
+        PortSettings.select({name: value for name, value in device.items() if value is not None})
         check_port(port)
     named = {override.split("=")[0].split(".")[0] for override in overrides}
     if "run" in config and config.run is not None and not config.run.endswith(".onnx"):

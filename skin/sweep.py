@@ -125,7 +125,8 @@ class Sweep(Callback):
         composed = [_composed(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.run import PARENT, SWEPT, tags
+        from skin.config import PARENT
+        from skin.run import SWEPT, tags
         from skin.tracking import Store
 
         identities = [tags(job) if job else {} for job in composed]

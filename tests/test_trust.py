@@ -58,7 +58,7 @@ def test_parts_of_libraries_may_be_built(name):
         "skin.learner.network.torch.optim.Adam",
         "skin.learner.base.AbstractLearner",
         "skin.learner.rules.Rules.load",
-        "skin.hardware.emulator.port.AbstractPort",
+        "skin.hardware.emulator.emulator.AbstractPort",
         "skinny.Learner",
         "experiments.peers.rocket.AbstractLearner",
         "experiments.peers.rocket.subprocess.Popen",

@@ -19,9 +19,9 @@ from skin.hardware.live.engine_builder import describe, window_classifier
 from skin.learner.network import Network
 from skin.signal.frame import Frame
 from skin.trained import Trained
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 from skin.wire.decoder import Decoder
-from skin.wire.text import encode_line
+from skin.wire.protocol import encode_line
 
 RATE = 100.0  # Hz, of the device
 _SENSORS = 25

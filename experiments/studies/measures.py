@@ -213,8 +213,8 @@ class Holds:
 
         from experiments.studies.tables import Page
         from skin.hardware.live import engine_builder
-        from skin.hardware.live.alarm_timing import FIELDS, time_courses
-        from skin.hardware.live.verdict import DebounceSettings
+        from skin.hardware.live.engine import DebounceSettings
+        from skin.hardware.live.selftest import FIELDS, time_courses
         from skin.trained import load_trained
 
         trained = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
@@ -251,8 +251,8 @@ class TouchAlarms:
         from skin.evaluation.operating_point import LABEL, choose_operating_point
         from skin.evaluation.touch_alarm import choose_for_touches, touch_scores
         from skin.hardware.live import engine_builder
+        from skin.hardware.live.engine import DebounceSettings
         from skin.hardware.live.trained_run import watching_of
-        from skin.hardware.live.verdict import DebounceSettings
         from skin.labels import TOUCH
         from skin.rng import Stream, generator
         from skin.touch.sampler import balanced

@@ -32,10 +32,11 @@ from skin.config import fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import decode, disagreement, vote
 from skin.files import whole
+from skin.fingerprint import source_tags
 from skin.labels import TOUCH
 from skin.run_overrides import apply_overrides
 from skin.stored_run import TAG, load_configuration
-from skin.tracking import Store, note_source, source_tags
+from skin.tracking import Store, note_source
 from skin.trained import Trained, load_trained
 
 FOLDER = Path("results/trials")

@@ -34,9 +34,7 @@ def _emulated(config: DictConfig) -> Iterator[dict[str, str | float]]:
 
     from skin.build import build_device
     from skin.console import quiet
-    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
-    from skin.hardware.emulator.faults import Faults
-    from skin.hardware.emulator.port import open_port
+    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.run_overrides import apply_overrides
     from skin.stored_run import find_run, load_configuration
     from skin.tracking import Store

@@ -25,9 +25,7 @@ def main(config: DictConfig) -> None:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
 
     from skin.build import build_device
-    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
-    from skin.hardware.emulator.faults import Faults
-    from skin.hardware.emulator.port import open_port
+    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.settings import configured
 
     groups = plain(config)

@@ -41,6 +41,7 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
     from skin.console import quiet
     from skin.evaluation.metrics_table import print_report
     from skin.evaluation.report import evaluate
+    from skin.hardware.wired import AbstractWired
     from skin.option import option_name
     from skin.plot.evaluation_page import publish_evaluation, verdicts
     from skin.run import log_report
@@ -59,7 +60,7 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
     of = load_trained(store, run, config, stored)
     device, learner, point = of.device, of.learner, of.point
     steps.begin("reading or simulating the touches")
-    steps.silent = device.wired is not None
+    steps.silent = isinstance(device, AbstractWired)
     touches = device.touches("test")  # read before anything is logged, because a port may fail
     steps.silent = False
     steps.begin("evaluating them")

@@ -120,8 +120,8 @@ def _thresholds(
     rates: Sequence[float],
 ) -> dict[str, float]:
     """Return the thresholds of the alarm for safe touches, by the rate of the device, Hz."""
+    from skin.hardware.live.engine import DebounceSettings
     from skin.hardware.live.trained_run import choose_threshold, watching_of
-    from skin.hardware.live.verdict import DebounceSettings
 
     thresholds = {}
     for rate in rates:

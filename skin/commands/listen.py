@@ -14,8 +14,6 @@ from skin.command import command
 from skin.config import plain
 from skin.errors import InputError
 
-_KEYS = ("baudrate", "format", "limits", "timeout")
-
 
 @command("listen")
 def main(config: DictConfig) -> None:
@@ -26,15 +24,12 @@ def main(config: DictConfig) -> None:
             "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"
         )
 
-    from skin.settings import check_groups
-    from skin.wire.diagnosis import PortMonitor
-    from skin.wire.errors import SkinDisconnected, SkinTimeout
-    from skin.wire.open import open_skin
+    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+    from skin.wire.skin import PortMonitor, open_skin
 
-    check_groups({"device": {key: device[key] for key in ("_target_", *_KEYS)}})
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sensors = None if config.n is None else range(config.n)
-    with open_skin(device["port"], sensors, **{key: device[key] for key in _KEYS}) as skin:
+    with open_skin(PortSettings.select(device), sensors) as skin:
         listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):

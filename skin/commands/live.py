@@ -21,8 +21,8 @@ from skin.command import command
 from skin.config import overrides, plain
 
 if TYPE_CHECKING:
-    from skin.hardware.live.display import Display
     from skin.hardware.live.live_settings import LiveSettings
+    from skin.hardware.live.loop import Display
 
 
 @command("live")
@@ -51,8 +51,7 @@ def show(config: DictConfig, given: Sequence[str], own_mechanics: bool = False) 
 def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_mechanics: bool) -> None:
     from rich.console import Console
 
-    from skin.hardware.live.display import Display, DisplayInfo
-    from skin.hardware.live.loop import LiveLoop
+    from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
     from skin.hardware.live.watched import check_settings
     from skin.interrupt import ends_on_signal
 
@@ -88,7 +87,7 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_m
 def _views(display: "Display", config: DictConfig, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
     """Open what shows the verdicts; yield messages."""
     if live.log is not None:
-        from skin.hardware.live.alarm_log import log_alarms
+        from skin.hardware.live.verdict_stream import log_alarms
 
         open_.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if config.web:

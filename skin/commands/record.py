@@ -27,9 +27,10 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.hardware.record.recorder import convert_session, record_session
+    from skin.hardware.wired import AbstractWired
 
-    device = build_device(config).wired
-    if device is None:
+    device = build_device(config)
+    if not isinstance(device, AbstractWired):
         raise InputError("only a skin at a port can be recorded: leave out device=")
     path = Path(config.out).expanduser()
     if not settings["finish"]:

@@ -1,7 +1,7 @@
 """The interface of a device: a source of touches."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
@@ -14,16 +14,10 @@ from skin.sensors import Sensors
 
 if TYPE_CHECKING:  # only their names are needed here
     from skin.signal.constants import Constants
-    from skin.signal.frame import Frame
     from skin.signal.imperfection import Imperfection
     from skin.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
     from skin.touch.stream import TouchStream
-    from skin.wire.announcement import AnnouncementListener
-    from skin.wire.conversion import UnitConversion
-    from skin.wire.segmentation import AbstractSegmenter, RecordedGesture
-    from skin.wire.skin import Skin
-    from skin.wire.source import Source
 
 Split = Literal["train", "validation", "holdout", "test"]
 
@@ -38,11 +32,13 @@ class AbstractDevice(ABC):
         task: the labels and their kind.
         size: extent (x, y) of the sheet, m.
         surface: the touched body, for plots; None: a flat sheet of ``size``.
+        name: of the source of :meth:`strips`, for the live view.
     """
 
     task: Task
     size: tuple[float, float]
     surface: AbstractBody | None = None
+    name: str = "simulator"
 
     @property
     def simulation(self) -> "AbstractSimulated | None":
@@ -53,11 +49,6 @@ class AbstractDevice(ABC):
     def reference(self) -> "AbstractSimulated | None":
         """The simulated skin of the configuration, on which thresholds of ``skin live`` are tuned."""
         return self.simulation
-
-    @property
-    def wired(self) -> "AbstractWired | None":
-        """This device, if it reads a skin at a port; else None."""
-        return None
 
     @abstractmethod
     def touches(self, split: Split, epoch: int = 0) -> Touches:
@@ -97,11 +88,11 @@ class AbstractDevice(ABC):
         """
         return self
 
-    def source(self) -> "Source":
-        """Open the stream of frames that ``skin live`` watches.
+    def strips(self) -> Iterator[Touches]:
+        """Yield touches, N, that can be played one after the other as a stream of frames.
 
         Raises:
-            InputError: the stream cannot be opened, or the device has none.
+            InputError: the device has none.
         """
         raise InputError(
             "only a skin at a port, a recording or the simulator can be watched: give device=serial "
@@ -204,64 +195,3 @@ class AbstractSimulated(AbstractDevice):
             gap: [least, most] idle frames between two touches; None: ``touch.gap``.
             number: of the stream; each number gives other gestures.
         """
-
-
-class AbstractWired(AbstractDevice):
-    """Base class of devices that read a skin at a port, frame by frame.
-
-    Attributes:
-        sensors: S sensors, one per value of a frame.
-        window: frames per touch.
-        model_rate: frames per second that touches are resampled to, Hz.
-        labels: source of the labels.
-        gestures: number of touches of ``test``.
-        calibration: calibration file of the device; or None.
-    """
-
-    sensors: Sensors
-    window: int
-    model_rate: float
-    labels: str
-    gestures: int
-    calibration: str | None
-
-    @property
-    def wired(self) -> "AbstractWired":
-        """This device."""
-        return self
-
-    @abstractmethod
-    def open(self, reconnect: bool = False) -> "tuple[Skin, AnnouncementListener]":
-        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
-
-    @abstractmethod
-    def warm_up(self, skin: "Skin") -> "tuple[list[Frame], UnitConversion]":
-        """Read the first frames: check the rate and take the baseline.
-
-        Returns:
-            all frames read, and the conversion of values to N.
-
-        Raises:
-            InputError: no frames arrive, the device is too slow, or the scale is unknown.
-        """
-
-    @abstractmethod
-    def segmenter(
-        self,
-        listener: "AnnouncementListener",
-        conversion: "UnitConversion",
-        first: "Sequence[Frame]",
-        done: Collection[int] = (),
-    ) -> "AbstractSegmenter":
-        """Return the segmenter of a stream.
-
-        Args:
-            listener: collects announcements.
-            conversion: of the values to N.
-            first: frames read before.
-            done: numbers of gestures that are already recorded.
-        """
-
-    @abstractmethod
-    def to_recording(self, gestures: "Sequence[RecordedGesture]", conversion: "UnitConversion") -> Recording:
-        """Return gestures as a recording."""

@@ -1,5 +1,6 @@
 """Touches from a file or a data set."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,8 +20,6 @@ from skin.errors import InputError
 from skin.layout.base import AbstractLayout
 from skin.recording import Part, Recording, Touches, concatenate
 from skin.recording_file import read_recording
-from skin.wire.open import open_skin
-from skin.wire.source import Source
 
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
 _BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated
@@ -76,6 +75,7 @@ class Recorded(AbstractDevice):
         self._example = self._stored.read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
         self.sensors = layout.sensors(body)
         self._compare(body)
+        self.name = str(self._stored.path(0))
         self.surface, self.task, self.size = body, self._example.task, body.size
         self.rate, self.window = self._example.touches.rate, self._example.touches.readings.shape[1]
 
@@ -112,10 +112,9 @@ class Recorded(AbstractDevice):
         """Return a device that has labels, which the file may lack."""
         return Blank.of(self.task, self.size, self._example.touches)
 
-    def source(self) -> Source:
-        """Open the file, or the first shard, as a stream of frames, in real time."""
-        path = str(self._stored.path(0))
-        return Source.of_newtons(path, open_skin(path, self.sensors), len(self.sensors))
+    def strips(self) -> Iterator[Touches]:
+        """Yield the touches of the file, or of the first shard."""
+        yield self._stored.read(0, complete=False).touches
 
     def recording(self, split: Split | None = None, epoch: int = 0, complete: bool = True) -> Recording:
         """Return the recording of a split; None takes the whole file or data set."""

@@ -1,8 +1,9 @@
 """A simulated skin: sampled gestures, a simulator, and device imperfections."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
+from itertools import count
 from typing import Annotated, Any
 
 import numpy as np
@@ -31,12 +32,12 @@ from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.signal.resampling import check_rate
 from skin.simulator.base import AbstractSimulator
 from skin.touch.gesture import GestureSettings
-from skin.touch.sampler import Movie, TouchSampler, balanced
+from skin.touch.movie import Movie
+from skin.touch.sampler import TouchSampler, balanced
 from skin.touch.stream import TouchStream, draw_timeline
-from skin.wire.open import open_skin
-from skin.wire.source import Source
 
 _BATCH = 1024
+_STRIP = 600.0  # s of simulated touches in one piece
 _FEW = 10  # gestures
 _DISC = 0.03  # share of the sheet under a press: small, and larger than any footprint
 
@@ -171,9 +172,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         recording = self._split(split, epoch, complete)
         return replace(recording, metadata=describe(self, recording, split, epoch))
 
-    def source(self) -> Source:
-        """Open a stream of test gestures, in real time."""
-        return Source.of_newtons("simulator", open_skin("simulated", device=self), len(self.sensors))
+    def strips(self) -> Iterator[Touches]:
+        """Yield test streams, ten minutes each, without end."""
+        for number in count():
+            yield self.simulate_stream(max(1, round(_STRIP * self.model_rate)), number=number).whole.touches
 
     def _split(self, split: Split | None, epoch: int, complete: bool) -> Recording:
         if split == "test":

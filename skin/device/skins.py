@@ -1,7 +1,7 @@
 """Touches on many skins, each drawn at random."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any
@@ -29,7 +29,6 @@ from skin.signal.imperfection import Imperfection, ImperfectionSettings
 from skin.simulator.base import AbstractSimulator
 from skin.skin_distribution import DrawnSkin, SkinDistribution
 from skin.touch.gesture import GestureSettings
-from skin.wire.source import Source
 
 _GROUP = 128  # largest number of gestures on one skin at a time; fewer take longer
 _DEAD = 4  # at most one of so many sensors is dead
@@ -97,9 +96,9 @@ class Skins(ImperfectionSettings, AbstractDevice):
         """The skin of body, layout and simulator, with other imperfections in every touch."""
         return self._simulated(DrawnSkin(self.body, self.layout, self.simulator, 0.0), 0)
 
-    def source(self) -> Source:
-        """Open a stream of test gestures on :attr:`reference`, in real time."""
-        return self.reference.source()
+    def strips(self) -> Iterator[Touches]:
+        """Yield test streams on :attr:`reference`, without end."""
+        return self.reference.strips()
 
     def _prepare(self, part: int, count: int) -> list[Simulated]:
         console, terminal = Console(stderr=True), sys.stderr.isatty()

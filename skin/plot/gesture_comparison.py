@@ -12,8 +12,8 @@ import torch
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.emulator.gestures import Gesture, emulated_gestures, gestures_with_labels
-from skin.hardware.record.session_log import check_session
-from skin.hardware.record.session_reader import read_session
+from skin.hardware.record.recorder import check_session
+from skin.hardware.record.session import read_session
 from skin.labels import TOUCH
 from skin.recording import Touches
 from skin.rng import Stream, generator

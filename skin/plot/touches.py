@@ -10,8 +10,8 @@ from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
 from skin.labels import TOUCH
-from skin.plot.animation import Scene
 from skin.plot.surface import surface_motion
+from skin.plot.view import Scene
 from skin.recording import Touches
 
 

@@ -1,7 +1,5 @@
-"""One frame of a skin, and the counters of its connection."""
+"""One frame of a skin, and the time of a stream of them."""
 
-from collections import Counter
-from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -74,35 +72,6 @@ class FrameError(Exception):
         found: number of fields, for the reason ``fields``.
     """
 
-    def __init__(self, reason: str, found: int | None = None) -> None:
+    def __init__(self, reason: str, count: int | None = None) -> None:
         super().__init__(reason)
-        self.reason, self.found = reason, found
-
-
-@dataclass
-class Counters:
-    """Numbers of frames and errors of a decoder.
-
-    Attributes:
-        bytes: received.
-        frames: good frames.
-        bad: reason -> number of frames dropped.
-        skipped: pieces before the first good frame of a connection: half a line, a banner, noise.
-        resyncs: good frames after bad ones.
-        gaps: interruptions by missing frames.
-        lost: missing frames, according to frame numbers.
-        resets: restarts of the device.
-        invalid: values in good frames for which the device sent no number, such as ``nan`` or ``ovf``.
-        weak: frames accepted without a CRC, which may have wrong values.
-    """
-
-    bytes: int = 0
-    frames: int = 0
-    bad: Counter[str] = field(default_factory=Counter)
-    skipped: int = 0
-    resyncs: int = 0
-    gaps: int = 0
-    lost: int = 0
-    resets: int = 0
-    weak: int = 0
-    invalid: int = 0
+        self.reason, self.found = reason, count

@@ -3,6 +3,7 @@
 import os
 import sys
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
@@ -15,7 +16,12 @@ from skin.labels import OPPOSITE, Task
 from skin.rng import Stream, generator
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.announcement import AnnouncementListener
+from skin.wire.protocol import Announcement, parse_announcement
+from skin.wire.reader import ByteStream
+
+_LONGEST = 4096  # bytes
+_KEPT = 64  # announcements that are kept unread
+
 
 Labels = Mapping[str, int]
 
@@ -62,11 +68,44 @@ def label_text(labels: Labels) -> str:
 
 def typed_lines(file: int) -> Iterator[str]:
     """Yield the lines typed into an open file."""
-    rest = b""
+    partial = b""
     # Not sys.stdin: a thread that blocks there would keep the program from ending.
     while data := os.read(file, 1024):
-        *lines, rest = (rest + data).split(b"\n")
+        *lines, partial = (partial + data).split(b"\n")
         yield from (line.decode(errors="replace") for line in lines)
+
+
+class AnnouncementListener:
+    """An opener for ``open_skin`` that passes bytes through and collects the announcements among them.
+
+    Args:
+        opener: opens the stream of bytes.
+
+    Attributes:
+        announcements: announcements that have not been read yet.
+    """
+
+    def __init__(self, opener: Callable[[], ByteStream]) -> None:
+        self._opener = opener
+        self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
+
+    def __call__(self) -> ByteStream:
+        """Open the stream; called again after each disconnection."""
+        self._stream, self._rest = self._opener(), b""
+        self.announcements.clear()
+        return self
+
+    def read(self) -> bytes:
+        """Return the received bytes."""
+        data = self._stream.read()
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._rest = self._rest[-_LONGEST:]
+        self.announcements.extend(filter(None, map(parse_announcement, lines)))
+        return data
+
+    def close(self) -> None:
+        """Close the stream."""
+        self._stream.close()
 
 
 class AbstractSegmenter(ABC):
@@ -146,8 +185,8 @@ class AnnouncedSegmenter(AbstractSegmenter):
                 labels = {"touch": 1} | dict(announced.labels)
                 if missing := [name for name in self._task.names if name not in labels]:
                     raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
-                known = {name: labels[name] for name in self._task.names}
-                return RecordedGesture(announced.number, known, begin, frame.segment, lost=late)
+                task_labels = {name: labels[name] for name in self._task.names}
+                return RecordedGesture(announced.number, task_labels, begin, frame.segment, lost=late)
         return None
 
 
@@ -165,12 +204,12 @@ class PromptedSegmenter(AbstractSegmenter):
     def __init__(
         self,
         window: Window,
-        wanted: Iterator[tuple[int, Labels]],
+        plan: Iterator[tuple[int, Labels]],
         notify: Callable[[str], None],
         lines: Iterator[str] | None = None,
     ) -> None:
         super().__init__(window)
-        self._wanted, self._notify = wanted, notify
+        self._wanted, self._notify = plan, notify
         self._typed: SimpleQueue[str] = SimpleQueue()
         self._asked: tuple[int, Labels] | None = None
         self._over_now = False
@@ -237,10 +276,10 @@ class ContinuousSegmenter(AbstractSegmenter):
     """
 
     def __init__(
-        self, window: Window, first: int = 0, wanted: Callable[[np.ndarray], bool] | None = None
+        self, window: Window, first: int = 0, begins: Callable[[np.ndarray], bool] | None = None
     ) -> None:
         super().__init__(window)
-        self._number, self._wanted = first, wanted
+        self._number, self._wanted = first, begins
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if self._wanted is not None and not self._wanted(frame.values):

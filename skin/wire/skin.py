@@ -1,56 +1,32 @@
 """An open skin: ``with open_skin("/dev/ttyACM0", layout=sensors) as skin: ...``"""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from dataclasses import replace
+from functools import partial
+from itertools import count
+from math import inf
 from time import monotonic
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from skin.errors import InputError
-from skin.signal.frame import Counters, Frame
-from skin.wire.baseline import median_baseline, quiet_baseline
-from skin.wire.decoder import Decoder
-from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.health import ChannelState
-from skin.wire.reader import Reader
-from skin.wire.text import Header
-
-
-@dataclass(frozen=True)
-class Stats:
-    """Statistics of the bytes received so far.
-
-    Those not listed are described in :class:`skin.signal.frame.Counters`.
-
-    Attributes:
-        frames: number of good frames.
-        bad_frames: number of frames that could not be decoded; ``bad`` has the reasons.
-        dropped: number of good frames dropped from a full queue.
-        resyncs: number of good frames after bad ones.
-        reconnects: number of reconnections.
-        rate_hz: frames per second by the device's clock, Hz; 0 if unknown.
-        format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
-        check: ``crc16``, ``xor`` or ``none``; empty likewise.
-        trouble: a message about the current problem; empty if there is none.
-    """
-
-    frames: int
-    bad_frames: int
-    dropped: int
-    resyncs: int
-    reconnects: int
-    rate_hz: float
-    bytes: int = 0
-    bad: tuple[tuple[str, int], ...] = ()
-    skipped: int = 0
-    gaps: int = 0
-    lost: int = 0
-    resets: int = 0
-    weak: int = 0
-    invalid: int = 0
-    format: str = ""
-    check: str = ""
-    trouble: str = ""
+from skin.signal.frame import Frame
+from skin.wire.channels import ChannelHealth, ChannelState, Limits, take_baseline
+from skin.wire.decoder import Decoder, Stats
+from skin.wire.protocol import Header, encode_header
+from skin.wire.reader import (
+    ByteStream,
+    Feed,
+    PlaybackFeed,
+    PortSettings,
+    Reader,
+    SkinDisconnected,
+    SkinTimeout,
+    WireFeed,
+    open_stream,
+)
 
 
 class Skin:
@@ -141,9 +117,7 @@ class Skin:
         if touch is None:
             touch = 0.02 * 2**self.header.bits if self.header and self.header.bits else 0.0
         values, valid = (np.stack([getattr(frame, name) for frame in frames]) for name in ("values", "valid"))
-        self.baseline = (
-            median_baseline(values) if force else quiet_baseline(values, valid, self.baseline, touch)
-        )
+        self.baseline = take_baseline(values, valid, self.baseline, touch, force)
         return self.baseline
 
     @property
@@ -163,21 +137,16 @@ class Skin:
 
     @property
     def stats(self) -> Stats:
-        """Statistics of the bytes received so far."""
+        """Statistics of what was received so far."""
         reader, decoder = self._reader, self._decoder
-        counters = decoder.counters if decoder else Counters(frames=self._taken)
-        known = vars(counters) | {"bad": tuple(sorted(counters.bad.items()))}
-        frame_format = decoder.frame_format if decoder else None
-        return Stats(
-            bad_frames=counters.bad.total(),
-            dropped=reader.dropped,
-            reconnects=reader.reconnects,
-            rate_hz=reader.rate,
-            format=frame_format.name if frame_format else "",
-            check=frame_format.check if frame_format else "",
-            trouble=decoder.quality.trouble if decoder else "",
-            **known,
-        )
+        if decoder is None:
+            stats = Stats(frames=self._taken)
+        else:
+            stats = replace(decoder.stats, bad=Counter(decoder.stats.bad), trouble=decoder.quality.trouble)
+            if (frame_format := decoder.frame_format) is not None:
+                stats.format, stats.check = frame_format.name, frame_format.check
+        stats.dropped, stats.reconnects, stats.rate_hz = reader.dropped, reader.reconnects, reader.rate
+        return stats
 
     def _explain(self, count: int, timeout: float, frames: list[Frame]) -> None:
         """Raise the error that explains why ``count`` frames are not available."""
@@ -195,3 +164,181 @@ class Skin:
             reason = stats.trouble or "no format shows yet; wrong baud rate?"
             raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)
         raise SkinTimeout(f"{message}: {stats.trouble or 'the device stopped sending'}", frames)
+
+
+if TYPE_CHECKING:
+    from skin.recording import Touches
+
+
+_KEPT = 10_000  # frames for the statistics of channels
+_SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
+
+
+class Playable(Protocol):
+    """A device that can be played, such as :class:`skin.device.simulated.Simulated`."""
+
+    def strips(self) -> "Iterable[Touches]":
+        """Yield touches in N in their order, each of which is a piece of a stream."""
+
+
+def open_skin(
+    port: str | PortSettings,
+    layout: Sized | None = None,
+    *,
+    opener: Callable[[], ByteStream] | None = None,
+    device: Playable | None = None,
+    baseline: np.ndarray | None = None,
+    channels: Sequence[int] = (),
+    polarity: Sequence[int] = (),
+    queue: int = 4096,
+    reconnect: bool = False,
+    realtime: bool = True,
+    **settings: Any,
+) -> Skin:
+    """Open a skin; use it in a ``with`` statement.
+
+    Args:
+        port: ``/dev/ttyACM0``, ``COM3``, ``socket://host:number``, a recording (``x.parquet``, ``x.csv``) or
+            ``simulated``; or the settings of a port.
+        layout: the sensors (anything with a length); None: their number is detected.
+        opener: opens the stream of bytes instead of ``port``, and again after each disconnection.
+        device: the device that ``simulated`` plays.
+        baseline: (S,), from an earlier tare.
+        channels: the device's channel of every sensor, as in a calibration; empty: the same order.
+        polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
+        queue: number of frames that are buffered.
+        reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
+        realtime: False plays a recording or the simulator as fast as frames are read.
+        settings: baudrate, format, limits, timeout, backoff and silence, as in :class:`PortSettings`.
+
+    Raises:
+        InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
+    """
+    if unused := sorted({"tare", "scale", "calibration"} & settings.keys()):
+        raise InputError(f"open_skin gives values as the device sends them: leave out {unused[0]}")
+    about = port if isinstance(port, PortSettings) else PortSettings(port=port, **settings)
+    if not (isinstance(queue, int) and queue > 0):
+        raise InputError(f"queue={queue} must be a whole number above 0: leave it out for 4096")
+    address, sensors = str(about.port), None if layout is None else len(layout)
+    if opener is None and address == "simulated":
+        if device is None:
+            raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
+        return play(device.strips(), about.timeout, baseline, queue, realtime)
+    if opener is None and address.endswith((".parquet", ".csv")):
+        return play([_read_touches(address, sensors)], about.timeout, baseline, queue, realtime)
+    decoder = Decoder(sensors, about.format, channels, polarity)
+    watched = reconnect and address.startswith("socket://")
+    opener = opener or partial(open_stream, address, about.baudrate)
+    connect = _listen(opener, decoder, about.limits, (about.silence if watched else None) or inf)
+    try:
+        reader = Reader(connect, queue, reconnect, about.backoff)
+    except OSError as error:
+        raise InputError(f"cannot open {address}: {error}") from error
+    return Skin(reader, decoder, about.timeout, baseline)
+
+
+def play(
+    strips: "Iterable[Touches]",
+    timeout: float = 5.0,
+    baseline: np.ndarray | None = None,
+    queue: int = 4096,
+    realtime: bool = True,
+) -> Skin:
+    """Return touches in N, all with one rate, as the frames of an open skin.
+
+    Args:
+        strips: the touches; each is a segment.
+        timeout, baseline, queue, realtime: as in :func:`open_skin`.
+    """
+    feed = PlaybackFeed(strips, realtime)
+    return Skin(Reader(lambda: feed, queue), None, timeout, baseline)
+
+
+def _listen(
+    opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float
+) -> Callable[[], Feed]:
+    """Return a function that connects; from the second call on it restarts the decoder.
+
+    The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
+    """
+    connections, health = count(), ChannelHealth()
+
+    def connect() -> Feed:
+        stream = opener()
+        if next(connections):
+            decoder.restart()
+            health.restart()
+        return WireFeed(stream, decoder, limits, silence, health)
+
+    return connect
+
+
+def _read_touches(path: str, sensors: int | None) -> "Touches":
+    """Return the touches of a recording, which must have as many sensors as the layout."""
+    # Imported here because it imports torch, which reading a port does not need.
+    from skin.recording_file import read_recording
+
+    touches = read_recording(path).touches
+    count = touches.readings.shape[2]
+    if sensors not in (None, count):
+        raise InputError(
+            f"{path} has {count} sensors, the layout has {sensors}: give the layout it was recorded with, "
+            "as in layout=file layout.path=FILE.csv"
+        )
+    return touches
+
+
+class PortMonitor:
+    """Collects statistics of an open skin."""
+
+    def __init__(self, skin: Skin) -> None:
+        self._skin = skin
+        self._frames: deque[Frame] = deque(maxlen=_KEPT)
+
+    def lines(self, seconds: float | None) -> Iterator[str]:
+        """Yield a line each second, and the last one after ``seconds`` s; None: without end."""
+        start = printed = monotonic()
+        for frame in self._skin:
+            self._frames.append(frame)
+            now = monotonic()
+            over = now - start >= (inf if seconds is None else seconds)
+            if over or now - printed >= 1:
+                printed = now
+                yield f"{now - start:6.1f} s  {self._line()}"
+            if over:
+                return
+
+    def _line(self) -> str:
+        stats, sensors = self._skin.stats, len(self._frames[-1].values)
+        counts = stats.list_counts(
+            bad_frames="bad", lost="lost", skipped="skipped", resets="resets", invalid="invalid values"
+        )
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(stats.bad.items()))
+        frames = ", ".join([f"{stats.frames} frames", *counts]) + (f" ({reasons})" if reasons else "")
+        checksum = f"checksum {stats.check}" if stats.check != "none" else "NO CHECKSUM"
+        trouble = f"; {stats.trouble}" if stats.trouble else ""
+        return f"{stats.format}, {checksum}, {sensors} sensors, {stats.rate_hz:.4g} Hz, {frames}{trouble}"
+
+    def summary(self) -> str:
+        """Return the header, and the minimum, median, maximum, noise and state of each channel."""
+        if not self._frames:
+            return "nothing received"
+        values = np.stack([frame.values for frame in self._frames])
+        valid = np.stack([frame.valid for frame in self._frames])
+        states = self._skin.channels or ("ok",) * values.shape[1]
+        # Of a channel that is never valid, the values that it repeats.
+        rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
+        lines = [f"header: {self._header()}", "channel     least    median   largest     noise"]
+        for channel, (row, state, share) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
+            middle = np.median(row)
+            noise = _SPREAD * np.median(np.abs(row - middle))
+            text = state if share == 1 else f"{state}, invalid in {1 - share:.0%}"
+            numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
+            lines.append(f"{numbers}  {text}")
+        return "\n".join(lines)
+
+    def _header(self) -> str:
+        header = self._skin.header
+        if header is None:
+            return "none"
+        return encode_header(header, "none").decode().removeprefix("# skin ").strip()

@@ -9,7 +9,7 @@ import tty
 import pytest
 
 from skin.paths import ROOT
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.protocol import Header, encode_header, encode_line
 
 LISTEN = "-m", "skin", "listen"
 

@@ -16,6 +16,7 @@ from skin.evaluation.margins import margins
 from skin.evaluation.operating_point import OperatingPoint, threshold_gestures
 from skin.evaluation.report import columns
 from skin.evaluation.sliding_windows import evaluate_windows
+from skin.hardware.wired import AbstractWired, open_source
 from skin.recording_file import write_recording
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -70,7 +71,7 @@ def test_fixed_touches_stay_the_same(device):
 
 def test_only_a_simulated_device_says_that_it_is_one(device):
     assert device.simulation is (device if isinstance(device, Simulated) else None)
-    assert device.wired is None
+    assert not isinstance(device, AbstractWired)
     assert len(device.recording("holdout", complete=False)) == 5
 
 
@@ -100,7 +101,7 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     [
         (lambda device: device.simulated("this is simulated"), "^this is simulated: leave out device="),
         (lambda device: device.recording(), "only simulated or recorded touches"),
-        (lambda device: device.source(), "can be watched: give device=serial"),
+        (open_source, "can be watched: give device=serial"),
         (lambda device: margins(None, device, 20, POINT), "MadeUpDevice has none: .* add device=simulated"),
         (
             lambda device: evaluate_windows(None, device, None, POINT),

@@ -12,7 +12,7 @@ from skin.labels import TOUCH
 from skin.rng import Stream, generator
 from skin.signal.frame import Frame
 from skin.touch.sampler import balanced
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "device.tare=true"]
 CONTACT = 0.5  # N

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.device.serial import Serial
+from skin.hardware.serial import Serial
 from skin.layout.grid import Grid
 from skin.recording_file import read_recording
 

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.hardware.record.session_reader import read_session
+from skin.hardware.record.session import read_session
 from skin.recording_file import read_recording
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive"]

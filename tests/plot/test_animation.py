@@ -7,8 +7,9 @@ from PIL import Image
 
 from skin.build import build_device
 from skin.errors import InputError
-from skin.plot.animation import VIEWS, Scene, thinning, write_animation
+from skin.plot.animation import VIEWS, thinning, write_animation
 from skin.plot.touches import recorded, simulated
+from skin.plot.view import Scene
 from skin.recording_file import write_recording as store
 
 

@@ -10,7 +10,7 @@ from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.hardware.emulator.gestures import emulated_gestures, upsample
-from skin.hardware.record.session_log import SessionLog
+from skin.hardware.record.recorder import SessionLog
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
 from skin.plot import gesture_comparison as compared
@@ -18,7 +18,7 @@ from skin.plot.gesture_page import gestures_markdown, plot_gestures
 from skin.plot.press_comparison import Verdicts
 from skin.signal.frame import Frame
 from skin.simulator.naive import Naive
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import RecordedGesture
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 import tty
 
-from skin.wire.text import encode_line
+from skin.wire.protocol import encode_line
 
 
 class Plug:

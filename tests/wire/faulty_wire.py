@@ -13,10 +13,10 @@ import psutil
 
 from skin.paths import ROOT
 from skin.signal.frame import Check, Frame
-from skin.wire.errors import SkinTimeout
-from skin.wire.open import open_skin
-from skin.wire.skin import Skin, Stats
-from skin.wire.text import encode_line
+from skin.wire.decoder import Stats
+from skin.wire.protocol import encode_line
+from skin.wire.reader import SkinTimeout
+from skin.wire.skin import Skin, open_skin
 
 SENSORS = 25
 _SPOILT = 0.01

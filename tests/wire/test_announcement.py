@@ -2,9 +2,8 @@
 
 import pytest
 
-from skin.wire.announcement import Announcement, encode_announcement, parse_announcement
 from skin.wire.decoder import Decoder
-from skin.wire.text import encode_line
+from skin.wire.protocol import Announcement, encode_announcement, encode_line, parse_announcement
 
 SAID = Announcement(3, 650, 300, {"big": 1, "dynamic": 0})
 
@@ -30,4 +29,4 @@ def test_a_reader_takes_it_for_a_comment():
     lines = [encode_line([1, number], number, 10_000 * number) for number in range(6)]
     frames = decoder.feed(b"".join([*lines[:3], encode_announcement(SAID), *lines[3:]]))
     assert len(frames) == 6
-    assert not decoder.counters.bad
+    assert not decoder.stats.bad

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from skin.body.sheet import Sheet
-from skin.device.serial import Serial
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import LiveLoop
 from skin.hardware.record.recorder import record_session
-from skin.hardware.record.session_reader import read_session
+from skin.hardware.record.session import read_session
+from skin.hardware.serial import Serial
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
-from skin.wire.open import open_skin
-from skin.wire.tare import Tare
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.channels import Tare
+from skin.wire.protocol import Header, encode_header, encode_line
+from skin.wire.skin import open_skin
 
 PATIENT = 300.0  # s: machines are busy at times
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])

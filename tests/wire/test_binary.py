@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from skin.signal.frame import FrameError
-from skin.wire.binary import decode_frame, encode_frame, stuff, unstuff
-from skin.wire.text import crc16
+from skin.wire.protocol import crc16, decode_frame, encode_frame, stuff, unstuff
 
 RAMP = bytes(range(256))
 

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.wire.binary import encode_frame
 from skin.wire.decoder import Decoder
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.protocol import Header, encode_frame, encode_header, encode_line
 
 
 def lines(count, sensors=4, first=0, check="crc16"):
@@ -36,7 +35,7 @@ def test_lines_are_recognised(check, end, sensors):
     assert numbers(frames) == list(range(check != "crc16", 12))
     assert frames[-1].values.tolist() == [11, 111, 211, 311]
     assert (frames[-1].t, frames[-1].valid.all()) == (0.011, True)
-    assert (decoder.frame_format.check, decoder.counters.weak) == (check, 0 if check == "crc16" else 11)
+    assert (decoder.frame_format.check, decoder.stats.weak) == (check, 0 if check == "crc16" else 11)
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " ", ", "])
@@ -53,7 +52,7 @@ def test_binary_is_recognised_at_the_second_frame(kind, sensors):
     decoder = Decoder(sensors)
     assert decoder.feed(b"\x07\x00" + encode_frame([1, 0, 3, 4], 0, 0, kind)) == []
     assert numbers(decoder.feed(encode_frame([1, 0, 3, 4], 1, 500, kind))) == [0, 1]
-    assert (decoder.frame_format.name, decoder.frame_format.check, decoder.counters.skipped) == (
+    assert (decoder.frame_format.name, decoder.frame_format.check, decoder.stats.skipped) == (
         "binary",
         "crc16",
         1,
@@ -79,7 +78,7 @@ def test_one_byte_at_a_time_gives_the_same():
     whole = together.feed(data)
     pieces = [frame for byte in data for frame in single.feed(bytes([byte]))]
     assert [frame[:3] + frame[5:] for frame in pieces] == [frame[:3] + frame[5:] for frame in whole]
-    assert (single.counters, len(whole)) == (together.counters, 25)
+    assert (single.stats, len(whole)) == (together.stats, 25)
 
 
 @pytest.mark.parametrize("format", ["text", "binary"])
@@ -95,7 +94,7 @@ def test_another_number_of_sensors_is_refused_with_both_counts(spoken):
     decoder = Decoder(25)
     encode = {"text": encode_line, "binary": encode_frame}[spoken]
     number = 0
-    while decoder.counters.bytes < 5000:
+    while decoder.stats.bytes < 5000:
         assert decoder.feed(encode([number % 7] * 16, number, number * 10)) == []
         number += 1
     assert "16 values per frame, the layout has 25 sensors" in str(decoder.error())
@@ -143,7 +142,7 @@ def test_a_bad_line_is_dropped_and_the_next_one_taken(spoilt, reason):
     frames = [frame for piece in data for frame in decoder.feed(piece)]
     assert numbers(frames) == [1, 2, 4, 5, 6]
     assert (frames[2].after, frames[2].lost) == ("gap", 1)
-    counters = decoder.counters
+    counters = decoder.stats
     assert (counters.bad, counters.resyncs, counters.gaps, counters.lost) == ({reason: 1}, 1, 1, 1)
 
 
@@ -151,7 +150,7 @@ def test_a_weaker_checksum_than_the_first_lines_had_is_refused():
     decoder = Decoder(4)
     weaker = lines(1, first=3, check="none") + lines(1, first=4, check="xor")
     frames = decoder.feed(b"".join(lines(3) + weaker))
-    assert (numbers(frames), decoder.counters.bad) == ([0, 1, 2], {"checksum": 2})
+    assert (numbers(frames), decoder.stats.bad) == ([0, 1, 2], {"checksum": 2})
 
 
 def test_memory_stays_small_without_any_delimiter():
@@ -161,7 +160,7 @@ def test_memory_stays_small_without_any_delimiter():
         decoder.feed(b"5" * 10_000)
         assert len(decoder._buffer) <= 65536 + 10_000
     assert numbers(decoder.feed(b"\n" + lines(1, first=3)[0])) == [3]
-    assert decoder.counters.bad == {"long": 1}
+    assert decoder.stats.bad == {"long": 1}
 
 
 def test_more_than_half_bad_over_two_seconds_is_trouble_until_it_is_not():

@@ -8,7 +8,7 @@ import pytest
 
 from skin.paths import ROOT
 from skin.wire.decoder import Decoder
-from skin.wire.text import Header
+from skin.wire.protocol import Header
 
 SKETCH = ROOT / "docs" / "firmware" / "skin" / "skin.ino"
 FIRST_US = 2**32 - 3_000_000  # the clock wraps after three seconds
@@ -51,7 +51,7 @@ def test_every_frame_of_the_sketch_is_read(said):
     assert [frame.seq for frame in frames] == list(range(1200))
     assert decoder.frame_format.check == "crc16"
     assert decoder.header == Header(1, 6, 100.0, "adc", 10, "uno")
-    assert decoder.counters.bad.total() + decoder.counters.gaps + decoder.counters.resets == 0
+    assert decoder.stats.bad.total() + decoder.stats.gaps + decoder.stats.resets == 0
     values = np.stack([frame.values for frame in frames])
     assert values[:, 5] - values[:, 0] == pytest.approx(500, abs=97)
     steps = np.diff([frame.t for frame in frames])

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skin.wire.binary import encode_frame
 from skin.wire.decoder import Decoder
-from skin.wire.text import encode_line, parse_line
+from skin.wire.protocol import encode_frame, encode_line, parse_line
 from tests.wire import bad_stream, independent_frames
 
 quickly = settings(

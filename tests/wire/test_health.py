@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.wire.health import ChannelHealth
+from skin.wire.channels import ChannelHealth
 
 
 def check(health, frames):

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from skin.signal.frame import FrameError
-from skin.wire.binary import encode_frame
 from skin.wire.decoder import Decoder
-from skin.wire.diagnosis import PortMonitor
-from skin.wire.open import open_skin
-from skin.wire.text import crc16, parse_line
+from skin.wire.protocol import crc16, encode_frame, parse_line
+from skin.wire.skin import PortMonitor, open_skin
 
 WORDS = [
     *(b"nan", b"NaN", b"-nan", b"inf", b"-INF", b"1e400", b"-1e999", b"ovf", b"OVF", b"err", b"ERROR"),
@@ -51,19 +49,19 @@ def test_a_channel_without_a_number_keeps_its_last_value_and_is_invalid(word):
     decoder, frames = decoded(line([1, 2, word, 4]), line([5, 6, 7, 8]))
     assert [frame.values.tolist() for frame in frames] == [[1, 2, NUMBERS[-1][2], 4], [5, 6, 7, 8]]
     assert [frame.valid.tolist() for frame in frames] == [[True, True, False, True], [True] * 4]
-    assert (decoder.counters.invalid, decoder.counters.bad.total()) == (1, 0)
+    assert (decoder.stats.invalid, decoder.stats.bad.total()) == (1, 0)
 
 
 def test_the_last_field_may_be_empty():
     decoder, frames = decoded(b"1,2,3,\n", b"1,2,3\n")
     assert [frame.valid.tolist() for frame in frames] == [[True, True, True, False]]
-    assert decoder.counters.bad == {"fields": 1}
+    assert decoder.stats.bad == {"fields": 1}
 
 
 def test_a_separator_at_the_end_of_every_line_is_no_field():
     decoder = Decoder(4)
     decoder.feed(b"".join(line([*row, b""]) for row in NUMBERS) + b"1,2,3,\n")
-    assert decoder.counters.bad == {"fields": 1}
+    assert decoder.stats.bad == {"fields": 1}
     other = Decoder(5)
     other.feed(b"".join(line([*row, b""]) for row in NUMBERS * 30))
     assert "4 values per frame, the layout has 5 sensors" in str(other.error())
@@ -83,7 +81,7 @@ def test_number_and_time_must_be_numbers(fields):
     frames = decoder.feed(b"".join(line([n, 1000 * n, *NUMBERS[n]], check=True) for n in range(12)))
     assert len(frames) == 12
     assert decoder.feed(line([*fields, 1, 2, 3, 4], check=True)) == []
-    assert decoder.counters.bad == {"number": 1}
+    assert decoder.stats.bad == {"number": 1}
 
 
 def test_wordy_lines_show_no_format():

@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.wire.binary import encode_frame
-from skin.wire.errors import SkinDisconnected, SkinTimeout
-from skin.wire.open import open_skin
-from skin.wire.text import Header, encode_header, encode_line
-from skin.wire.transport import open_stream
+from skin.wire.protocol import Header, encode_frame, encode_header, encode_line
+from skin.wire.reader import SkinDisconnected, SkinTimeout, open_stream
+from skin.wire.skin import open_skin
 
 LAYOUT = range(4)
 PATIENT = 60.0  # s: machines are busy at times
@@ -103,7 +101,7 @@ def test_a_bad_line_costs_itself_only(plug, spoilt, reason):
         plug.send(lines(*range(5), check=check), spoilt, lines(6, 7, check=check))
         frames = skin.read(7 if check == "crc16" else 6, timeout=PATIENT)
         assert (numbers(frames[-3:]), frames[-2].lost) == ([4, 6, 7], 1)
-        assert (skin.stats.bad, skin.stats.resyncs) == (((reason, 1),), 1)
+        assert (skin.stats.bad, skin.stats.resyncs) == ({reason: 1}, 1)
 
 
 def test_bad_lines_are_told_once_a_second_with_their_reason(plug, caplog):
@@ -280,7 +278,7 @@ def test_a_forbidden_port_is_refused(plug):
     os.chmod(plug.port, 0)
     # As root nothing is forbidden, so another user tries; by then everything is imported.
     code = (
-        "import os, sys, serial; from skin.wire.open import open_skin\n"
+        "import os, sys, serial; from skin.wire.skin import open_skin\n"
         "os.geteuid() or os.seteuid(65534)\n"
         "try: open_skin(sys.argv[1])\n"
         "except ValueError as error: print(error)\n"
@@ -345,7 +343,7 @@ def test_tare_while_the_device_starts_anew_is_refused(plug):
 
 def test_ctrl_c_ends_a_read_that_waits(plug):
     code = (
-        "import sys; from skin.wire.open import open_skin\n"
+        "import sys; from skin.wire.skin import open_skin\n"
         "with open_skin(sys.argv[1]) as skin:\n"
         "    print('open', flush=True)\n"
         "    skin.read(1, timeout=600)\n"

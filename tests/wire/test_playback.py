@@ -9,8 +9,8 @@ from skin.build import build_device
 from skin.config import validate_config
 from skin.errors import InputError
 from skin.recording_file import write_recording
-from skin.wire.errors import SkinDisconnected
-from skin.wire.open import open_skin
+from skin.wire.reader import SkinDisconnected
+from skin.wire.skin import open_skin
 
 
 @pytest.fixture(scope="module")

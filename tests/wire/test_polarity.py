@@ -11,12 +11,12 @@ from skin.signal.calibration import Calibration, read_calibration, write_calibra
 from skin.signal.frame import Frame
 from skin.signal.imperfection import Imperfection
 from skin.signal.resampling import Window
-from skin.wire.conversion import unit_conversion
+from skin.wire.channels import Tare, unit_conversion
 from skin.wire.decoder import Decoder
-from skin.wire.open import open_skin
-from skin.wire.serial_source import SerialSource
-from skin.wire.tare import Tare
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.protocol import Header, encode_header, encode_line
+from skin.wire.reader import PortSettings
+from skin.wire.skin import open_skin
+from skin.wire.source import SerialSource
 
 FALLING = Calibration(
     {"gain": [2.0, 0.5, 1.0], "offset": [0.1, -0.2, 0.0], "clip": [10.0, 10.0, 10.0]},
@@ -82,10 +82,12 @@ def test_a_scale_may_be_negative_but_not_beside_a_calibration_and_not_0():
     conversion = unit_conversion(2, np.array([900.0, 900.0]), -0.02, None, None)
     readings, _ = conversion(np.array([900.0, 400.0]), np.ones(2, dtype=bool))
     np.testing.assert_allclose(readings, [0, 10], atol=1e-6)
-    assert SerialSource(sensors=2, rate=10.0, scale=-0.02).polarity == [-1, -1]
-    for scale in (0.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=r"must not be 0.*device.scale=-0.039 if values fall"):
-            SerialSource(sensors=2, rate=10.0, scale=scale)
+    assert SerialSource(PortSettings(scale=-0.02), 2, 10.0).polarity == [-1, -1]
+    with pytest.raises(InputError, match=r"must not be 0.*device.scale=-0.039 if values fall"):
+        SerialSource(PortSettings(scale=0.0), 2, 10.0)
+    for scale in (float("nan"), float("inf")):
+        with pytest.raises(InputError, match=r"device.scale=(nan|inf) must be a finite number"):
+            PortSettings(scale=scale)
     with pytest.raises(InputError, match="above 0 beside a calibration"):
         unit_conversion(3, None, -0.02, FALLING, None)
 
@@ -145,13 +147,13 @@ def test_both_ends_of_the_converter_saturate_a_channel_whose_values_fall():
 
 
 def test_a_press_on_a_falling_channel_reads_its_peak_after_a_tare():
-    source = SerialSource(sensors=1, rate=10.0, scale=-0.02, tare=1.0)
+    source = SerialSource(PortSettings(scale=-0.02, tare=1.0), 1, 10.0)
     rng, rows = np.random.default_rng(0), []
     for number in range(200):
         force = 5.0 if 150 <= number < 155 else 0.0
         rows.append([round(900 - force / 0.02 + rng.normal())])
     lines = b"".join(encode_line(row, n, 10_000 * n) for n, row in enumerate(rows))
-    tare, window = Tare(source.conversion, 1.0, 10.0), Window(5, 10.0, 1)
+    tare, window = Tare(source.convert, 1.0, 10.0), Window(5, 10.0, 1)
     for frame in Decoder(1, polarity=source.polarity).feed(lines):
         tare.add(frame)
         window.add(frame)

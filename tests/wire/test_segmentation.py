@@ -11,8 +11,14 @@ from skin.errors import InputError
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.signal.frame import Frame
 from skin.signal.resampling import Window
-from skin.wire.announcement import Announcement, AnnouncementListener, encode_announcement
-from skin.wire.segmentation import AnnouncedSegmenter, ContinuousSegmenter, PromptedSegmenter, label_plan
+from skin.wire.protocol import Announcement, encode_announcement
+from skin.wire.segmentation import (
+    AnnouncedSegmenter,
+    AnnouncementListener,
+    ContinuousSegmenter,
+    PromptedSegmenter,
+    label_plan,
+)
 
 LABELS = {"big": 1, "dynamic": 0, "press": 1, "dangerous": 0}
 
@@ -122,6 +128,6 @@ def test_windows_one_after_the_other():
 
 def test_windows_that_wait_for_a_touch():
     gestures = shown(
-        ContinuousSegmenter(window(0.1), wanted=lambda values: values[0] % 50 > 40), frames(range(120))
+        ContinuousSegmenter(window(0.1), begins=lambda values: values[0] % 50 > 40), frames(range(120))
     )
     assert [gesture.frames[0].seq for gesture in gestures] == [41, 91]

@@ -12,11 +12,10 @@ from time import monotonic, sleep
 import pytest
 
 from skin.errors import InputError
-from skin.wire import feed
-from skin.wire.binary import encode_frame
-from skin.wire.errors import SkinTimeout
-from skin.wire.open import open_skin
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire import reader
+from skin.wire.protocol import Header, encode_frame, encode_header, encode_line
+from skin.wire.reader import SkinTimeout
+from skin.wire.skin import open_skin
 
 LAYOUT = range(4)
 PATIENT = 60.0  # s: machines are busy at times
@@ -139,9 +138,9 @@ def test_a_silence_that_is_no_time_is_refused(silence):
 
 NETWORK = """
 import logging, socket, subprocess, sys, threading, time
-from skin.wire import transport
-from skin.wire.open import open_skin
-from skin.wire.text import encode_line
+from skin.wire import reader as transport
+from skin.wire.skin import open_skin
+from skin.wire.protocol import encode_line
 ip = lambda *words: subprocess.run(["ip", "link", "set", "lo", *words], check=True)
 ip("up")
 server = socket.create_server(("127.0.0.1", 0))
@@ -194,7 +193,7 @@ def test_a_text_clock_that_never_moves_is_said(plug, layout, told):
 
 @pytest.mark.parametrize("kind", ["text", "binary"])
 def test_a_clock_that_stops_is_said(plug, kind, monkeypatch):
-    monkeypatch.setattr(feed, "_STILL", (0.5, 10))
+    monkeypatch.setattr(reader, "_STILL", (0.5, 10))
     encode = {"text": encode_line, "binary": encode_frame}[kind]
     with open_skin(plug.port, LAYOUT) as skin:
         plug.send(*(encode([5, 6, 7, 8], number, 10 * number) for number in range(5)))
@@ -210,7 +209,7 @@ def test_a_clock_that_stops_is_said(plug, kind, monkeypatch):
 
 
 def test_lines_of_one_moment_are_no_clock_that_stands_still(plug, monkeypatch):
-    monkeypatch.setattr(feed, "_STILL", (0.3, 10))
+    monkeypatch.setattr(reader, "_STILL", (0.3, 10))
     with open_skin(plug.port, LAYOUT) as skin:
         plug.send(*(encode_line([5, 6, 7, 8], number, number) for number in range(20)))
         for burst in range(1, 12):

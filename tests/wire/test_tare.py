@@ -6,10 +6,9 @@ import pytest
 from skin.errors import InputError
 from skin.signal.calibration import Calibration
 from skin.signal.frame import Frame
-from skin.wire.conversion import unit_conversion
-from skin.wire.errors import SkinTouched
-from skin.wire.tare import Tare, warm_up
-from skin.wire.text import Header
+from skin.wire.channels import SkinTouched, Tare, unit_conversion
+from skin.wire.protocol import Header
+from skin.wire.source import warm_up
 
 REST = np.array([512.0, 300.0, 40.0])
 RATE = 10.0  # Hz, of the model
@@ -142,7 +141,8 @@ def settled(played, seconds, said=None):
     """Return the frames that settling took, and the baseline."""
     tare = Tare(lambda baseline, header: unit_conversion(2, baseline, 1.0, None, header), seconds, RATE)
     tell = (lambda _: None) if said is None else said.append
-    return warm_up(played, tare, RATE, seconds, tell), tare.conversion.zero
+    frames, conversion = warm_up(played, tare, RATE, seconds, tell)
+    return frames, conversion.zero
 
 
 def test_an_untouched_skin_gives_its_baseline_at_once():

@@ -3,7 +3,7 @@
 import pytest
 
 from skin.signal.frame import FrameError
-from skin.wire.text import Header, crc16, encode_header, encode_line, parse_header, parse_line, xor8
+from skin.wire.protocol import Header, crc16, encode_header, encode_line, parse_header, parse_line, xor8
 
 
 def test_the_crc_has_the_published_check_value():

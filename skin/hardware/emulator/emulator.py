@@ -1,10 +1,16 @@
-"""The emulated skin: sends gestures to a port in real time."""
+"""The emulated skin: sends gestures to a pseudo-terminal or a TCP port in real time, with faults."""
 
-from collections.abc import Callable, Iterator
+import os
+import select
+import socket
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from threading import Event
-from time import monotonic
+from pathlib import Path
+from threading import Event, RLock
+from time import monotonic, sleep
 from typing import Annotated
 
 import numpy as np
@@ -13,15 +19,261 @@ from annotated_types import Ge, Le
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from skin.device.base import AbstractSimulated
-from skin.hardware.emulator.faults import BANNER, KINDS, Faults
+from skin.errors import InputError
 from skin.hardware.emulator.gestures import Converter, Gesture, emulated_gestures, upsample
-from skin.hardware.emulator.port import AbstractPort
 from skin.rng import Stream, generator
 from skin.signal.frame import Check
-from skin.wire.announcement import Announcement, encode_announcement
-from skin.wire.binary import encode_comment, encode_frame
+from skin.wire.protocol import (
+    Announcement,
+    Header,
+    encode_announcement,
+    encode_comment,
+    encode_frame,
+    encode_header,
+    encode_line,
+)
 from skin.wire.segmentation import label_text
-from skin.wire.text import Header, encode_header, encode_line
+
+_PATIENCE = 1.0  # s that a reader may be late before bytes are lost, as in a device without flow control
+_PAUSE = 0.002  # s until a full buffer is tried again
+
+
+class AbstractPort(ABC):
+    """Base class of ports; one thread may write while another unplugs the port.
+
+    Attributes:
+        address: value for ``device.port``.
+    """
+
+    address: str
+
+    def __init__(self) -> None:
+        # Held by every method that uses or replaces what is open.
+        self._lock = RLock()
+
+    @abstractmethod
+    def connected(self) -> bool:
+        """Return whether a reader is connected."""
+
+    @abstractmethod
+    def unplug(self) -> None:
+        """Close the port."""
+
+    @abstractmethod
+    def plug(self) -> None:
+        """Open the port again at the same address."""
+
+    @abstractmethod
+    def _send(self, data: bytes) -> int:
+        """Write part of ``data`` without waiting and return its length; the lock is held."""
+
+    def write(self, data: bytes) -> None:
+        """Write; bytes that are not read within a second are lost."""
+        deadline = monotonic() + _PATIENCE
+        while data and monotonic() < deadline:
+            with self._lock:
+                if not self.connected():
+                    return
+                try:
+                    data = data[self._send(data) :]
+                    continue
+                except BlockingIOError:
+                    pass
+                except OSError:
+                    return
+            sleep(_PAUSE)
+
+
+def open_port(port: str, link: str | None) -> AbstractPort:
+    """Open a port: ``pty``, or ``tcp:NUMBER`` (0: any free number).
+
+    Args:
+        port: as above.
+        link: symbolic link to the pseudo-terminal, which stays the same after unplugging.
+
+    Raises:
+        InputError: an unknown port, a number in use, or a link that cannot be created.
+    """
+    kind, _, number = port.partition(":")
+    if kind == "pty" and not number:
+        return _Pty(link)
+    if kind == "tcp" and number.isascii() and number.isdigit() and int(number) < 65536:
+        if link is not None:
+            raise InputError("a TCP port needs no link: leave out link=, or give port=pty")
+        return _Tcp(int(number))
+    raise InputError(f"port is pty or tcp:NUMBER, got {port}: as in port=tcp:5555")
+
+
+class _Pty(AbstractPort):
+    def __init__(self, link: str | None) -> None:
+        super().__init__()
+        self._link = None if link is None else Path(link).expanduser().absolute()
+        if self._link and self._link.exists() and not self._link.is_symlink():
+            raise InputError(f"link={link} would replace a file: give another name")
+        self.plug()
+
+    def plug(self) -> None:
+        try:
+            import tty
+        except ImportError as error:  # Windows
+            raise InputError(
+                "this system has no pseudo-terminals: add port=tcp:5555, and read it with "
+                "device.port=socket://127.0.0.1:5555"
+            ) from error
+        with self._lock:
+            self._master, slave = os.openpty()
+            tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            name = os.ttyname(slave)
+            # Opened and closed once, it signals when a reader opens it.
+            os.close(slave)
+        self.address = name if self._link is None else str(self._link)
+        if self._link is not None:
+            partial = self._link.with_name(self._link.name + ".part")
+            try:
+                partial.unlink(missing_ok=True)
+                partial.symlink_to(name)
+                partial.replace(self._link)
+            except OSError as error:
+                raise InputError(f"cannot make link={self._link}: {error}") from error
+
+    def connected(self) -> bool:
+        with self._lock:
+            if self._master < 0:
+                return False
+            watch = select.poll()
+            watch.register(self._master, 0)
+            return not any(event & select.POLLHUP for _, event in watch.poll(0))
+
+    def unplug(self) -> None:
+        with self._lock:
+            if self._master >= 0:
+                os.close(self._master)
+                self._master = -1
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+    def _send(self, data: bytes) -> int:
+        return os.write(self._master, data)
+
+
+class _Tcp(AbstractPort):
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self._number = number
+        self.plug()
+
+    def plug(self) -> None:
+        with self._lock:
+            try:
+                self._server = socket.create_server(("127.0.0.1", self._number))
+            except OSError as error:
+                raise InputError(f"cannot listen on tcp:{self._number}: {error}; as in port=tcp:0") from error
+            self._server.setblocking(False)
+            self._number = self._server.getsockname()[1]
+            self.address = f"socket://127.0.0.1:{self._number}"
+            self._client: socket.socket | None = None
+
+    def connected(self) -> bool:
+        with self._lock:
+            if self._client is not None and self._left(self._client):
+                self._client.close()
+                self._client = None
+            if self._client is None:
+                with suppress(OSError):  # no reader, or unplugged
+                    self._client, _ = self._server.accept()
+                    self._client.setblocking(False)
+            return self._client is not None
+
+    def unplug(self) -> None:
+        with self._lock:
+            if self._client is not None:
+                self._client.close()
+                self._client = None
+            self._server.close()
+
+    @staticmethod
+    def _left(client: socket.socket) -> bool:
+        try:
+            return not client.recv(4096)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def _send(self, data: bytes) -> int:
+        return self._client.send(data) if self._client else len(data)
+
+
+BANNER = b"\x00\xff\x00ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805f0\r\n"
+"""Boot message of an ESP32 at 115200 baud, after two bytes of noise."""
+
+KINDS = ("silence", "reset", "unplug")
+"""Faults that occur at a moment."""
+
+Share = Annotated[float, Ge(0), Le(1)]
+Often = NonNegativeFloat | Sequence[NonNegativeFloat]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """Rates of faults; all are off by default.
+
+    ``silence``, ``reset`` and ``unplug`` are mean numbers per minute, or lists of times, s since the start
+    of the device.
+
+    Attributes:
+        flipped_bits: share of bits that arrive flipped.
+        lost_bytes: share of bytes that are lost.
+        banner: send the boot message of a board at the start and after each reset and unplugging.
+        silence: nothing is sent for ``silent`` s; frame numbers continue.
+        reset: frame numbers start from 0 again.
+        unplug: the port disappears for ``away`` s.
+        silent, away: s.
+        stuck: channels, from 0, that repeat their value at ``since``.
+        dead: channels that send 0 from ``since`` on.
+        since: s.
+    """
+
+    flipped_bits: Share = 0.0
+    lost_bytes: Share = 0.0
+    banner: bool = False
+    silence: Often = 0.0
+    reset: Often = 0.0
+    unplug: Often = 0.0
+    silent: NonNegativeFloat = 2.0
+    away: NonNegativeFloat = 2.0
+    stuck: Sequence[NonNegativeInt] = ()
+    dead: Sequence[NonNegativeInt] = ()
+    since: NonNegativeFloat = 0.0
+
+    def fits(self, sensors: int) -> None:
+        """Raise InputError if a channel does not exist."""
+        for number in (*self.stuck, *self.dead):
+            if number >= sensors:
+                raise InputError(f"there is no channel {number}: the layout has {sensors} sensors, from 0")
+
+    def happen(self, kind: str, frames: int, rate: float, generator: np.random.Generator) -> np.ndarray:
+        """Draw the frames in which a fault given by its rate occurs, (frames,), bool."""
+        per_minute: float | Sequence[float] = getattr(self, kind)
+        if not isinstance(per_minute, int | float) or not per_minute:
+            return np.zeros(frames, dtype=bool)
+        return generator.random(frames) < per_minute / 60 / rate
+
+    def moments(self, kind: str, rate: float) -> frozenset[int]:
+        """Return the frames, counted from the start, in which a fault given by times occurs."""
+        listed = getattr(self, kind)
+        return frozenset() if isinstance(listed, int | float) else frozenset(round(t * rate) for t in listed)
+
+    def damaged(self, data: bytes, generator: np.random.Generator) -> bytes:
+        """Return bytes with flipped bits and lost bytes."""
+        if not self.flipped_bits and not self.lost_bytes:
+            return data
+        bits = np.unpackbits(np.frombuffer(data, np.uint8))
+        bits ^= generator.random(len(bits)) < self.flipped_bits
+        arrived = np.packbits(bits)
+        return arrived[generator.random(len(arrived)) >= self.lost_bytes].tobytes()
+
 
 _HEADER = 1.0  # s from one header to the next
 _LOOK = 0.05  # s between two checks for a reader

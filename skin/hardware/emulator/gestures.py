@@ -84,10 +84,10 @@ def _batch(device: AbstractSimulated, seed: int, number: int) -> list[Gesture]:
 def _drawn(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
     movie = device.sampler.sample(len(labels), draw, labels)
     readings = device.model.respond(movie, displacement=False).readings.double().numpy()
-    names, found, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
+    names, rows, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
     return [
-        Gesture(dict(zip(names, row, strict=True)), one, applied)
-        for row, one, applied in zip(found, readings, force, strict=True)
+        Gesture(dict(zip(names, row, strict=True)), reading, applied)
+        for row, reading, applied in zip(rows, readings, force, strict=True)
     ]
 
 
@@ -108,8 +108,8 @@ def upsample(force: np.ndarray, model_rate: float, rate: float) -> np.ndarray:
     now = np.minimum(place.astype(int), len(force) - 1)
     share = (place - now)[:, None]
     padded = np.concatenate([np.zeros_like(force[:1]), force, np.zeros_like(force[:1])])
-    here = padded[now + 1]
-    before, after = np.minimum(padded[now], here), np.minimum(padded[now + 2], here)
-    rising = before + (here - before) * np.clip(share / _EDGE, 0, 1)
-    falling = after + (here - after) * np.clip((1 - share) / _EDGE, 0, 1)
+    level = padded[now + 1]
+    before, after = np.minimum(padded[now], level), np.minimum(padded[now + 2], level)
+    rising = before + (level - before) * np.clip(share / _EDGE, 0, 1)
+    falling = after + (level - after) * np.clip((1 - share) / _EDGE, 0, 1)
     return np.where(share < 0.5, rising, falling)

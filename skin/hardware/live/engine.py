@@ -1,22 +1,143 @@
-"""Classify a stream of frames, without input or output."""
+"""Classify a stream of frames, without input or output: verdicts, their debouncing, and the engine."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from math import ceil, floor, inf
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from skin.hardware.live.verdict import Debounce, DebounceSettings, Verdict
-from skin.labels import Task
+from skin.labels import OPPOSITE, Task
 from skin.settings import checked
 from skin.signal.contact_detection import DRIFT, ContactDetector
 from skin.signal.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown
 from skin.signal.frame import Frame, StreamClock
 from skin.signal.resampling import Window
-from skin.wire.conversion import UnitConversion
-from skin.wire.tare import EXPECTED, FROZEN
+from skin.wire.channels import EXPECTED, FROZEN, UnitConversion
+
+State = Literal["touch", "no touch", "unknown"]
+_NAMED = 3  # sensors
+
+
+def sensor_list(sensors: Sequence[int]) -> str:
+    """Return the numbers of sensors in words."""
+    omitted = f" and {len(sensors) - _NAMED} more" if len(sensors) > _NAMED else ""
+    numbers = ", ".join(map(str, sensors[:_NAMED]))
+    return f"sensor{'s' * (len(sensors) > 1)} {numbers}{omitted}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Classification of a window.
+
+    Attributes:
+        t: s, the device's clock at the latest frame.
+        t_host: s, the host's clock at that frame.
+        chances: label -> its probability in this window; of ``dangerous`` the largest since the alarm was
+            raised, while it lasts.
+        touched: debounced; if False, nothing touches the skin and the labels are meaningless.
+        labels: label -> debounced prediction; empty without touch.
+        dangerous: the alarm, which lasts until the contact ends.
+        gap: whether frames are missing in the window.
+        masked: sensors without a valid reading.
+        contact: duration of the contact, s; None without contact.
+        unknown: sensors at which a dangerous touch could not be felt, because no valid sensor would respond.
+        below: sensors that read below their rest: their wire is broken, their values fall with force, or the
+            tare was taken under a load.
+        agreeing: label -> its probability in the latest window that agreed with the debounced label; where it
+            is missing, that of this window.
+    """
+
+    t: float
+    t_host: float
+    chances: dict[str, float]
+    touched: bool
+    labels: dict[str, bool]
+    dangerous: bool
+    gap: bool
+    masked: tuple[int, ...] = ()
+    contact: float | None = None
+    unknown: tuple[int, ...] = ()
+    below: tuple[int, ...] = ()
+    agreeing: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def state(self) -> State:
+        """``touch``; ``unknown``, where a dangerous touch on a sensor could not be felt; or ``no touch``."""
+        return "touch" if self.touched else "unknown" if self.unknown else "no touch"
+
+    @property
+    def reason(self) -> str:
+        """Where the state is unknown and why, in words; empty where it is known everywhere."""
+        if not self.unknown:
+            return ""
+        text = f"unknown near {sensor_list(self.unknown)}"
+        if self.below:
+            return f"{text}, below rest: a broken wire, device.scale of the wrong sign, or a tare under load"
+        return f"{text}, without a valid reading"
+
+    def words(self) -> list[tuple[str, float]]:
+        """Return the predicted classes, each with its probability; empty without touch."""
+        chances = self.chances | self.agreeing
+        pairs = [
+            (name, chances[name]) if yes else (OPPOSITE.get(name, ""), 1 - chances[name])
+            for name, yes in self.labels.items()
+        ]
+        return [(word, chance) for word, chance in pairs if word]
+
+
+@checked("live.patience")
+@dataclass(frozen=True)
+class DebounceSettings:
+    """Durations for which a prediction must last before it is shown, and be absent before it is removed, s.
+
+    Attributes:
+        label: of any label but ``dangerous``, and of touch.
+        alarm: of ``dangerous`` before it is shown: two decisions of a device of 20 Hz or more. One alone
+            would raise several times as many false alarms; more than 0.1 s would come too late.
+        calm: without ``dangerous`` before the alarm is removed.
+        above: probability above which a touch is dangerous; None: that of the run.
+
+    Raises:
+        InputError: a negative time, an alarm that would be too late, or a value that is no probability.
+    """
+
+    label: NonNegativeFloat = 0.15
+    alarm: Annotated[float, Ge(0), Le(0.1)] = 0.1
+    calm: NonNegativeFloat = 2.0
+    above: Annotated[float, Gt(0), Lt(1)] | None = None
+
+
+@dataclass
+class Debounce:
+    """Turns on after ``rise`` seconds of True, and off after ``fall`` seconds of False.
+
+    If frames are further apart than that, one frame is enough.
+
+    Attributes:
+        rise: s.
+        fall: s.
+        state: the debounced value.
+    """
+
+    rise: float
+    fall: float
+    state: bool = False
+    _since: float | None = field(default=None, repr=False)
+
+    def __call__(self, answer: bool, t: float, period: float) -> bool:
+        """Return the debounced value after an answer at ``t`` that lasts for ``period``, s."""
+        if answer == self.state:
+            self._since = None
+            return self.state
+        self._since = t if self._since is None else self._since
+        # Rounding of the clock must not cost a frame.
+        if t - self._since + period >= (self.rise if answer else self.fall) - 1e-6:
+            self.state, self._since = answer, None
+        return self.state
+
 
 Classify = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Readings (B, T, S), float32, N, and valid (B, T, S), bool, of windows -> probabilities (B, L)."""
@@ -235,13 +356,13 @@ class Engine:
             self._idle = readings, valid
         lasted = None if self._contact.since is None else time - self._contact.since
         unknown = ~self._responds[:, valid[-1]].any(axis=1)
-        readings, known = self._presented(readings, valid, lasted or 0.0)
+        readings, presented = self._presented(readings, valid, lasted or 0.0)
         return [
             _Decision(
                 frame=frame,
                 time=time,
                 readings=readings,
-                valid=known,
+                valid=presented,
                 contact=contact,
                 risen=risen,
                 lasted=lasted,
@@ -259,8 +380,8 @@ class Engine:
         """Return the window (T, S) as the model sees it, during a contact of ``lasted`` s."""
         if lasted * self.window.rate <= self._shown:
             return readings, valid
-        idle, known = self._idle
-        return as_press(idle, readings, self._held), as_press(known, valid, self._held)
+        idle, idle_valid = self._idle
+        return as_press(idle, readings, self._held), as_press(idle_valid, valid, self._held)
 
     def _judge(self, decisions: Sequence[_Decision]) -> list[Verdict]:
         """Classify the windows of decisions at once, and return their verdicts."""
@@ -270,62 +391,76 @@ class Engine:
             np.stack([getattr(decision, name) for decision in decisions]) for name in ("readings", "valid")
         )
         chances = np.asarray(self._classify(readings, valid), dtype=float)
-        return [self._verdict(*pair) for pair in zip(decisions, chances.tolist(), strict=True)]
+        return [self._conclude(*pair) for pair in zip(decisions, chances.tolist(), strict=True)]
 
-    def _verdict(self, decision: _Decision, probabilities: Sequence[float]) -> Verdict:
+    def _conclude(self, decision: _Decision, probabilities: Sequence[float]) -> Verdict:
+        """Return the verdict on a decision, given the probabilities of its window, one per label."""
         chances = dict(zip(self.task.names, probabilities, strict=True))
         learned = self._detection.learned and chances[self.task.gate or ""] > 0.5
         period = max(self.window.period, 1 / DECISIONS)
-        # A touch that the window shows, but that has ended, raises no alarm.
-        present = decision.contact or (learned and not decision.risen)
-        self._update_alarm(present, chances, decision, period)
-        # An alarm does not wait for the debounced touch.
-        touched = decision.contact or decision.risen or learned
-        touched = self._touch(touched, decision.time, period) or self.alarm
-        labels = self._debounced(chances, decision.time, period)
-        if "dangerous" in chances:
-            labels["dangerous"] = self.alarm
-            chances["dangerous"] = max(self._peak_probability, chances["dangerous"])
-        return Verdict(
-            decision.frame.t,
-            decision.frame.t_host,
-            chances,
-            touched,
-            labels if touched else {},
-            self.alarm,
-            decision.gap,
-            decision.masked,
-            decision.lasted,
-            decision.unknown,
-            decision.below,
-            dict(self._agreeing),
-        )
+        self._update_alarm(decision, chances, learned, period)
+        touched = self._debounce_touch(decision, learned, period)
+        labels = self._debounce_labels(decision, chances, period)
+        return self._pack(decision, chances, touched, labels)
 
     def _update_alarm(
-        self, touched: bool, chances: dict[str, float], decision: _Decision, period: float
+        self, decision: _Decision, chances: dict[str, float], learned: bool, period: float
     ) -> None:
         """Raise the alarm during a contact that is dangerous; keep it until the contact ends."""
+        # A touch that the window shows, but that has ended, raises no alarm.
+        present = decision.contact or (learned and not decision.risen)
         chance = chances.get("dangerous", 0.0)
         # A NaN probability must not make a touch safe.
-        dangerous = touched and not chance <= self._above
+        dangerous = present and not chance <= self._above
         # No second decision can follow the last one before an interruption.
         period = inf if decision.last and dangerous else period
         raised = self._labels["dangerous"](dangerous, decision.time, period)
         self.alarm = raised or (self.alarm and decision.contact)
         self._peak_probability = max(self._peak_probability, chance) if self.alarm else 0.0
 
-    def _debounced(self, chances: dict[str, float], time: float, period: float) -> dict[str, bool]:
+    def _debounce_touch(self, decision: _Decision, learned: bool, period: float) -> bool:
+        """Return whether the window shows a touch, debounced; an alarm does not wait for that."""
+        touched = decision.contact or decision.risen or learned
+        return self._touch(touched, decision.time, period) or self.alarm
+
+    def _debounce_labels(
+        self, decision: _Decision, chances: dict[str, float], period: float
+    ) -> dict[str, bool]:
         """Return the predicted labels but ``dangerous``: the likeliest one if they exclude each other."""
-        if self.task.kind == "exclusive":
-            best = max(chances, key=chances.__getitem__)
-            predicted = {name: name == best for name in chances}
-        else:
-            predicted = {name: chance > 0.5 for name, chance in chances.items()}
-        gated = [name for name in self.task.gated if name != "dangerous"]
-        labels = {name: self._labels[name](predicted[name], time, period) for name in gated}
-        # A word must not stand beside the probability of its opposite.
-        self._agreeing |= {name: chances[name] for name in gated if labels[name] == predicted[name]}
+        best = max(chances, key=chances.__getitem__)
+        exclusive = self.task.kind == "exclusive"
+        labels = {}
+        for name in self.task.gated:
+            if name == "dangerous":
+                continue
+            predicted = name == best if exclusive else chances[name] > 0.5
+            labels[name] = self._labels[name](predicted, decision.time, period)
+            # A word must not stand beside the probability of its opposite.
+            if labels[name] == predicted:
+                self._agreeing[name] = chances[name]
         return labels
+
+    def _pack(
+        self, decision: _Decision, chances: dict[str, float], touched: bool, labels: dict[str, bool]
+    ) -> Verdict:
+        """Return the verdict; ``dangerous`` is the alarm, with its largest probability so far."""
+        if "dangerous" in chances:
+            labels = labels | {"dangerous": self.alarm}
+            chances = chances | {"dangerous": max(self._peak_probability, chances["dangerous"])}
+        return Verdict(
+            t=decision.frame.t,
+            t_host=decision.frame.t_host,
+            chances=chances,
+            touched=touched,
+            labels=labels if touched else {},
+            dangerous=self.alarm,
+            gap=decision.gap,
+            masked=decision.masked,
+            contact=decision.lasted,
+            unknown=decision.unknown,
+            below=decision.below,
+            agreeing=dict(self._agreeing),
+        )
 
 
 def _numbers(which: np.ndarray | np.bool) -> tuple[int, ...]:

@@ -13,8 +13,8 @@ from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.evaluation.report import Predictor
 from skin.exported.metadata import ModelMetadata
-from skin.hardware.live.engine import Classify, Detection, Engine, EngineSettings
-from skin.hardware.live.verdict import DebounceSettings
+from skin.hardware.live.engine import Classify, DebounceSettings, Detection, Engine, EngineSettings
+from skin.hardware.wired import AbstractWired
 from skin.recording import Touches
 from skin.signal.contact_detection import DRIFT
 from skin.signal.contact_threshold import ContactThreshold, rise
@@ -169,7 +169,7 @@ def simulator_warning(stored: DictConfig, device: AbstractDevice | None = None) 
         device: the watched device; None: a real skin.
     """
     reading = OmegaConf.select(stored, "device.simulator.reading")
-    if reading != "equation10" or (device is not None and device.wired is None):
+    if reading != "equation10" or not (device is None or isinstance(device, AbstractWired)):
         return None
     return (
         "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "

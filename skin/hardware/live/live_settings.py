@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le
 
-from skin.hardware.live.verdict import DebounceSettings
+from skin.hardware.live.engine import DebounceSettings
 from skin.settings import configured
 
 

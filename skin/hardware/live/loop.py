@@ -1,19 +1,192 @@
-"""The live loop: read frames, classify, update the views."""
+"""The live loop: read frames, classify, update the state that the views share."""
 
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from threading import Event, Lock
 from time import monotonic
+from typing import Literal
 
 import numpy as np
 
-from skin.hardware.live.display import Display
-from skin.hardware.live.engine import Engine
-from skin.hardware.live.verdict import Verdict
+from skin.hardware.live.engine import Engine, Verdict
 from skin.signal.frame import Frame
-from skin.wire.conversion import UnitConversion
-from skin.wire.errors import SkinDisconnected, SkinTimeout
+from skin.wire.channels import Tare, UnitConversion
+from skin.wire.reader import SkinDisconnected, SkinTimeout
 from skin.wire.skin import Skin
-from skin.wire.tare import Tare
+
+_log = logging.getLogger(__name__)
+
+Observer = Callable[[Verdict | None, str, bool], None]
+"""Takes the arguments of :meth:`Display.set_verdict`; it must return at once."""
+
+TareRequest = Literal["", "tare", "forced"]
+"""A request for a new baseline: none, from the next quiet stretch, or from the next frames."""
+
+_KEPT = 8192  # frames that are kept for slow views
+_ONSET = 10  # frames of a touch before its contact is decided
+_CONFIRM = 60.0  # s after a refusal in which a tare may be forced
+REFUSED = "tare refused: something touches the skin; if nothing does, confirm it (terminal: force and Enter)"
+
+
+@dataclass(frozen=True)
+class DisplayInfo:
+    """Constant information about a live view.
+
+    Attributes:
+        title: of the run.
+        port: source of the frames.
+        positions: (S, 3), m.
+        size: extent (x, y) of the sheet, m.
+        top: upper end of the colour scale, N.
+        window: length of the classified window, s.
+    """
+
+    title: str
+    port: str
+    positions: np.ndarray
+    size: tuple[float, float]
+    top: float
+    window: float = 3.0
+
+
+@dataclass(frozen=True)
+class DisplayState:
+    """State of the live view at one moment.
+
+    Attributes:
+        number: of frames so far, to be passed to the next :meth:`Display.state`.
+        values: (S,), N, the largest of each sensor since the last call, so that no peak is missed; the limit
+            of a saturated sensor, 0 of an invalid one.
+        valid: (S,), bool, of the latest frame.
+        saturated: (S,), bool, since the last call: the force is at least the value.
+        verdict: the latest one; None if there is none now.
+        trouble: message about why there is no verdict; else empty.
+        alarm: the latest verdict was dangerous, and the contact has not ended as far as known.
+        line: text with rate, lost frames and latency.
+        peak: (S,), N, the largest of each sensor in the touch that the verdict is about; 0 without touch.
+    """
+
+    number: int
+    values: np.ndarray
+    valid: np.ndarray
+    saturated: np.ndarray
+    verdict: Verdict | None
+    trouble: str
+    line: str
+    alarm: bool
+    peak: np.ndarray
+
+    @property
+    def held(self) -> bool:
+        """Whether the verdict is about a touch that has ended, or an alarm is on: show :attr:`peak`."""
+        ended = self.verdict is not None and self.verdict.touched and self.verdict.contact is None
+        return self.alarm or ended
+
+    @property
+    def map(self) -> np.ndarray:
+        """Forces (S,), N, at the time of the verdict."""
+        return self.peak if self.held else self.values
+
+
+class Display:
+    """The latest frames, verdict and status, shared by one writing thread and any number of views.
+
+    Attributes:
+        info: as given.
+        closed: event, set at the end.
+        observers: called with each verdict, in the thread that classifies.
+        listeners: called with the name of each event of the operator, such as ``tare``.
+    """
+
+    def __init__(self, info: DisplayInfo) -> None:
+        self.info, self.closed = info, Event()
+        self.observers: list[Observer] = []
+        self.listeners: list[Callable[[str], None]] = []
+        self._lock = Lock()
+        sensors = len(info.positions)
+        first = np.zeros(sensors), np.zeros(sensors, dtype=bool)
+        self._frames: deque[tuple[np.ndarray, np.ndarray]] = deque([first], maxlen=_KEPT)
+        self._valid, self._alarm = np.ones(sensors, dtype=bool), False
+        self._peak, self._contact = np.zeros(sensors), False
+        self._number = 0
+        self._verdict: Verdict | None = None
+        self._trouble, self._line, self._note = "waiting for the first frame", "", ""
+        self._request: TareRequest = ""
+        self._refused_at = -np.inf
+
+    def add_frame(self, frame: Frame, conversion: UnitConversion) -> None:
+        """Add a frame as sent, with the conversion of its values to N."""
+        values, valid = conversion(frame.values, frame.valid)
+        saturated = np.zeros_like(valid) if frame.saturated is None else frame.saturated & valid
+        with self._lock:
+            self._number += 1
+            self._frames.append((values, saturated))
+            self._valid = valid
+            self._peak = np.maximum(self._peak, np.where(valid, values, 0.0))
+
+    def set_verdict(self, verdict: Verdict | None, trouble: str = "", alarm: bool = False) -> None:
+        """Set the verdict; or None with the reason and whether an alarm continues."""
+        with self._lock:
+            self._verdict, self._trouble = verdict, trouble
+            self._alarm = alarm if verdict is None else verdict.dangerous
+            contact = verdict is not None and verdict.contact is not None
+            touched = contact or (verdict is not None and verdict.touched)
+            if not self._alarm and (not touched or (contact and not self._contact)):
+                # A new touch; its first frames came before the decision.
+                recent = [values for values, _ in list(self._frames)[-_ONSET:]]
+                self._peak = np.max(recent, axis=0) if contact else np.zeros_like(self._peak)
+            self._contact = contact
+        for observer in self.observers:
+            observer(verdict, trouble, alarm)
+
+    def set_status(self, line: str) -> None:
+        """Set the text with rate, lost frames and latency."""
+        with self._lock:
+            self._line = line
+
+    def request_tare(self, force: bool = False) -> str:
+        """Request a new baseline; return why it is refused, or an empty text.
+
+        It is refused while something touches the skin. Within a minute after that it can be forced, by a
+        second and explicit confirmation of the operator.
+        """
+        with self._lock:
+            contact = self._verdict is not None and self._verdict.contact is not None
+            refused = contact or self._alarm
+            if force and monotonic() - self._refused_at <= _CONFIRM:
+                self._request, event, self._note = "forced", "tare_forced", ""
+            elif refused or force:
+                self._refused_at = monotonic() if refused else self._refused_at
+                event, self._note = "tare_refused", REFUSED if refused else "there is nothing to force"
+            else:
+                self._request, event, self._note = "tare", "tare", ""
+            note = self._note
+        _log.warning(
+            "%s", {"tare": "new tare", "tare_forced": "tare forced by the operator"}.get(event, note)
+        )
+        for listener in self.listeners:
+            listener(event)
+        return note
+
+    def take_tare(self) -> TareRequest:
+        """Return the latest request for a new baseline, once."""
+        with self._lock:
+            request, self._request = self._request, ""
+        return request
+
+    def state(self, since: int = 0) -> DisplayState:
+        """Return the state, with the largest values after the first ``since`` frames."""
+        with self._lock:
+            fresh = min(max(1, self._number - since), len(self._frames))
+            latest = [self._frames[-1 - back] for back in range(fresh)]
+            line = ", ".join(text for text in (self._note, self._line) if text)
+            state = self._verdict, self._trouble, line, self._alarm, self._peak
+            number, valid = self._number, self._valid
+        values, saturated = (np.max(part, axis=0) for part in zip(*latest, strict=True))
+        return DisplayState(number, np.where(valid, values, 0.0), valid, saturated & valid, *state)
+
 
 STALE = 1.5
 """s without frames after which nothing is known of the skin."""
@@ -144,13 +317,9 @@ class LiveLoop:
     def line(self) -> str:
         """Text with rate, lost frames, broken sensors and delay."""
         stats = self._skin.stats
-        counts = {
-            "bad": stats.bad_frames,
-            "lost": stats.lost,
-            "dropped": stats.dropped,
-            "restarts": stats.resets,
-            "reconnected": stats.reconnects,
-        }
+        counts = stats.list_counts(
+            bad_frames="bad", lost="lost", dropped="dropped", resets="restarts", reconnects="reconnected"
+        )
         faulty = [
             f"sensor {number} {state}" for number, state in enumerate(self._skin.channels) if state != "ok"
         ]
@@ -158,7 +327,7 @@ class LiveLoop:
             self._tare.status if self._tare.conversion is not None else "",
             self._tare.warning,
             self._rate,
-            *(f"{count} {name}" for name, count in counts.items() if count),
+            *counts,
             *faulty[:3],
             f"and {len(faulty) - 3} more" if len(faulty) > 3 else "",
             f"frame to verdict {1e3 * self.p99:.1f} ms (p99)" if self._delays else "",

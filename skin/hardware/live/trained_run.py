@@ -24,6 +24,7 @@ from skin.evaluation.touch_alarm import Watching, choose_for_touches
 from skin.hardware.live import engine_builder
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched, measured_rate, used_settings
+from skin.hardware.wired import AbstractWired, open_source
 from skin.progress import Steps
 from skin.run_overrides import apply_overrides
 from skin.signal import decisions, device_sampling, imperfection
@@ -65,7 +66,7 @@ def watch_run(
     watched = apply_overrides(stored, config, given)
     device = build_device(watched)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.
-    source = device.source() if device.wired is not None else None
+    source = open_source(device) if isinstance(device, AbstractWired) else None
     if source is not None:
         opened.enter_context(source.skin)
     # The training data stay those of the run, for any watched device.
@@ -93,7 +94,7 @@ def watch_run(
     chosen = above if live.patience.above is None else None
     nominal = replace(nominal, patience=replace(nominal.patience, above=chosen))
     if source is None:
-        source = device.source()
+        source = open_source(device)
         opened.enter_context(source.skin)
     used = used_settings(nominal, live)
     return Watched(title, source, used, nominal, of.positions.numpy(), of.device.size)

@@ -1,19 +1,63 @@
-"""Verdicts as JSON lines, on standard output or to the clients of a TCP port."""
+"""Verdicts as JSON lines: on standard output, to the clients of a TCP port, and in a log of alarms."""
 
 import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from math import isfinite
+from pathlib import Path
 from queue import Empty, Full, Queue
 from threading import Event, Lock, Thread
 from time import monotonic
-from typing import Literal
+from typing import Any, Literal, TextIO
 
 from skin.errors import InputError
-from skin.files import json_line
-from skin.hardware.live.display import Display
-from skin.hardware.live.verdict import Verdict
-from skin.hardware.live.verdict_message import verdict_message
+from skin.files import json_line, unwritable
+from skin.hardware.live.engine import Verdict
+from skin.hardware.live.loop import Display
+
+SCHEMA = 1
+"""Version of the messages. A field may be added without a new version; a reader ignores unknown ones."""
+
+
+def verdict_message(verdict: Verdict | None, reason: str, alarm: bool) -> dict[str, Any]:
+    """Return a verdict, or the reason why there is none, as JSON data.
+
+    Args:
+        verdict: the present one; None if there is none.
+        reason: why there is none.
+        alarm: an alarm that continues without a verdict.
+
+    Returns:
+        The fields of ``docs/export.md`` but ``number`` and ``event``.
+    """
+    if verdict is None:
+        shared = {"schema": SCHEMA, "stale": True, "reason": reason, "state": "unknown"}
+        return shared | {"time": _utc(0.0), "alarm": alarm}
+    shared = {"schema": SCHEMA, "stale": False, "reason": verdict.reason, "state": verdict.state}
+    return shared | {
+        "time": _utc(monotonic() - verdict.t_host),
+        "alarm": verdict.dangerous,
+        "device_time": verdict.t,
+        "touched": verdict.touched,
+        "labels": verdict.labels,
+        # JSON has no NaN.
+        "probabilities": {
+            name: round(value, 6) if isfinite(value) else None for name, value in verdict.chances.items()
+        },
+        "contact": verdict.contact,
+        "gap": verdict.gap,
+        "masked": list(verdict.masked),
+        "unknown": list(verdict.unknown),
+    }
+
+
+def _utc(ago: float) -> str:
+    """Return the time some seconds ago, ISO 8601 in UTC."""
+    moment = datetime.now(UTC) - timedelta(seconds=ago)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
 
 HEARTBEAT = 0.5  # s without a line after which the state is repeated
 _WAITING = 256  # lines for a slow reader; then the oldest is dropped
@@ -39,9 +83,9 @@ class VerdictStream:
     def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
         """Send a verdict, or a new reason for its absence."""
         with self._lock:
-            known, self._state = self._state, (verdict, reason, alarm)
+            before, self._state = self._state, (verdict, reason, alarm)
             self._seen = monotonic()
-            if verdict is not None or known != self._state:
+            if verdict is not None or before != self._state:
                 self._send("verdict" if verdict is not None else "change")
 
     def beat(self) -> None:
@@ -154,3 +198,69 @@ def _accept(listening: socket.socket, stream: VerdictStream, over: Event) -> Non
                 client, _ = listening.accept()
                 client.settimeout(_PATIENCE)
                 stream.join(client.sendall, client.close)
+
+
+class AlarmLog:
+    """Appends a JSON line to a file for each change.
+
+    The events are ``alarm``, ``cleared``, ``stale``, ``resumed``, ``unknown`` (of a place: its sensors have
+    no valid reading), ``known``, ``tare``, ``tare_refused`` and ``tare_forced``.
+
+    Args:
+        file: open for writing. If it becomes unwritable, a message says so once, and the live view continues.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self._file: TextIO | None = file
+        self._alarm, self._stale, self._unknown = False, True, False
+
+    def observe(self, verdict: Verdict | None, reason: str, alarm: bool) -> None:
+        """Write what has changed since the last call."""
+        now, stale = (alarm, True) if verdict is None else (verdict.dangerous, False)
+        if stale != self._stale:
+            self.write("stale" if stale else "resumed", verdict, reason, alarm)
+        if now != self._alarm:
+            self.write("alarm" if now else "cleared", verdict, reason, alarm)
+        unknown = verdict is not None and bool(verdict.unknown)
+        if unknown != self._unknown and not stale:
+            self.write("unknown" if unknown else "known", verdict, reason, alarm)
+            self._unknown = unknown
+        self._alarm, self._stale = now, stale
+
+    def write(
+        self, event: str, verdict: Verdict | None = None, reason: str = "", alarm: bool = False
+    ) -> None:
+        """Write one line."""
+        if self._file is None:
+            return
+        try:
+            self._file.write(json_line({"event": event, **verdict_message(verdict, reason, alarm)}) + "\n")
+            self._file.flush()
+        except OSError as error:
+            self._file = None
+            print(f"the alarm log ends here: {error}", file=sys.stderr)
+
+
+@contextmanager
+def log_alarms(display: Display, path: Path) -> Iterator[None]:
+    """Append the alarms of a display to a file while the block runs.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a", encoding="utf-8")
+    except OSError as error:
+        raise unwritable(path, error, "live.log=FILE.jsonl") from error
+    with file:
+        log = AlarmLog(file)
+        log.write("started")
+        display.observers.append(log.observe)
+        display.listeners.append(log.write)
+        try:
+            yield
+        finally:
+            display.observers.remove(log.observe)
+            display.listeners.remove(log.write)
+            log.write("ended")

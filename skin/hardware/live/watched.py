@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from math import log
 from time import monotonic
 from typing import Any
@@ -12,15 +12,13 @@ import numpy as np
 from skin.errors import InputError
 from skin.exported.metadata import ModelMetadata
 from skin.exported.model import ExportedModel
-from skin.hardware.live.engine import Detection, EngineSettings
+from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.selftest import SelfTest
-from skin.hardware.live.verdict import DebounceSettings
-from skin.wire.conversion import UnitConversion
-from skin.wire.errors import SkinTimeout
-from skin.wire.serial_source import SerialSource
+from skin.wire.channels import UnitConversion
+from skin.wire.reader import PortSettings, SkinTimeout
 from skin.wire.skin import Skin
-from skin.wire.source import Source
+from skin.wire.source import SerialSource, Source
 
 USUAL_RATE = 100.0
 """Hz: of a device whose rate is not known yet, for the choice of a threshold."""
@@ -84,9 +82,7 @@ def watch_model(
         )
     model = ExportedModel(path)
     about = model.metadata
-    names = {entry.name for entry in fields(SerialSource)}
-    settings = {name: value for name, value in device.items() if name in names}
-    source = SerialSource(sensors=len(about.positions), rate=about.rate, **settings).source()
+    source = SerialSource(PortSettings.select(device), len(about.positions), about.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {about.title} from {path}, exported by version {about.version}")
     given = live.patience.above

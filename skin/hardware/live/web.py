@@ -20,9 +20,8 @@ from starlette.routing import Route
 
 from skin.errors import InputError
 from skin.files import json_line
-from skin.hardware.live.display import Display, DisplayState
-from skin.hardware.live.picture import SkinPicture
-from skin.hardware.live.terminal import contact_text
+from skin.hardware.live.loop import Display, DisplayState
+from skin.hardware.live.terminal import SkinPicture, contact_text
 
 HERTZ = 33  # pictures per second: 30, with a margin for a busy machine
 _PIXELS = 64
@@ -99,9 +98,9 @@ def _application(display: Display) -> Starlette:
         return FileResponse(_PAGE, media_type="text/html", headers={"Cache-Control": "no-store"})
 
     async def skin(request: Request) -> Response:
-        known = {"positions": info.positions.tolist(), "size": list(info.size), "pixels": _PIXELS}
+        geometry = {"positions": info.positions.tolist(), "size": list(info.size), "pixels": _PIXELS}
         named = {"title": info.title, "port": info.port, "top": info.top, "window": info.window}
-        return JSONResponse(known | named)
+        return JSONResponse(geometry | named)
 
     async def pictures(request: Request) -> Response:
         return StreamingResponse(_events(display, picture), media_type="text/event-stream")
@@ -114,10 +113,10 @@ def _application(display: Display) -> Starlette:
         return JSONResponse({"reason": refused}, status_code=409) if refused else Response(status_code=204)
 
     # Other host names are refused, so that pages of other sites cannot read the skin.
-    here = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
+    local = Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
     routes = [Route("/", page), Route("/skin.json", skin), Route("/pictures", pictures)]
     routes.append(Route("/tare", tare, methods=["POST"]))
-    return Starlette(routes=routes, middleware=[here])
+    return Starlette(routes=routes, middleware=[local])
 
 
 async def _events(display: Display, picture: SkinPicture) -> AsyncIterator[str]:

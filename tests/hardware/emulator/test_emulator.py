@@ -8,9 +8,7 @@ import pytest
 
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
-from skin.hardware.emulator.emulator import Emulator, EmulatorSettings
-from skin.hardware.emulator.faults import Faults
-from skin.hardware.emulator.port import open_port
+from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
 from skin.layout.grid import Grid
 from skin.simulator.naive import Naive
 

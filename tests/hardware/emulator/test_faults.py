@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.emulator.faults import Faults
+from skin.hardware.emulator.emulator import Faults
 from skin.settings import configured
 
 

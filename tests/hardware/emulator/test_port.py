@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.errors import InputError
-from skin.hardware.emulator.port import _Tcp, open_port
-from skin.wire.transport import open_stream
+from skin.hardware.emulator.emulator import _Tcp, open_port
+from skin.wire.reader import open_stream
 
 
 def hear(stream, count):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.live.alarm_log import AlarmLog, log_alarms
-from skin.hardware.live.display import Display, DisplayInfo
-from skin.hardware.live.verdict import Verdict
+from skin.hardware.live.engine import Verdict
+from skin.hardware.live.loop import Display, DisplayInfo
+from skin.hardware.live.verdict_stream import AlarmLog, log_alarms
 
 
 def display():

@@ -6,8 +6,8 @@ import pytest
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live import engine_builder
-from skin.hardware.live.alarm_timing import COURSES, dangerous_touches, play_touch
-from skin.hardware.live.verdict import DebounceSettings
+from skin.hardware.live.engine import DebounceSettings
+from skin.hardware.live.selftest import COURSES, dangerous_touches, play_touch
 from skin.trained import Trained
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
@@ -49,7 +49,7 @@ def test_an_alarm_stays_until_the_touch_ends(engine, course):
     found = [play_touch(subject, device, force, RATE, number) for number, force in enumerate(forces)]
     assert not any(one.early for one in found)
     raised = [one for one in found if one.raised is not None]
-    assert all(one.kept for one in found)
+    assert all(one.lasting for one in found)
     # Small trainings miss some; most must be there, and the alarm ends with the window that shows the touch.
     assert len(raised) >= len(found) / 2
     assert all(one.cleared is not None and one.cleared < 4.5 for one in raised)
@@ -63,7 +63,7 @@ def test_a_hold_that_becomes_dangerous_late_is_found(engine):
     load = np.interp(np.arange(0, 20, 0.1), [0, 0.2, 10, 10.2, 18, 18.2], [0, 0.15, 0.15, 1, 1, 0])
     found = play_touch(subject, device, load[:, None] * peak, RATE, 99)
     assert found.raised is not None
-    assert found.kept
+    assert found.lasting
 
 
 def test_courses_have_names(engine):

@@ -5,13 +5,12 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.hardware.live.engine import Detection, Engine
+from skin.hardware.live.engine import Debounce, DebounceSettings, Detection, Engine
 from skin.hardware.live.engine_builder import window_classifier
-from skin.hardware.live.verdict import Debounce, DebounceSettings
 from skin.labels import TOUCH, Task
 from skin.recording import Touches
 from skin.signal.frame import Frame
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 
 PLAIN_PARTS = np.ones(4), np.zeros(4), np.zeros(4, bool)
 PLAIN = UnitConversion(*PLAIN_PARTS)

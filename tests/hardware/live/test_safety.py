@@ -10,17 +10,15 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.hardware.live.display import Display, DisplayInfo
-from skin.hardware.live.engine import Detection, EngineSettings
+from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
 from skin.hardware.live.engine_builder import window_classifier
-from skin.hardware.live.loop import LiveLoop
+from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.live.selftest import SelfTest
-from skin.hardware.live.verdict import DebounceSettings
 from skin.labels import TOUCH
-from skin.wire.conversion import UnitConversion
-from skin.wire.health import RawRange
-from skin.wire.serial_source import SerialSource
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.channels import RawRange, UnitConversion
+from skin.wire.protocol import Header, encode_header, encode_line
+from skin.wire.reader import PortSettings
+from skin.wire.source import SerialSource
 
 RATE, SENSORS = 100, 9
 SPEED = 8  # times faster than the device's clock says
@@ -70,12 +68,12 @@ class Watching:
         self.thread = Thread(target=self._serve, args=(stream, speed, each), daemon=True)
         self.thread.start()
         port = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
-        source = SerialSource(port=port, sensors=SENSORS, rate=10.0, tare=2.0, **source)
+        source = SerialSource(PortSettings(port=port, timeout=10.0, **source), SENSORS, 10.0)
         self.skin, _ = source.open()
         self.display = Display(DisplayInfo("loud", port, np.zeros((SENSORS, 3)), (0.1, 0.1), 4.0))
         self.display.observers.append(self._note)
         self.acts = list(acts)
-        self.loop = LiveLoop(self.skin, source.taring(self.skin), settings().build(), self.display)
+        self.loop = LiveLoop(self.skin, source.tare(self.skin), settings().build(), self.display)
         with self.skin:
             self.loop.run()
         self.thread.join(20)

@@ -9,18 +9,23 @@ import torch
 
 from skin.body.sheet import Sheet
 from skin.build import build_data, build_device, build_learner
-from skin.device.serial import Serial
-from skin.hardware.live.display import Display, DisplayInfo
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.engine_builder import window_classifier
-from skin.hardware.live.loop import LiveLoop
+from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.record.recorder import convert_session, record_session
+from skin.hardware.serial import Serial
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
 from skin.recording_file import read_recording
-from skin.wire.announcement import Announcement, encode_announcement
-from skin.wire.binary import encode_comment, encode_frame
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.protocol import (
+    Announcement,
+    Header,
+    encode_announcement,
+    encode_comment,
+    encode_frame,
+    encode_header,
+    encode_line,
+)
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)
@@ -113,7 +118,7 @@ def serial(port, **settings):
 
 def watched(learner, device):
     """Run the live view on a device until its peer leaves; return time -> (window, verdict)."""
-    skin, _ = device.open()
+    skin, _ = device.wire.open()
     positions = torch.from_numpy(device.sensors.positions).float()
     asked, found = Asked(learner), {}
     engine = Engine(
@@ -151,7 +156,7 @@ def live(learner, stream):
             turn.set()
 
     with skin:
-        Turning(skin, device.taring(skin), engine, Taking(info)).run()
+        Turning(skin, device.wire.tare(skin), engine, Taking(info)).run()
     listener.close()
     return found
 
@@ -191,7 +196,7 @@ def test_the_header_counts_whenever_it_comes(tmp_path):
     for late in (0, 5, 40):
         listener = Listener(_adc(late), lambda number: None)
         device = Serial(body=SHEET, layout=LAYOUT, port=listener.port, scale=SCALE, gestures=1, timeout=5.0)
-        with device.open()[0] as skin:
+        with device.wire.open()[0] as skin:
             frames = skin.read(200, 10)
         listener.close()
         found.append([frame.saturated.tolist() for frame in frames[50:]])
@@ -218,7 +223,7 @@ def test_given_limits_win_over_the_header_and_binary_streams_carry_one():
         listener = Listener(_adc(3, binary=True), lambda number: None)
         settings = {"scale": SCALE, "gestures": 1, "timeout": 5.0, "limits": limits}
         device = Serial(body=SHEET, layout=LAYOUT, port=listener.port, **settings)
-        with device.open()[0] as skin:
+        with device.wire.open()[0] as skin:
             frames = skin.read(200, 10)
             assert skin.header.bits == 10
             assert skin.stats.bad_frames == 0

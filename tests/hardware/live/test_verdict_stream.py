@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.live.display import Display, DisplayInfo
-from skin.hardware.live.verdict import Verdict
+from skin.hardware.live.engine import Verdict
+from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.verdict_stream import HEARTBEAT, stream_verdicts
 from skin.paths import ROOT
 

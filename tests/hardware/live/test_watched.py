@@ -14,13 +14,13 @@ import pytest
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.exported.writer import write_model
+from skin.hardware.live.engine import DebounceSettings
 from skin.hardware.live.engine_builder import describe
 from skin.hardware.live.live_settings import LiveSettings
-from skin.hardware.live.verdict import DebounceSettings
 from skin.hardware.live.watched import watch_model
 from skin.learner.network import Network
 from skin.paths import ROOT
-from skin.wire.text import Header, encode_header, encode_line
+from skin.wire.protocol import Header, encode_header, encode_line
 
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.record.session_log import SessionLog
-from skin.hardware.record.session_reader import read_session
+from skin.hardware.record.recorder import SessionLog
+from skin.hardware.record.session import read_session
 from skin.signal.frame import Frame
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import RecordedGesture
 
 ABOUT = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc"}
@@ -24,7 +24,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from test_session_log import ABOUT, MEANING, frame
-from skin.hardware.record.session_log import SessionLog
+from skin.hardware.record.recorder import SessionLog
 log = SessionLog(Path(sys.argv[1]), ABOUT, 2)
 log.conversion(MEANING)
 print("ready", flush=True)

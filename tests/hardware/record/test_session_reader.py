@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin.errors import InputError
-from skin.hardware.record.session_log import SessionLog
-from skin.hardware.record.session_reader import read_session
+from skin.hardware.record.recorder import SessionLog
+from skin.hardware.record.session import read_session
 from skin.signal.frame import Frame
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import RecordedGesture
 from tests.damage import DAMAGED_FILES, damaged, opened
 

@@ -2,46 +2,44 @@
 
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody
 from skin.device._blank import Blank
-from skin.device.base import AbstractDevice, AbstractWired, Split
+from skin.device.base import AbstractDevice, Split
 from skin.errors import InputError
+from skin.hardware.wired import AbstractWired
 from skin.labels import TOUCH, TOUCH_OR_NOT
 from skin.layout.base import AbstractLayout
 from skin.recording import Recording, Touches
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
 from skin.touch.gesture import GestureSettings, model_window
-from skin.wire.announcement import AnnouncementListener
-from skin.wire.conversion import UnitConversion
-from skin.wire.errors import SkinDisconnected, SkinTimeout
+from skin.wire.channels import UnitConversion
+from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
 from skin.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
+    AnnouncementListener,
     ContinuousSegmenter,
     PromptedSegmenter,
     RecordedGesture,
     label_plan,
     label_text,
 )
-from skin.wire.serial_source import SerialSettings, SerialSource
 from skin.wire.skin import Skin
-from skin.wire.source import Source
-from skin.wire.tare import Tare, warm_up
-from skin.wire.text import Header
+from skin.wire.source import SerialSource
 
 _LABELS = ("announced", "prompted", "none")
-_OF_THE_PORT = tuple(one.name for one in fields(SerialSettings))
 
 
 @dataclass(kw_only=True, eq=False)
-class Serial(SerialSettings, AbstractWired):
+class Serial(PortSettings, AbstractWired):
     """Yields gestures on a real or emulated skin; its only split is ``test``.
 
     Readings are in N above the baseline, which is taken from resampled values, because the maximum of noise
@@ -50,7 +48,7 @@ class Serial(SerialSettings, AbstractWired):
     Args:
         body: the sheet of the model.
         layout: positions of its sensors; the device must send as many values.
-        port, baudrate, tare, ...: as in :class:`skin.wire.serial_source.SerialSettings`.
+        port, baudrate, tare, ...: as in :class:`skin.wire.reader.PortSettings`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: number of gestures.
         seed: of the order of prompts.
@@ -64,6 +62,7 @@ class Serial(SerialSettings, AbstractWired):
 
     body: AbstractBody
     layout: AbstractLayout
+    timeout: PositiveFloat = 10.0
     labels: str = "announced"
     gestures: int = 16
     seed: int = 0
@@ -72,6 +71,7 @@ class Serial(SerialSettings, AbstractWired):
     stream: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.labels not in _LABELS:
             raise InputError(f"device.labels must be one of {', '.join(_LABELS)}, got {self.labels}")
         if self.gestures < 1:
@@ -83,11 +83,7 @@ class Serial(SerialSettings, AbstractWired):
         self.sensors = self.layout.sensors(self.body)
         self._positions = torch.from_numpy(self.sensors.positions).float()
         self._recording: Recording | None = None
-        self._wire = SerialSource(
-            sensors=len(self.sensors),
-            rate=self.model_rate,
-            **{name: getattr(self, name) for name in _OF_THE_PORT},
-        )
+        self.wire = SerialSource(self, len(self.sensors), self.model_rate)
 
     def touches(self, split: Split, epoch: int = 0) -> Touches:
         """Return the gestures, read at the first call; labels are None if unknown."""
@@ -110,36 +106,6 @@ class Serial(SerialSettings, AbstractWired):
         touches = Touches(empty, empty == 0, self._positions, torch.zeros(1, len(self.task)), self.model_rate)
         return Blank(self.task, self.size, touches)
 
-    def open(self, reconnect: bool = False) -> tuple[Skin, AnnouncementListener]:
-        """Open the port and collect its announcements; ``reconnect`` waits for an unplugged skin."""
-        return self._wire.open(reconnect)
-
-    def source(self) -> Source:
-        """Open the port as a stream of frames; wait for an unplugged skin."""
-        return self._wire.source()
-
-    def warm_up(self, skin: Skin) -> tuple[list[Frame], UnitConversion]:
-        """Read the first frames: check the rate and take the baseline."""
-        tare = self.taring(skin)
-        try:
-            frames = warm_up(skin, tare, self.model_rate, self.tare, _say)
-        except (SkinTimeout, SkinDisconnected) as error:
-            raise InputError(f"{self.port}: {error}") from error
-        assert tare.conversion is not None
-        return frames, tare.conversion
-
-    def taring(self, skin: Skin) -> Tare:
-        """Return the tare of an open skin."""
-        return self._wire.taring(skin)
-
-    def conversion(self, baseline: np.ndarray | None, header: Header | None) -> UnitConversion:
-        """Return the conversion of values to N, given a baseline (S,) and the header of the device.
-
-        Raises:
-            InputError: the scale is unknown.
-        """
-        return self._wire.conversion(baseline, header)
-
     def segmenter(
         self,
         listener: AnnouncementListener,
@@ -154,45 +120,48 @@ class Serial(SerialSettings, AbstractWired):
         if self.labels == "announced":
             return AnnouncedSegmenter(window, listener, self.task)
         if self.labels == "none":
-            known = np.ones(len(self.sensors), dtype=bool)
+            valid = np.ones(len(self.sensors), dtype=bool)
             return ContinuousSegmenter(
                 window,
                 max(done, default=-1) + 1,
-                lambda values: bool((conversion(values, known)[0] > self.trigger).any()),
+                lambda values: bool((conversion(values, valid)[0] > self.trigger).any()),
             )
         planned = enumerate(label_plan(self.task.names, -(-self.gestures // 2 ** len(self.task)), self.seed))
-        left = (one for one in planned if one[0] < self.gestures and one[0] not in done)
-        return PromptedSegmenter(window, left, _say)
+        left = (
+            (number, labels) for number, labels in planned if number < self.gestures and number not in done
+        )
+        return PromptedSegmenter(window, left, _print)
 
     def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
         """Return gestures as a recording."""
-        touches = self._touches([one.resampled for one in gestures if one.resampled is not None], conversion)
+        windows = [gesture.resampled for gesture in gestures if gesture.resampled is not None]
+        touches = self._touches(windows, conversion)
         if gestures and gestures[0].labels is not None:
-            rows = [[float(value) for value in one.labels.values()] for one in gestures if one.labels]
+            rows = [list(map(float, gesture.labels.values())) for gesture in gestures if gesture.labels]
             touches = replace(touches, labels=torch.tensor(rows))
         about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
 
     def _touches(self, windows: Sequence[Resampled], conversion: UnitConversion) -> Touches:
         """Return windows in the device's unit as touches."""
-        values, mask, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
-        readings, valid = conversion(values, mask)
-        known = [torch.from_numpy(array) for array in (readings, valid, valid & saturated)]
-        return Touches(known[0], known[1], self._positions, None, self.model_rate, saturated=known[2])
+        values, received, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
+        readings, valid = conversion(values, received)
+        force, mask, limited = map(torch.from_numpy, (readings, valid, valid & saturated))
+        return Touches(force, mask, self._positions, None, self.model_rate, saturated=limited)
 
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin stops sending, or the user ends it."""
         gestures: list[RecordedGesture] = []
-        skin, listener = self.open()
+        skin, listener = self.wire.open()
         with skin:
-            first, conversion = self.warm_up(skin)
+            first, conversion = self.wire.warm_up(skin, _print)
             segmenter = self.segmenter(listener, conversion, first)
-            _say(f"waiting for {self.gestures} gestures, labels {self.labels}")
+            _print(f"waiting for {self.gestures} gestures, labels {self.labels}")
             for gesture in self._finished_gestures(skin, segmenter):
                 gestures.append(gesture)
                 words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
                 lost = f" ({gesture.lost} frames lost)" * bool(gesture.lost)
-                _say(f"{len(gestures)}/{self.gestures}{words}{lost}")
+                _print(f"{len(gestures)}/{self.gestures}{words}{lost}")
                 if len(gestures) == self.gestures:
                     break
         if not gestures:
@@ -204,15 +173,15 @@ class Serial(SerialSettings, AbstractWired):
             for frame in skin:
                 gesture = segmenter.add(frame)
                 if gesture is not None and gesture.broken:
-                    _say(f"gesture {gesture.number} was interrupted: the device restarted")
+                    _print(f"gesture {gesture.number} was interrupted: the device restarted")
                 elif gesture is not None:
                     yield gesture
                 if segmenter.over:
                     return
         except (SkinTimeout, SkinDisconnected) as end:
-            _say(str(end))
+            _print(str(end))
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     """Print a message for the user; results go to standard output."""
     print(text, file=sys.stderr, flush=True)

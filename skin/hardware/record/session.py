@@ -1,7 +1,19 @@
-"""Read a session, skipping damaged lines."""
+"""A session: raw frames as they arrived, and events; and how it is read.
+
+A session is a CSV file that skin calibrate reads too: ``time`` (s since the start), ``seq`` and a column of
+raw values per sensor. Lines that start with # are JSON: unit conversion, beginning and end of gestures, gaps,
+invalid channels. Unit, layout and start time are in ``x.csv.json``. Whole lines are appended, so the file is
+valid up to its last complete frame if the program is interrupted.
+
+The reader skips damaged lines. Events have checksums, and that which ends a gesture has those of its frames.
+The line that begins a gesture repeats the invalid and saturated channels, and refers to the unit conversion
+by the checksum of its line, so that a lost line never gives a gesture the baseline of another.
+"""
 
 import logging
+import zlib
 from collections import deque
+from dataclasses import dataclass, field
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
@@ -12,14 +24,56 @@ import numpy as np
 from skin import files
 from skin.checksum import sha256
 from skin.errors import InputError
-from skin.hardware.record.line_writer import decode_event, line_sum
-from skin.hardware.record.stored_session import StoredSession
+from skin.files import json_line
 from skin.safe_loading import parse_json, read_file, regular
 from skin.sensors import MOST
 from skin.signal.frame import Frame
 from skin.signal.resampling import Resampled, Window
-from skin.wire.conversion import UnitConversion
+from skin.wire.channels import UnitConversion
 from skin.wire.segmentation import RecordedGesture
+
+_SUM = ', "sum": "'
+
+
+_NAMED = 5  # lines or gestures, in a sentence
+
+
+@dataclass
+class StoredSession:
+    """Content of a session.
+
+    Attributes:
+        about: metadata in the JSON file beside it.
+        gestures: complete gestures by number, each with its unit conversion; the last one of a number counts.
+        frames: number of frames.
+        end: time of the last frame, s.
+        damaged: numbers of the lines that cannot be read; the header is line 1.
+        left_out: number of a gesture -> reason why it cannot be used.
+    """
+
+    about: dict[str, Any]
+    gestures: dict[int, tuple[RecordedGesture, UnitConversion]] = field(default_factory=dict)
+    frames: int = 0
+    end: float = -1.0
+    damaged: list[int] = field(default_factory=list)
+    left_out: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings about damaged lines and omitted gestures."""
+        warnings = []
+        if count := len(self.damaged):
+            warnings.append(f"{count} damaged line{'s' * (count > 1)} skipped: {_some(self.damaged)}")
+        for reason in dict.fromkeys(self.left_out.values()):
+            numbers = [number for number, why in self.left_out.items() if why == reason]
+            warnings.append(f"gesture {_some(numbers)} left out: {reason}")
+        return warnings
+
+
+def _some(numbers: list[int]) -> str:
+    omitted = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+    return ", ".join(map(str, numbers[:_NAMED])) + omitted
+
 
 _log = logging.getLogger("skin.hardware.record")
 
@@ -260,9 +314,9 @@ class _Reading:
     def _drop_changed(self, gesture: RecordedGesture, sums: str) -> None:
         """Drop frames that look whole but are not those that were recorded; they count as lost."""
         written = {sums[start : start + _DIGITS] for start in range(0, len(sums), _DIGITS)}
-        kept = [frame for frame in gesture.frames if self._sums[id(frame)] in written]
-        self._spoilt += len(gesture.frames) - len(kept)
-        gesture.frames[:] = kept
+        frames = [frame for frame in gesture.frames if self._sums[id(frame)] in written]
+        self._spoilt += len(gesture.frames) - len(frames)
+        gesture.frames[:] = frames
 
     def _end(self, number: int, lost: int, frames: str | None) -> None:
         gesture, self._gesture = self._gesture, None
@@ -285,3 +339,28 @@ class _Reading:
             gesture.resampled = self._window(gesture)
             self.stored.left_out.pop(number, None)
             self.stored.gestures[number] = gesture, self._conversion[1]
+
+
+def line_sum(text: str) -> str:
+    """Return the checksum of a line, 8 hexadecimal digits."""
+    return f"{zlib.crc32(text.encode()):08x}"
+
+
+def encode_event(event: str, **what: Any) -> tuple[str, str]:
+    """Return an event as a line of JSON after #, with its checksum, and the checksum."""
+    text = "# " + json_line({"event": event, **what})
+    token = line_sum(text)
+    return f'{text[:-1]}{_SUM}{token}"}}', token
+
+
+def decode_event(line: str) -> tuple[dict[str, Any], str]:
+    """Decode a line of :func:`encode_event`; return event and checksum, which is empty in older sessions.
+
+    Raises:
+        ValueError: no JSON, or a wrong checksum.
+    """
+    content = parse_json(line[1:])
+    token = content.pop("sum", "")
+    if token and line_sum(line.rpartition(_SUM)[0] + "}") != token:
+        raise ValueError("wrong checksum")
+    return content, token

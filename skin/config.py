@@ -15,11 +15,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from skin.error_messages import one_line
 from skin.errors import InputError
+from skin.evaluation.settings import Evaluation
 from skin.fingerprint import config_hash
 
 _TOO_LARGE = 2**63
-PARENT = "SKIN_PARENT_RUN"
-"""Environment variable by which a sweep tells its jobs the id of their parent run."""
 
 # Settings without effect on results.
 _STEERING = ("shard", "tracking", "trust")
@@ -38,18 +37,6 @@ class Data:
     stream: bool = False
     direction: bool = False
     augment: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass
-class Evaluation:
-    """Test data of a trained learner (``conf/train.yaml``)."""
-
-    devices: int
-    layouts: int
-    false_alarm_rate: float
-    safe_gestures: int = 5000
-    gestures: int | None = None  # of older runs, which evaluated other gestures on other devices
-    profile: str | None = None  # older runs have none
 
 
 @dataclass

@@ -23,14 +23,14 @@ from rich.console import Console
 from skin.build import build_data, build_device, build_learner
 from skin.claim import claim, refuse_twice
 from skin.class_balance import report_balance
-from skin.config import PARENT, fingerprint, overrides, plain
+from skin.config import fingerprint, overrides, plain
 from skin.console import quiet
 from skin.errors import InputError
-from skin.evaluation.metrics_table import metrics_table
-from skin.evaluation.metrics_table import print_report as show
-from skin.evaluation.operating_point import check_evaluation, choose_operating_point
-from skin.evaluation.outcomes import OUTCOMES
-from skin.evaluation.report import Report, evaluate
+from skin.evaluation.metrics import OUTCOMES
+from skin.evaluation.operating_point import choose_operating_point
+from skin.evaluation.report import Report, evaluate, metrics_table
+from skin.evaluation.report import print_report as show
+from skin.evaluation.settings import check_evaluation
 from skin.fingerprint import MACHINE
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
@@ -38,6 +38,7 @@ from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
 from skin.run_logger import RunLogger
 from skin.settings import import_target
+from skin.shard import PARENT
 from skin.source import note_reuse
 from skin.stored_run import TAG
 from skin.tracking import Store

@@ -17,11 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.build import build_device
-from skin.config import Evaluation
 from skin.datamodule import TouchData
 from skin.earlier_settings import in_seconds
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
+from skin.evaluation.settings import Evaluation
 from skin.fingerprint import renamed
 from skin.learner.base import AbstractLearner
 from skin.pretrained import find_copy, find_pretrained

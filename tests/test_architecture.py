@@ -13,26 +13,28 @@ errors interrupt paths option safe_loading
 trust earlier_settings checksum suggestions
 settings
 error_messages fingerprint labels rng material model sensor_dynamics sensors source
-config recording body gesture_measures server shard run_table
+recording body gesture_measures server shard run_table
 files recording_metadata layout summary plausibility outbox
-recording_file touch tracking array_cache
+recording_file touch array_cache
 simulator data_set
 contact sensor_geometry skin_distribution
 signal
-wire representation progress
-quick_checks
-command
+wire representation
 device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished claim run_logger pretrained
+plot
+evaluation
+config
+tracking quick_checks
+progress
+command build unfinished claim run_logger pretrained
 stored_run run_overrides skin_settings model_card fine_tuning
 trained
 adaptation_target
 exported
 hardware
-plot
 design
 console variants
 run generation

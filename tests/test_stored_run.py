@@ -11,10 +11,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import Evaluation, Tracking, plain, validate_config
+from skin.config import Tracking, plain, validate_config
 from skin.earlier_settings import in_seconds
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.settings import Evaluation
 from skin.fingerprint import RENAMED
 from skin.paths import CONF, ROOT
 from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point

@@ -11,7 +11,7 @@ from experiments.studies.subject import Measurement, Subject
 from skin.build import build_data, build_learner
 from skin.config import plain, validate_config
 from skin.device.base import AbstractSimulated
-from skin.evaluation.metrics import metrics
+from skin.evaluation.metrics import compute_metrics
 from skin.fine_tuning import FineTuning, fine_tune
 from skin.learner.base import AbstractLearner
 from skin.settings import configured
@@ -66,5 +66,5 @@ def _trained(row: str, device: AbstractSimulated, epochs: int | None) -> Abstrac
 def _named(model: str, learner: AbstractLearner, device: AbstractSimulated) -> dict[str, float]:
     """Return the metrics of a learner on the test gestures."""
     touches = device.touches("test")
-    found = metrics(learner.probabilities(touches), touches.known_labels, device.task)
+    found = compute_metrics(learner.probabilities(touches), touches.known_labels, device.task)
     return {f"{model}/{name}": value for name, value in found.items() if name.endswith("/accuracy")}

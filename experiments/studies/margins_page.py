@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.studies.tables import Page
-from skin.evaluation.margins import ALARM, Faint, MarginReport, Span
+from skin.evaluation.margins import ALARM_NAME, Faint, MarginReport, Span
 from skin.labels import OPPOSITE, TOUCH
 from skin.plot.figures import COLOURS, MARKS
 
@@ -16,7 +16,7 @@ _MEASURES = {
     "dynamic": "travel",
     "press": "duration",
     "dangerous": "pressure",
-    ALARM: "pressure",
+    ALARM_NAME: "pressure",
 }
 _OVERALL = ("accuracy", "balanced_accuracy", "ece")
 _NEAR = (0.9, 1.1)  # times its threshold
@@ -36,7 +36,7 @@ def margins_summary(found: MarginReport) -> str:
         for name in ("big", "dangerous")
     }
     faint = sum(one.wrong["dynamic"] for one in found.faint if one.high <= _FAINT)
-    clear = [one for one in found.spans[ALARM] if one.low >= _NEAR[1]]
+    clear = [one for one in found.spans[ALARM_NAME] if one.low >= _NEAR[1]]
     return (
         f"within 10 % of their thresholds lie {near['big']} of {wrong['big']} errors of big and "
         f"{near['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes {_FAINT:g} N in "
@@ -73,13 +73,13 @@ def _tables(found: MarginReport) -> dict[str, list[list[str]]]:
 
 
 def _heading(name: str, found: MarginReport) -> str:
-    if name == ALARM:
+    if name == ALARM_NAME:
         return f"Alarm above {found.point.threshold:.4f}"
     return f"{name.capitalize()} or {OPPOSITE[name]}"
 
 
 def _called(name: str) -> str:
-    return "dangerous" if name == ALARM else name
+    return "dangerous" if name == ALARM_NAME else name
 
 
 def _row(one: Span) -> list[str]:
@@ -112,8 +112,8 @@ def _figure(found: MarginReport, title: str) -> Figure:
     """Draw what is said against measure over threshold, and errors against the highest reading."""
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    styles = dict(zip([*TOUCH.names, ALARM], zip(COLOURS, MARKS, strict=True), strict=False))
-    for name in ("big", "dangerous", ALARM):
+    styles = dict(zip([*TOUCH.names, ALARM_NAME], zip(COLOURS, MARKS, strict=True), strict=False))
+    for name in ("big", "dangerous", ALARM_NAME):
         _course(left, found.spans[name], name, *styles[name])
     left.axvline(1, color="black", lw=0.8, ls=":")
     left.set_xscale("log")

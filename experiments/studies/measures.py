@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt
 from experiments.studies.embedding.probe_settings import ProbeSettings
 from experiments.studies.subject import Measurement, Subject
 from skin.errors import InputError
-from skin.evaluation.stream_settings import StreamSettings
+from skin.evaluation.settings import StreamSettings
 
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
 
@@ -23,8 +23,7 @@ class Accuracy:
     """Accuracy and the like on the test touches, and alarms at the operating point of the run."""
 
     def __call__(self, subject: Subject) -> Measurement:
-        from skin.evaluation.metrics import metrics
-        from skin.evaluation.outcomes import encode
+        from skin.evaluation.metrics import compute_metrics, encode
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
@@ -34,7 +33,7 @@ class Accuracy:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
             return Measurement({}, cannot=str(reason))
-        found = metrics(chances, touches.labels, task, point)
+        found = compute_metrics(chances, touches.labels, task, point)
         outcomes = encode(chances, touches.labels, task, point)
         return Measurement({f"same/{name}": value for name, value in found.items()}, outcomes=outcomes)
 
@@ -67,9 +66,9 @@ class Margins:
 
     def __call__(self, subject: Subject) -> Measurement:
         from experiments.studies.margins_page import build_margins_page
-        from skin.evaluation.margins import margins
+        from skin.evaluation.margins import measure_margins
 
-        found = margins(subject.learner, subject.device, self.gestures, subject.point())
+        found = measure_margins(subject.learner, subject.device, self.gestures, subject.point())
         return Measurement(found.metrics, build_margins_page(found, subject.title))
 
 
@@ -81,7 +80,7 @@ class Streams(StreamSettings):
         from rich.progress import track
 
         from experiments.studies.streams_page import build_streams_page
-        from skin.evaluation.sliding_windows import evaluate_windows
+        from skin.evaluation.streams import evaluate_windows
 
         console = Console(stderr=True)
         shown = partial(track, description=subject.title, console=console, transient=True)
@@ -146,10 +145,14 @@ class TouchAlarms:
         import numpy as np
 
         from experiments.studies.tables import Page
-        from skin.evaluation import touch_alarm
-        from skin.evaluation.alarm import Reached
-        from skin.evaluation.operating_point import LABEL, choose_operating_point
-        from skin.evaluation.touch_alarm import choose_for_touches, touch_scores
+        from skin.evaluation import operating_point
+        from skin.evaluation.operating_point import (
+            LABEL,
+            Reached,
+            choose_for_touches,
+            choose_operating_point,
+            touch_scores,
+        )
         from skin.hardware.live import engine_builder
         from skin.hardware.live.trained_run import watching_of
         from skin.hardware.live.verdict import DebounceSettings
@@ -172,7 +175,7 @@ class TouchAlarms:
         danger = labels[:, TOUCH.names.index(LABEL)]
         wanted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         scores = touch_scores(subject.learner, device, watching, wanted, _COUNTED)
-        few = min(self.safe, touch_alarm.SAFE)
+        few = min(self.safe, operating_point.SAFE_TOUCHES)
         single = touch_scores(subject.learner, device, one, wanted[:few], _COUNTED)
         tests = device.touches("test")
         chances = subject.learner.probabilities(tests)

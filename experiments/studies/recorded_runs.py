@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from skin.checksum import check_seal, write_parquet
 from skin.config import Tracking
 from skin.errors import InputError
-from skin.evaluation.outcomes import OUTCOMES
+from skin.evaluation.metrics import OUTCOMES
 from skin.files import whole
 from skin.tracking import PROCESS, RECORDED, Store
 

@@ -15,7 +15,7 @@ from experiments.studies import tables
 from experiments.studies.comparison import estimate
 from experiments.studies.runs import load_outcomes, newest_finished
 from experiments.studies.tables import percent
-from skin.evaluation.outcomes import decode
+from skin.evaluation.metrics import decode
 from skin.labels import TOUCH
 from skin.tracking import Store
 
@@ -49,7 +49,7 @@ class Cell:
         simulator: on whose data.
         runs: those that finished.
         missing: how many did not: failed, killed, or never started.
-        outcomes: of the test gestures of each run (:func:`skin.evaluation.outcomes.encode`), where known.
+        outcomes: of the test gestures of each run (:func:`skin.evaluation.metrics.encode`), where known.
     """
 
     row: str

@@ -13,7 +13,7 @@ from skin.config import fingerprint, plain
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.evaluation.operating_point import choose_operating_point, threshold_gestures
-from skin.evaluation.report import columns, evaluate
+from skin.evaluation.report import evaluate, touch_sets
 from skin.labels import Task
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_report, simulator, tags
@@ -127,7 +127,7 @@ class _Asked:
 def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: AbstractDevice) -> _Asked:
     """Restore each member and predict each column; a member predicts all sets of a column or none."""
     settings = members[0][0].evaluation
-    sets = {column: _drawn(drawn) for column, drawn in columns(device, settings).items()}
+    sets = {column: _drawn(drawn) for column, drawn in touch_sets(device, settings).items()}
     sets["alarm"] = [threshold_gestures(device, settings)]
     answers: dict[str, list[Tensor]] = {}
     left_out: dict[str, str] = {}
@@ -163,7 +163,7 @@ def _log(store: Store, config: DictConfig, asked: _Asked, way: Way, identity: st
         describe(store, run.info.run_id, OmegaConf.create(kept), touches_hash(device.touches("train")))
         point = choose_operating_point(known, device, config.evaluation)
         report = evaluate(known, device, config.evaluation, point)
-        chances = asked.chances[touches_hash(next(columns(device, config.evaluation)["same"]))]
+        chances = asked.chances[touches_hash(next(touch_sets(device, config.evaluation)["same"]))]
         differ = disagreement(chances, device.task)
         log_report(
             store, run, report, device.task, {f"same/{name}/disagreement": x for name, x in differ.items()}

@@ -19,11 +19,11 @@ from omegaconf import DictConfig
 from experiments.studies.row_ensembles import combine
 from experiments.studies.study import SMOKE, Study, Variant, as_overrides, passed_overrides, sweeps, variants
 from skin.commands import train
-from skin.config import PARENT, fingerprint, validate_config
+from skin.config import fingerprint, validate_config
 from skin.errors import InputError
-from skin.evaluation.outcomes import OUTCOMES
+from skin.evaluation.metrics import OUTCOMES
 from skin.run import SWEPT, simulator
-from skin.shard import LEFT_OUT, Shard
+from skin.shard import LEFT_OUT, PARENT, Shard
 from skin.source import note_reuse
 from skin.stored_run import find_run
 from skin.tracking import Store

@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from experiments.studies.tables import Page
-from skin.evaluation.alarm import Alarms
-from skin.evaluation.sliding_windows import WindowReport
+from skin.evaluation.streams import Alarms, WindowReport
 from skin.plot.figures import COLOURS, MARKS
 
 

@@ -25,7 +25,7 @@ from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.config import fingerprint, validate_config
 from skin.errors import InputError
-from skin.evaluation.outcomes import OUTCOMES
+from skin.evaluation.metrics import OUTCOMES
 from skin.run_overrides import apply_overrides
 from skin.source import note_reuse
 from skin.stored_run import TAG, MissingWeightsError, load_configuration
@@ -46,7 +46,7 @@ class Trial:
         metrics: name -> value.
         line: for a person; empty where there is only a table.
         files: of the measure.
-        outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
+        outcomes: of each test gesture (:func:`skin.evaluation.metrics.encode`); None: not known.
         cannot: why the run does not accept the touches of the condition; empty where it does.
     """
 

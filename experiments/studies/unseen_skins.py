@@ -9,7 +9,7 @@ from experiments.studies.tables import Page
 from skin.device.simulated import Simulated
 from skin.device.skins import Skins
 from skin.errors import InputError
-from skin.evaluation.metrics import metrics
+from skin.evaluation.metrics import compute_metrics
 from skin.rng import Stream
 
 _OVERALL = "overall/accuracy"
@@ -35,7 +35,7 @@ def measure_unseen_skins(subject: Subject, gestures: int) -> Measurement:
     lines = []
     for number, skin in enumerate(subject.device.unseen_skins):
         touches = skin.draw(Stream.SKIN, gestures, number)
-        found = metrics(
+        found = compute_metrics(
             subject.learner.probabilities(touches), touches.known_labels, skin.task, subject.point()
         )
         lines.append(_described(skin) | {name: 100 * found[name] for name in _FIGURES})

@@ -15,8 +15,8 @@ from skin.error_messages import to_input_error
 from skin.errors import InputError
 from skin.evaluation.report import write_chances
 from skin.files import json_line, json_text, write
-from skin.hardware.calibration.bench_session import BenchSession
-from skin.hardware.calibration.bench_session import write_bench_session as write_session
+from skin.hardware.calibration.bench import BenchSession
+from skin.hardware.calibration.bench import write_bench_session as write_session
 from skin.labels import TOUCH
 from skin.plot import animation, figures
 from skin.plot.touches import simulated

@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     from skin.hardware.calibration.calibration_report import held_out_summary, print_calibration
     from skin.hardware.calibration.fit import fit_calibration
     from skin.hardware.calibration.held_out import evaluate_held_out
-    from skin.hardware.calibration.protocol import write_demo_session
+    from skin.hardware.calibration.presses import write_demo_session
     from skin.hardware.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.settings import configured
     from skin.signal.calibration import write_calibration

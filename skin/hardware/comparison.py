@@ -18,9 +18,8 @@ from matplotlib.figure import Figure
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.files import write
-from skin.hardware.calibration.bench_data import BenchData, build_bench_data
-from skin.hardware.calibration.bench_session import read_bench_session
-from skin.hardware.calibration.gauge import read_gauge
+from skin.hardware.calibration.bench import read_bench_session, read_gauge
+from skin.hardware.calibration.presses import BenchData, build_bench_data
 from skin.hardware.emulator.gestures import Gesture, emulated_gestures, gestures_with_labels
 from skin.hardware.record.session_log import check_session
 from skin.hardware.record.session_reader import read_session

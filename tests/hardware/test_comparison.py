@@ -10,8 +10,8 @@ import pytest
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_session import write_bench_session
-from skin.hardware.calibration.protocol import Protocol, emulate_session
+from skin.hardware.calibration.bench import write_bench_session
+from skin.hardware.calibration.presses import Protocol, emulate_session
 from skin.hardware.comparison import (
     Agreement,
     compare_gestures,

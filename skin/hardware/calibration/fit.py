@@ -8,9 +8,8 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.calibration import _channel
-from skin.hardware.calibration._channel import Idle
-from skin.hardware.calibration.bench_data import BenchData
-from skin.hardware.calibration.responses import collect_responses, find_polarity
+from skin.hardware.calibration.channels import Idle, collect_responses, find_polarity
+from skin.hardware.calibration.presses import BenchData
 from skin.sensor_dynamics import first_order_lag, running_peak
 from skin.signal.calibration import Calibration
 

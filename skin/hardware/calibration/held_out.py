@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from skin.errors import InputError
-from skin.hardware.calibration.bench_data import BenchData
 from skin.hardware.calibration.fit import fit_calibration
+from skin.hardware.calibration.presses import BenchData
 from skin.sensor_dynamics import first_order_lag
 from skin.signal.calibration import Calibration
 from skin.signal.imperfection import Imperfection
@@ -102,7 +102,7 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
     Args:
         raw: (..., S), in the session's unit.
         each: (S,), true readings per N of that indenter at that place, as
-            :func:`skin.hardware.calibration.gauge.per_newton` gives them.
+            :func:`skin.hardware.calibration.bench.per_newton` gives them.
         calibration: of this skin.
 
     Returns:

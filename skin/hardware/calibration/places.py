@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from skin.hardware.calibration.gauge import Gauge
+from skin.hardware.calibration.bench import Gauge
 
 Turn = Literal[
     "as_given",

@@ -12,16 +12,15 @@ from scipy.optimize import linear_sum_assignment
 
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_data import BenchData, build_bench_data
-from skin.hardware.calibration.bench_session import BenchSession
-from skin.hardware.calibration.gauge import Gauge, per_newton
-from skin.hardware.calibration.places import TURNS, WORDS, Turn, composed, inside, turn_gauge
-from skin.hardware.calibration.responses import (
+from skin.hardware.calibration.bench import BenchSession, Gauge, per_newton
+from skin.hardware.calibration.channels import (
     Match,
     Responses,
     collect_responses,
     match_channels,
 )
+from skin.hardware.calibration.places import TURNS, WORDS, Turn, composed, inside, turn_gauge
+from skin.hardware.calibration.presses import BenchData, build_bench_data
 from skin.settings import checked
 from skin.signal.calibration import Calibration
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.hardware.calibration._channel import clip_and_gain, decay, idle, quantum
+from skin.hardware.calibration.channels import clip_and_gain, decay, idle, quantum
 
 TIME = np.arange(6000) / 100
 

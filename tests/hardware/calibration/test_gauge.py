@@ -7,7 +7,7 @@ import pytest
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.hardware.calibration import bench_session, gauge
-from skin.hardware.calibration.bench_session import BenchSession
+from skin.hardware.calibration.bench import BenchSession
 from skin.layout.grid import Grid
 from skin.simulator.naive import Naive
 

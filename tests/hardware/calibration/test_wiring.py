@@ -9,12 +9,10 @@ import pytest
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_data import BenchData
-from skin.hardware.calibration.bench_session import BenchSession
+from skin.hardware.calibration.bench import BenchSession, Gauge
 from skin.hardware.calibration.fit import fit_calibration
-from skin.hardware.calibration.gauge import Gauge
 from skin.hardware.calibration.places import TURNS, composed, inside, turn_gauge
-from skin.hardware.calibration.protocol import Protocol, emulate_session
+from skin.hardware.calibration.presses import BenchData, Protocol, emulate_session
 from skin.hardware.calibration.wiring import Confirmed, check_usable, wired_bench
 from skin.layout.file import File
 from skin.layout.grid import Grid

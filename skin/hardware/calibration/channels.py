@@ -8,7 +8,7 @@ from scipy.stats import theilslopes
 
 from skin.hardware.calibration.presses import BenchData
 
-_BLOCKS = 200  # medians of a drift's line: their pairs, 20,000, take a second
+_BLOCKS = 200  # of the frames: Theil's line of a drift takes all pairs of their medians
 _MAD = 1.4826  # standard deviation over the median absolute deviation, of normal noise
 _MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _STEPS = 8  # means over the loading of a press

@@ -11,10 +11,9 @@ from skin.adaptation_target import Target, choose_gestures, find_target
 from skin.build import build_data, build_learner
 from skin.config import plain
 from skin.device.base import AbstractDevice
-from skin.evaluation.metrics import metrics
-from skin.evaluation.metrics_table import metrics_table
+from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
-from skin.evaluation.report import evaluate
+from skin.evaluation.report import evaluate, metrics_table
 from skin.fine_tuning import Adaptation, FineTuning, fine_tune
 from skin.hardware.wired import AbstractWired
 from skin.learner.base import AbstractLearner
@@ -106,7 +105,7 @@ def _before(
 ) -> dict[str, float]:
     """Return the metrics of the original network on the test gestures."""
     touches = others.touches("test")
-    found = metrics(learner.probabilities(touches), touches.known_labels, others.task, point)
+    found = compute_metrics(learner.probabilities(touches), touches.known_labels, others.task, point)
     return {f"before/{name}": value for name, value in found.items()}
 
 
@@ -116,7 +115,7 @@ def _validation(found: Adaptation, touches: Touches, device: AbstractDevice) -> 
     return {
         f"{column}/{name}": value
         for column, chance in chances.items()
-        for name, value in metrics(chance, touches.known_labels, device.task).items()
+        for name, value in compute_metrics(chance, touches.known_labels, device.task).items()
     }
 
 

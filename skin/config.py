@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from skin.error_messages import one_line
 from skin.errors import InputError
+from skin.evaluation.settings import Evaluation
 from skin.fingerprint import config_hash
 
 _TOO_LARGE = 2**63
@@ -40,17 +41,6 @@ class Data:
     stream: bool
     direction: bool
     augment: dict[str, Any]
-
-
-@dataclass
-class Evaluation:
-    """Test data of a trained learner (``conf/train.yaml``)."""
-
-    devices: int
-    layouts: int
-    false_alarm_rate: float
-    safe_gestures: int = 5000
-    profile: str | None = None
 
 
 @dataclass

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from skin.classifier import TouchClassifier, probabilities
 from skin.datamodule import TouchData
-from skin.evaluation.metrics import metrics
+from skin.evaluation.metrics import compute_metrics
 from skin.recording import Touches
 from skin.settings import checked
 
@@ -260,7 +260,7 @@ def _is_better(network: TouchClassifier, first: Tensor, last: Tensor, labels: Te
     gain = one - other
     error = gain.std() / len(gain) ** 0.5
     before, after = (
-        metrics(probabilities(logits, network.task), labels, network.task)["overall/accuracy"]
+        compute_metrics(probabilities(logits, network.task), labels, network.task)["overall/accuracy"]
         for logits in (first, last)
     )
     return bool(gain.mean() > _CLEAR * error) and after >= before

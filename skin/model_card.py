@@ -4,11 +4,10 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from skin.evaluation.metrics_table import format_number
 from skin.evaluation.operating_point import parse_operating_point
-from skin.evaluation.report import SHARES
+from skin.evaluation.report import PERCENTAGES, format_number
 
-_SHARES = (*SHARES, "/balanced_accuracy", "/ece")  # in per cent
+_SHARES = (*PERCENTAGES, "/balanced_accuracy", "/ece")  # in per cent
 _COLUMNS = (
     "Per cent; degrees for a direction. `same`: test gestures on the device of the training. `holdout`: a "
     "tenth of the training gestures, used for nothing else. `device_shift`: test gestures on unseen devices. "

@@ -30,11 +30,11 @@ from skin.class_balance import report_balance
 from skin.config import PARENT, Tracking, fingerprint, overrides, plain
 from skin.console import quiet
 from skin.errors import InputError
-from skin.evaluation.metrics_table import metrics_table
-from skin.evaluation.metrics_table import print_report as show
-from skin.evaluation.operating_point import check_evaluation, choose_operating_point
-from skin.evaluation.outcomes import OUTCOMES
-from skin.evaluation.report import Report, evaluate
+from skin.evaluation.metrics import OUTCOMES
+from skin.evaluation.operating_point import choose_operating_point
+from skin.evaluation.report import Report, evaluate, metrics_table
+from skin.evaluation.report import print_report as show
+from skin.evaluation.settings import check_evaluation
 from skin.files import unwritable
 from skin.fingerprint import MACHINE, source_tags
 from skin.labels import Task

@@ -9,6 +9,9 @@ from hydra.core.hydra_config import HydraConfig
 
 from skin.errors import InputError
 
+PARENT = "SKIN_PARENT_RUN"
+"""Environment variable by which a sweep tells its jobs the id of their parent run."""
+
 LEFT_OUT = "SKIN_LEFT_OUT"
 """Environment variable with the numbers of the jobs of a multirun that belong to other shards."""
 

@@ -17,10 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.build import build_device
-from skin.config import Evaluation, validate_config
+from skin.config import validate_config
 from skin.datamodule import TouchData
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point, parse_operating_point
+from skin.evaluation.settings import Evaluation
 from skin.learner.base import AbstractLearner
 from skin.pretrained import find_pretrained
 from skin.safe_loading import load_yaml, regular

@@ -31,7 +31,7 @@ WARM = (
     "skfem",
     "skin.learner.boosted_trees",
     "skin.learner.network",
-    "skin.evaluation.metrics_table",
+    "skin.evaluation.report",
     "skin.run",
 )
 

@@ -34,7 +34,6 @@ trained
 adaptation_target
 exported
 hardware
-plot
 design
 console
 run generation

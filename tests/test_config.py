@@ -16,7 +16,7 @@ from skin.build import build_device, build_learner
 from skin.command import command
 from skin.config import fingerprint, plain, validate_config
 from skin.errors import InputError
-from skin.evaluation.operating_point import check_evaluation
+from skin.evaluation.settings import check_evaluation
 from skin.paths import CONF, ROOT
 from tests.damage import DAMAGED_FILES
 

@@ -13,11 +13,12 @@ from skin import array_cache
 from skin.config import Tracking
 from skin.error_messages import to_input_error
 from skin.errors import InputError
+from skin.evaluation.report import write_chances
 from skin.files import json_line, json_text, write
-from skin.hardware.calibration.bench_session import BenchSession
-from skin.hardware.calibration.bench_session import write_bench_session as write_session
+from skin.hardware.calibration.bench import BenchSession
+from skin.hardware.calibration.bench import write_bench_session as write_session
 from skin.labels import TOUCH
-from skin.plot import animation, evaluation_page, figures
+from skin.plot import animation, figures
 from skin.plot.touches import simulated
 from skin.recording import Recording
 from skin.recording_file import write_recording as write_recording
@@ -60,7 +61,7 @@ WRITERS = {
     "gains.yaml": lambda path, device: calibration.write_calibration(
         calibration.Calibration({"gain": 99 * [1.0]}), path
     ),
-    "verdicts.csv": lambda path, device: evaluation_page.verdicts(torch.ones(9, 4), TOUCH, None, path),
+    "chances.csv": lambda path, device: write_chances(torch.ones(9, 4), TOUCH, None, path),
 }
 
 

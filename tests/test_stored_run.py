@@ -11,9 +11,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from skin.build import build_data, build_device, build_learner
-from skin.config import Evaluation, Tracking, validate_config
+from skin.config import Tracking, validate_config
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.settings import Evaluation
 from skin.paths import CONF
 from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from experiments.studies.figures import Panel, draw_panels
 from experiments.studies.tables import Page
-from skin.evaluation.margins import ALARM, Faint, MarginReport, Span
-from skin.evaluation.sliding_windows import WindowReport
+from skin.evaluation.margins import ALARM_NAME, Faint, MarginReport, Span
+from skin.evaluation.streams import WindowReport
 from skin.labels import OPPOSITE, TOUCH
 
 _MEASURES = {
@@ -19,7 +19,7 @@ _MEASURES = {
     "dynamic": "travel",
     "press": "duration",
     "dangerous": "pressure",
-    ALARM: "pressure",
+    ALARM_NAME: "pressure",
 }
 _NEAR = (0.9, 1.1)  # times its threshold
 _FAINT = 1.0  # N
@@ -29,12 +29,12 @@ def margins_page(report: MarginReport, title: str) -> Page:
     """Return the tables, the CSV (``label,by,low,high,touches,said,wrong``) and the figure, under a title."""
     tables = {
         f"Alarm above {report.point.threshold:.4f}"
-        if name == ALARM
+        if name == ALARM_NAME
         else f"{name.capitalize()} or {OPPOSITE[name]}": [
             [
                 f"{_MEASURES[name]} over threshold",
                 "touches",
-                f"called {'dangerous' if name == ALARM else name}, %",
+                f"called {'dangerous' if name == ALARM_NAME else name}, %",
                 "95 %",
                 "wrong",
             ],
@@ -73,7 +73,7 @@ def margins_summary(report: MarginReport) -> str:
         for name in ("big", "dangerous")
     }
     faint = sum(span.wrong["dynamic"] for span in report.faint if span.high <= _FAINT)
-    clear = [span for span in report.spans[ALARM] if span.low >= _NEAR[1]]
+    clear = [span for span in report.spans[ALARM_NAME] if span.low >= _NEAR[1]]
     return (
         f"within 10 % of their thresholds lie {near['big']} of {wrong['big']} errors of big and "
         f"{near['dangerous']} of {wrong['dangerous']} of dangerous; no reading passes {_FAINT:g} N in "
@@ -89,7 +89,7 @@ def _margins_figure(report: MarginReport, title: str) -> Figure:
         name: np.array(
             [(s.mean, 100 * s.said / s.count, 100 * s.range[0], 100 * s.range[1]) for s in report.spans[name]]
         ).T
-        for name in ("big", "dangerous", ALARM)
+        for name in ("big", "dangerous", ALARM_NAME)
     }
     wrong = {
         name: np.array([(n, 100 * f.wrong[name] / f.count) for n, f in enumerate(report.faint)]).T

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 from annotated_types import Ge, Gt, MinLen
 
 from skin.errors import InputError
-from skin.evaluation.stream_settings import StreamSettings
+from skin.evaluation.settings import StreamSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -123,8 +123,7 @@ class Accuracy:
     """Accuracy and the like on the test touches, and alarms at the operating point of the run."""
 
     def __call__(self, subject: Subject) -> Measurement:
-        from skin.evaluation.metrics import metrics
-        from skin.evaluation.outcomes import encode
+        from skin.evaluation.metrics import compute_metrics, encode
 
         touches = subject.device.touches("test")
         assert touches.labels is not None
@@ -134,7 +133,7 @@ class Accuracy:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
             return Measurement({}, cannot=str(reason))
-        values = metrics(chances, touches.labels, task, point)
+        values = compute_metrics(chances, touches.labels, task, point)
         outcomes = encode(chances, touches.labels, task, point)
         return Measurement({f"same/{name}": value for name, value in values.items()}, outcomes=outcomes)
 
@@ -167,9 +166,9 @@ class Margins:
 
     def __call__(self, subject: Subject) -> Measurement:
         from experiments.studies.measure_pages import margins_page
-        from skin.evaluation.margins import margins
+        from skin.evaluation.margins import measure_margins
 
-        report = margins(subject.learner, subject.device, self.gestures, subject.point())
+        report = measure_margins(subject.learner, subject.device, self.gestures, subject.point())
         return Measurement(report.metrics, margins_page(report, subject.title))
 
 
@@ -181,7 +180,7 @@ class Streams(StreamSettings):
         from rich.progress import track
 
         from experiments.studies.measure_pages import streams_page
-        from skin.evaluation.sliding_windows import evaluate_windows
+        from skin.evaluation.streams import evaluate_windows
 
         console = Console(stderr=True)
         progress = partial(track, description=subject.title, console=console, transient=True)
@@ -246,10 +245,14 @@ class TouchAlarms:
         import numpy as np
 
         from experiments.studies.tables import Page
-        from skin.evaluation import touch_alarm
-        from skin.evaluation.alarm import Reached
-        from skin.evaluation.operating_point import LABEL, choose_operating_point
-        from skin.evaluation.touch_alarm import choose_for_touches, touch_scores
+        from skin.evaluation.operating_point import (
+            LABEL,
+            SAFE_TOUCHES,
+            Reached,
+            choose_for_touches,
+            choose_operating_point,
+            touch_scores,
+        )
         from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
         from skin.hardware.live.trained_run import watching_of
@@ -272,7 +275,7 @@ class TouchAlarms:
         danger = labels[:, TOUCH.names.index(LABEL)]
         counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         scores = touch_scores(subject.learner, device, watching, counted, _COUNTED)
-        few = min(self.safe, touch_alarm.SAFE)
+        few = min(self.safe, SAFE_TOUCHES)
         single = touch_scores(subject.learner, device, at_once, counted[:few], _COUNTED)
         tests = device.touches("test")
         chances = subject.learner.probabilities(tests)

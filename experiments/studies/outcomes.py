@@ -18,7 +18,7 @@ from experiments.studies.comparison import (
 )
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
-from skin.evaluation.outcomes import decodable, decode
+from skin.evaluation.metrics import decodable, decode
 from skin.labels import TOUCH
 
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}

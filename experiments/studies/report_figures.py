@@ -13,7 +13,7 @@ from experiments.studies.tables import csv_text
 from experiments.studies.trials import Trial
 from skin.build import build_device
 from skin.device.base import AbstractSimulated
-from skin.evaluation.outcomes import decode
+from skin.evaluation.metrics import decode
 from skin.files import write
 from skin.labels import TOUCH
 from skin.plot import figures

@@ -19,7 +19,7 @@ from experiments.studies.study import Study, Variant, sweeps, variants
 from skin.commands import train
 from skin.config import PARENT, fingerprint
 from skin.errors import InputError
-from skin.evaluation.outcomes import OUTCOMES
+from skin.evaluation.metrics import OUTCOMES
 from skin.run import SWEPT, simulator
 from skin.shard import LEFT_OUT, Shard
 from skin.stored_run import find_run

@@ -30,7 +30,7 @@ from skin.build import build_device
 from skin.checksum import check_seal, write_parquet
 from skin.config import fingerprint, validate_config
 from skin.errors import InputError
-from skin.evaluation.outcomes import decode, disagreement, vote
+from skin.evaluation.metrics import decode, disagreement, vote
 from skin.files import whole
 from skin.fingerprint import source_tags
 from skin.labels import TOUCH

@@ -32,11 +32,14 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
 
     from skin.build import build_device
-    from skin.hardware.calibration import bench_session, gauge
-    from skin.hardware.calibration.calibration_report import held_out_summary, print_calibration
-    from skin.hardware.calibration.fit import fit_calibration
-    from skin.hardware.calibration.held_out import evaluate_held_out
-    from skin.hardware.calibration.protocol import write_demo_session
+    from skin.hardware.calibration.bench import read_bench_session, read_gauge
+    from skin.hardware.calibration.fit import (
+        evaluate_held_out,
+        fit_calibration,
+        print_calibration,
+        summarise_held_out,
+    )
+    from skin.hardware.calibration.presses import write_demo_session
     from skin.hardware.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.settings import configured
     from skin.signal.calibration import write_calibration
@@ -47,8 +50,8 @@ def main(config: DictConfig) -> None:
     if settings["demo"]:
         print(write_demo_session(device, settings, config.session))
     shape = settings["indenter"], settings["radius"]
-    session = bench_session.read_bench_session(config.session, *shape, settings["unit"])
-    rows = None if config.presses is None else gauge.read_gauge(config.presses, *shape, settings["delay"])
+    session = read_bench_session(config.session, *shape, settings["unit"])
+    rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"])
     with Console(stderr=True).status("fitting"):
         bench = wired_bench(device, session, rows, confirmed)
         calibration = fit_calibration(bench)
@@ -61,7 +64,7 @@ def main(config: DictConfig) -> None:
             "body or the clock wrong?"
         )
         sys.exit(1)
-    known = {**calibration.about, **held_out_summary(outcome)}
-    known |= {"session": config.session, "presses_file": config.presses}
+    about = {**calibration.about, **summarise_held_out(outcome)}
+    about |= {"session": config.session, "presses_file": config.presses}
     channels = device_channels(session, confirmed)
-    print(write_calibration(replace(calibration, about=known, channels=channels), config.out))
+    print(write_calibration(replace(calibration, about=about, channels=channels), config.out))

@@ -17,11 +17,8 @@ from skin.errors import InputError
 from skin.files import results
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from skin.device.base import AbstractSimulated
-    from skin.plot.press_comparison import Verdicts
-    from skin.recording import Touches
+    from skin.hardware.comparison import Agreement, SessionComparison
 
 
 @command("compare")
@@ -32,8 +29,7 @@ def main(config: DictConfig) -> None:
 
     from skin.build import build_device
     from skin.console import quiet
-    from skin.files import write
-    from skin.plot import gesture_comparison, gesture_page, press_comparison
+    from skin.hardware.comparison import compare_session, publish_comparison
 
     quiet()
     settings = plain(config)["compare"]
@@ -42,38 +38,21 @@ def main(config: DictConfig) -> None:
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
         f" with {device.calibration}." if device.calibration else ", not calibrated."
     )
-    if config.presses is None and gesture_comparison.marked(config.session):
-        pairs = gesture_comparison.read_gestures(device, config.session, settings["seed"])
-        truth = [[bool(pair.labels[name]) for name in device.task.names] for pair in pairs.pairs]
-        text = gesture_page.gestures_markdown(
-            pairs, _verdicts(config, device, gesture_comparison.gesture_touches(pairs), truth), about
-        )
-        picture = gesture_page.plot_gestures(pairs, settings["shown"], folder / "compare.png")
-    else:
-        presses = press_comparison.read_presses(device, config.session, config.presses, settings)
-        both = press_comparison.press_touches(
-            presses, device.sensors.positions, device.model_rate, device.window
-        )
-        text = press_comparison.presses_markdown(presses, _verdicts(config, device, both), about)
-        picture = press_comparison.plot_presses(presses, settings["shown"], folder / "compare.png")
-    print(text, write(text, folder / "compare.md"), picture, sep="\n")
+    comparison = compare_session(device, config.session, config.presses, settings)
+    agreement = None if config.run is None else _compare_predictions(config, device, comparison)
+    page, picture = publish_comparison(comparison, agreement, about, settings["shown"], folder)
+    print(page.read_text(encoding="utf-8"), page, picture, sep="\n")
 
 
-def _verdicts(
-    config: DictConfig,
-    device: "AbstractSimulated",
-    both: "Sequence[Touches]",
-    truth: list[list[bool]] | None = None,
-) -> "Verdicts | None":
-    """Return the predictions of a run for both sides; None without a run."""
-    if config.run is None:
-        return None
-
+def _compare_predictions(
+    config: DictConfig, device: "AbstractSimulated", comparison: "SessionComparison"
+) -> "Agreement":
+    """Return the predictions of a run for both sides."""
     import numpy as np
 
     from skin.build import build_data, build_learner
     from skin.device._blank import Blank
-    from skin.plot.press_comparison import Verdicts
+    from skin.hardware.comparison import Agreement
     from skin.stored_run import find_run, load_configuration, load_learner
     from skin.tracking import Store
 
@@ -81,6 +60,9 @@ def _verdicts(
     run = find_run(store, config.run)
     trained = load_configuration(store, run, config.trust)
     learner = build_learner(trained)
-    load_learner(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
-    simulated, recorded = ((learner.probabilities(side) > 0.5).numpy() for side in both)
-    return Verdicts(device.task.names, simulated, recorded, None if truth is None else np.array(truth))
+    blank = Blank.of(device.task, device.size, comparison.touches[0])
+    load_learner(store, run, learner, build_data(trained, blank))
+    simulated, measured = ((learner.probabilities(side) > 0.5).numpy() for side in comparison.touches)
+    labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
+    truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])
+    return Agreement(device.task.names, simulated, measured, truth if labels else None)

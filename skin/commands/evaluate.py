@@ -39,11 +39,9 @@ def main(config: DictConfig) -> None:
 
 def _evaluate(config: DictConfig, steps: "Steps") -> None:
     from skin.console import quiet
-    from skin.evaluation.metrics_table import print_report
-    from skin.evaluation.report import evaluate
+    from skin.evaluation.report import evaluate, print_report, publish_evaluation, write_chances
     from skin.hardware.wired import AbstractWired
     from skin.option import option_name
-    from skin.plot.evaluation_page import publish_evaluation, verdicts
     from skin.run import log_report
     from skin.run_overrides import apply_overrides
     from skin.stored_run import find_run, load_configuration
@@ -72,7 +70,7 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
             chances = learner.probabilities(touches)
-            text, path = verdicts(chances, device.task, point, folder / f"{name}.csv")
+            text, path = write_chances(chances, device.task, point, folder / f"{name}.csv")
             store.client.log_artifact(evaluation.info.run_id, str(path))
             print(f"{title}\n{text}\n{path}")
             return

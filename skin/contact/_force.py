@@ -9,7 +9,7 @@ import torch
 
 from skin.contact._unilateral import Equilibrium
 from skin.gesture_measures import measure_gestures
-from skin.touch.problem import ContactProblem
+from skin.touch.sampler import ContactProblem
 
 # Relative tolerance of the peak. The tolerance at an end of its range, where a search fails, is tighter, so
 # that the result does not depend on the side from which the search has come.

@@ -3,7 +3,8 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
-from skin.touch.problem import ContactProblem, ContactResult, Trajectories
+from skin.touch.gesture import Trajectories
+from skin.touch.sampler import ContactProblem, ContactResult
 
 
 class AbstractContact(ABC):

@@ -8,7 +8,8 @@ import torch
 from skin.body.base import AbstractBody
 from skin.contact.base import AbstractContact
 from skin.simulator.base import AbstractSimulator
-from skin.touch.problem import ContactProblem, ContactResult, Trajectories
+from skin.touch.gesture import Trajectories
+from skin.touch.sampler import ContactProblem, ContactResult
 
 
 @final

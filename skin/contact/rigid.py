@@ -15,7 +15,8 @@ from skin.contact._unilateral import Equilibrium, solve_contact
 from skin.contact.base import AbstractContact
 from skin.settings import checked
 from skin.simulator.base import AbstractSimulator
-from skin.touch.problem import ContactProblem, ContactResult, Trajectories
+from skin.touch.gesture import Trajectories
+from skin.touch.sampler import ContactProblem, ContactResult
 
 
 @final

@@ -9,15 +9,13 @@ from scipy.stats import binomtest
 from torch import Tensor
 
 from skin.device.base import AbstractDevice
-from skin.evaluation.alarm import Reached
-from skin.evaluation.metrics import metrics
-from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.report import Predictor
+from skin.evaluation.metrics import compute_metrics
+from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor, Reached
 from skin.gesture_measures import Measures
 from skin.labels import TOUCH, Thresholds
 from skin.signal.features import above_idle
 
-ALARM = "alarm"
+ALARM_NAME = "alarm"
 """Name of the prediction "dangerous" at the operating point; the label itself uses a threshold of 0.5."""
 
 _SHARES = (0, 0.5, 0.8, 0.9, 0.95, 1, 1.05, 1.1, 1.25, 2, torch.inf)  # of the threshold
@@ -73,14 +71,14 @@ class Faint:
 
 @dataclass(frozen=True)
 class MarginReport:
-    """Result of :func:`margins`.
+    """Result of :func:`measure_margins`.
 
     Attributes:
         spans: label, or ``ALARM`` -> its spans in ascending order.
         faint: by strength, ascending.
         point: operating point of ``ALARM``.
         reached: its alarms.
-        metrics: of all touches (:func:`skin.evaluation.metrics.metrics`).
+        metrics: of all touches (:func:`skin.evaluation.metrics.compute_metrics`).
     """
 
     spans: dict[str, list[Span]]
@@ -90,7 +88,9 @@ class MarginReport:
     metrics: dict[str, float]
 
 
-def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: OperatingPoint) -> MarginReport:
+def measure_margins(
+    learner: Predictor, device: AbstractDevice, gestures: int, point: OperatingPoint
+) -> MarginReport:
     """Return a learner's errors on test touches by the measures that define the labels, and by strength.
 
     Args:
@@ -116,15 +116,15 @@ def margins(learner: Predictor, device: AbstractDevice, gestures: int, point: Op
     measures = Measures(*(known[name] for name in Measures._fields))
     settings = simulation.sampler.settings
     shares = _shares(measures, settings.thresholds, settings.frames.duration)
-    found = {name: spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
+    found = {name: find_spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
-    found[ALARM] = spans(point.alarm(chances[:, danger]), shares[:, danger])
+    found[ALARM_NAME] = find_spans(point.alarm(chances[:, danger]), shares[:, danger])
     faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
-    overall = metrics(chances, labels, TOUCH, point)
+    overall = compute_metrics(chances, labels, TOUCH, point)
     return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH), overall)
 
 
-def spans(said: Tensor, shares: Tensor) -> list[Span]:
+def find_spans(said: Tensor, shares: Tensor) -> list[Span]:
     """Return the spans that are not empty.
 
     Args:

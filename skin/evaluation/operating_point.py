@@ -1,29 +1,94 @@
-"""The threshold of the alarm "dangerous" for a given false-alarm rate."""
+"""The threshold of the alarm "dangerous" for a given false-alarm rate.
+
+It is chosen for one window of each gesture, or for touches as the live view watches them: the highest score
+of the decisions while a touch lasts.
+"""
 
 import json
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING
+from math import ceil
+from typing import Protocol
 
+import numpy as np
 import torch
+from scipy.stats import binomtest
 from torch import Tensor
+from torch.nn.functional import max_pool1d, pad
 
-from skin.config import Evaluation
-from skin.device.base import AbstractDevice
+from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
-from skin.evaluation.alarm import Reached
-from skin.labels import Task
+from skin.evaluation.settings import ENOUGH, Evaluation, check_evaluation
+from skin.labels import TOUCH, Task
 from skin.recording import Touches
-
-if TYPE_CHECKING:
-    from skin.evaluation.report import Predictor
+from skin.rng import Stream, generator
+from skin.signal.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown
+from skin.signal.device_sampling import between_frames, draw_constants
+from skin.touch.movie import Movie
+from skin.touch.sampler import balanced
 
 LABEL = "dangerous"
-ENOUGH = 2000
-"""Safe gestures; where 2 % are wanted, the true rate is then 1.4 to 2.7 % (95 %). 5000: 1.6 to 2.4 %."""
-
 _APART = 1e-6  # scores closer than this may have another order on another processor
 _MOST_DRAWS = 6
+SAFE_TOUCHES = 2000
+"""Safe touches on which a threshold is chosen: where 2 % are wanted, the rate is then 1.4 to 2.7 % (95 %)."""
+_TOUCHES = 50  # touches
+_WINDOWS = 500  # windows that are classified at once
+_AFTER = 1.0  # s that are simulated behind the window of a touch
+
+
+class Predictor(Protocol):
+    """The interface that an evaluation needs: a trained learner, an ensemble of runs, or a peer."""
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L); raise InputError for touches that do not fit."""
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The alarms of an operating point on some gestures.
+
+    Attributes:
+        dangerous: dangerous gestures.
+        found: those that raise the alarm.
+        safe: safe gestures.
+        raised: those that raise the alarm.
+    """
+
+    dangerous: int
+    found: int
+    safe: int
+    raised: int
+
+    @property
+    def recall(self) -> float:
+        """Share of the dangerous gestures that raise the alarm; NaN if there are none."""
+        return self.found / self.dangerous if self.dangerous else math.nan
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """Share of the safe gestures that raise the alarm; NaN if there are none."""
+        return self.raised / self.safe if self.safe else math.nan
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """95 % confidence interval of the false-alarm rate, exact (Clopper and Pearson, 1934)."""
+        if not self.safe:
+            return math.nan, math.nan
+        low, high = binomtest(self.raised, self.safe).proportion_ci(0.95)
+        return float(low), float(high)
+
+    def sentence(self) -> str:
+        """Return the false-alarm rate with its range, and the recall, in words; "-" where undefined."""
+        low, high = self.range
+        rate = "false alarms: - (no safe gesture)"
+        if self.safe:
+            rate = (
+                f"false alarms: {self.raised} of {self.safe} safe gestures, "
+                f"{100 * self.false_alarm_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
+            )
+        recall = f"{100 * self.recall:.1f} % of {self.dangerous}" if self.dangerous else "-"
+        return f"{rate}; dangerous gestures found: {recall}"
 
 
 @dataclass(frozen=True)
@@ -131,23 +196,6 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
     return point
 
 
-def check_evaluation(settings: Evaluation) -> None:
-    """Raise InputError where the settings of an evaluation cannot be used."""
-    for name, least in (("devices", 0), ("layouts", 0)):
-        if getattr(settings, name) < least:
-            raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {least}")
-    if not 0 < settings.false_alarm_rate < 1:
-        raise InputError(
-            f"a false-alarm rate is between 0 and 1, got {settings.false_alarm_rate:g}: "
-            "use evaluation.false_alarm_rate=0.02"
-        )
-    if settings.safe_gestures < 1:
-        raise InputError(
-            "the alarm's threshold is chosen on 1 safe gesture or more, got "
-            f"{settings.safe_gestures}: use evaluation.safe_gestures={ENOUGH}"
-        )
-
-
 def threshold_gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     """Return the gestures on which the threshold is chosen.
 
@@ -171,7 +219,7 @@ def threshold_gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
 
 
 def choose_operating_point(
-    learner: "Predictor", device: AbstractDevice, settings: Evaluation
+    learner: Predictor, device: AbstractDevice, settings: Evaluation
 ) -> OperatingPoint | None:
     """Return the operating point of a trained learner; None if its task has no label ``dangerous``.
 
@@ -219,3 +267,160 @@ def _column(chances: Tensor, labels: Tensor, task: Task) -> tuple[Tensor, Tensor
     place = task.names.index(LABEL)
     rows = task.counts(labels)[:, place]
     return chances[rows, place], labels[rows, place] > 0.5
+
+
+@dataclass(frozen=True)
+class Watching:
+    """How a live view watches a skin.
+
+    Attributes:
+        rate: of the device, Hz.
+        contact: N above the baseline that count as contact.
+        longest: s, longest touch of the training.
+        patience: s for which decisions must be dangerous before the alarm is raised.
+        column: of ``dangerous`` among the labels of the learner.
+        aligned: a device at the model's rate gives the frames of the model, as the simulator does; otherwise
+            it reads at any phase of their intervals.
+    """
+
+    rate: float
+    contact: float
+    longest: float
+    patience: float
+    column: int
+    aligned: bool = False
+
+    def decisions(self, rate: float) -> int:
+        """Return how many decisions in a row raise the alarm, for a device of ``rate``, Hz."""
+        return max(1, ceil(self.patience * min(DECISIONS, rate) - 1e-6))
+
+
+@torch.inference_mode()
+def choose_for_touches(
+    learner: Predictor,
+    device: AbstractSimulated,
+    watching: Watching,
+    target: float,
+    count: int = SAFE_TOUCHES,
+) -> OperatingPoint:
+    """Return the threshold at which a share of safe touches raises the alarm of the live view.
+
+    Args:
+        learner: trained.
+        device: simulates and measures the touches; with ``randomise``, each with another device.
+        watching: how they are watched.
+        target: largest share of safe touches that raise the alarm.
+        count: number of safe touches.
+    """
+    labels = balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
+    safe = labels[~labels[:, TOUCH.names.index(LABEL)]][:count]
+    scores = touch_scores(learner, device, watching, safe, device.data_seed)
+    point = OperatingPoint(lowest_threshold(scores, target), target, len(scores), 0, device.data_seed)
+    return replace(point, raised=int(point.alarm(scores).sum()))
+
+
+@torch.inference_mode()
+def touch_scores(
+    learner: Predictor,
+    device: AbstractSimulated,
+    watching: Watching,
+    labels: np.ndarray,
+    seed: int,
+) -> Tensor:
+    """Return the score of each touch: it raises the alarm at thresholds below.
+
+    Args:
+        learner, device, watching: as in :func:`choose_for_touches`.
+        labels: (B, 4), bool, of the touches.
+        seed: of the touches and their devices.
+
+    Returns:
+        (B,), the largest over the decisions of the smallest probability of ``dangerous`` among as many
+        decisions in a row as the patience needs; 0 without contact.
+    """
+    device = device.replace(padded=False, stream=False)
+    scores = list[Tensor]()
+    for first in range(0, len(labels), _TOUCHES):
+        batch, draw = labels[first : first + _TOUCHES], generator(Stream.ALARM, seed, 2, first)
+        movie = device.sampler.sample(len(batch), draw, batch)
+        readings, valid, contact = _decision_windows(device, movie, watching, draw)
+        chances = torch.zeros(contact.shape)
+        chances[contact] = _classify_windows(
+            learner, device, watching, readings[contact], valid[contact.nonzero()[:, 0]]
+        )
+        row = watching.decisions(_round_rate(device, watching))
+        least = -max_pool1d(-pad(chances, (row - 1, 0)), row, 1) if row > 1 else chances
+        scores.append(least.amax(dim=1))
+    return torch.cat(scores)
+
+
+def _round_rate(device: AbstractSimulated, watching: Watching) -> float:
+    """Return the rate of the device, rounded to a multiple of the model's, Hz."""
+    return max(1, round(watching.rate / device.model_rate)) * device.model_rate
+
+
+def _decision_windows(
+    device: AbstractSimulated, movie: Movie, watching: Watching, draw: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the windows (B, J, T, S), N, of J decisions about each touch, as the model sees them.
+
+    Returns:
+        windows; valid (B, S); contact (B, J), whether something touches the skin at each decision.
+    """
+    readings, valid = _measure_touches(device, movie, watching, draw)
+    rate, window = _round_rate(device, watching), device.window
+    ratio = round(rate / device.model_rate)
+    # Each place holds the maximum over the interval of the model that begins there.
+    highest = max_pool1d(readings.transpose(1, 2), ratio, 1).transpose(1, 2)
+    end = _draw_decisions(readings.shape, ratio * window, max(1.0, rate / DECISIONS), draw)
+    place = end[:, :, None] - ratio * torch.arange(window, 0, -1) + 1
+    windows = highest[torch.arange(len(end))[:, None, None], place]
+    risen = (windows >= watching.contact) & valid[:, None, None]
+    recent = max(1, ceil(RELEASE * device.model_rate - 1e-9))
+    contact = risen[:, :, -recent:].flatten(2).any(dim=2)
+    held = held_frames(watching.longest, device.model_rate, window)
+    begun = torch.where(contact, end, torch.iinfo(end.dtype).max).amin(dim=1, keepdim=True)
+    lasted = (end - begun) / ratio + 1
+    for touch, decision in (contact & (lasted > longest_shown(held, recent, window))).nonzero().tolist():
+        shown = as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
+        windows[touch, decision] = torch.from_numpy(shown)
+    return windows * valid[:, None, None], valid, contact
+
+
+def _measure_touches(
+    device: AbstractSimulated, movie: Movie, watching: Watching, draw: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return what devices read of touches after a window of rest, (B, F, S), N, and their valid sensors."""
+    force = device.model.respond(movie, displacement=False).readings
+    before, after = device.window, ceil(_AFTER * device.model_rate)
+    padded, rate = pad(force, (0, 0, before, after)), _round_rate(device, watching)
+    if rate > device.model_rate or not watching.aligned:
+        padded = between_frames(padded, device.model_rate, rate, draw.random(len(padded)))
+    imperfection = replace(device.imperfection, rate=rate)
+    gestures = len(padded) if getattr(device, "randomise", False) else None
+    constants = draw_constants(imperfection, padded.shape[2], device.model_rate, draw, gestures)
+    # A drift is 0 where the touch begins, as in other gestures: the live view follows it without contact.
+    time = torch.arange(padded.shape[1]) / rate - before / device.model_rate
+    readings, valid, _ = imperfection.apply(padded, constants, draw, time)
+    return readings, valid[:, 0]
+
+
+def _draw_decisions(shape: torch.Size, first: int, step: float, draw: np.random.Generator) -> Tensor:
+    """Return the frames at which it is decided about each touch, (B, J): the ticks have any phase to it."""
+    begin = first - 1 + step * draw.random(shape[0])
+    count = int((shape[1] - first - step) / step)
+    ends = np.floor(begin[:, None] + step * np.arange(count)).astype(np.int64)
+    return torch.from_numpy(ends)
+
+
+def _classify_windows(
+    learner: Predictor, device: AbstractSimulated, watching: Watching, readings: Tensor, valid: Tensor
+) -> Tensor:
+    """Return the probability of ``dangerous`` of windows (W, T, S) with valid sensors (W, S), (W,)."""
+    positions = torch.from_numpy(device.sensors.positions).float()
+    mask = valid[:, None].expand_as(readings)
+    parts = [
+        learner.probabilities(Touches(*part, positions, None, device.model_rate))[:, watching.column]
+        for part in zip(readings.split(_WINDOWS), mask.split(_WINDOWS), strict=True)
+    ]
+    return torch.cat(parts).nan_to_num(1.0) if parts else torch.zeros(0)

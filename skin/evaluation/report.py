@@ -1,40 +1,37 @@
-"""Evaluation of a learner on its own device, unseen devices and unseen layouts."""
+"""Evaluation of a learner on its own device, unseen devices and unseen layouts, as a table and as a page."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
-from typing import Literal, Protocol
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import torch
+from rich.console import Console
+from rich.table import Table
 from torch import Tensor
 
-from skin.config import Evaluation
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
-from skin.evaluation.alarm import Reached
-from skin.evaluation.metrics import confusion, metrics
-from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.outcomes import encode
+from skin.evaluation.metrics import compute_metrics, count_confusions, encode
+from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor, Reached
+from skin.evaluation.settings import Evaluation
+from skin.files import whole, write
 from skin.labels import Task
 from skin.layout.scattered import Scattered
+from skin.plot.figures import confusions, save_figure
 from skin.recording import Touches
 
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101
-SHARES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
+PERCENTAGES = ("/accuracy", "/alarm_recall", "/false_alarm_rate")
 """Suffixes of the metrics that are shown in per cent."""
-
-_SHOWN = (*SHARES, "/degrees")
+_SHOWN = (*PERCENTAGES, "/degrees")
 _UNDEFINED = "not defined, because the test has only gestures with this label or only gestures without it"
-
-
-class Predictor(Protocol):
-    """The interface that an evaluation needs: a trained learner, an ensemble of runs, or a peer."""
-
-    def probabilities(self, touches: Touches) -> Tensor:
-        """Return the probability of each label, (B, L); raise InputError for touches that do not fit."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ class Report:
         predictions: a row per test gesture: labels, probabilities (``p_<label>``) and drawn parameters.
         point: where the alarm is raised; None where the task has no label ``dangerous``.
         reached: the alarms on the gestures of ``same``; None without ``point``.
-        outcomes: of the gestures of ``same`` (:func:`skin.evaluation.outcomes.encode`); None where the labels
+        outcomes: of the gestures of ``same`` (:func:`skin.evaluation.metrics.encode`); None where the labels
             have none.
     """
 
@@ -64,7 +61,7 @@ class Report:
     outcomes: np.ndarray | None = None
 
 
-def columns(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
+def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
     """Return the sets of touches of each column of a report, drawn lazily.
 
     Those of ``unseen_layout`` raise InputError where the sensors cannot form a grid.
@@ -90,8 +87,8 @@ def evaluate(
     task, found, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
-    found |= _named("same", metrics(chances, _labels(same), task, point))
-    others = columns(device, settings)
+    found |= _named("same", compute_metrics(chances, _labels(same), task, point))
+    others = touch_sets(device, settings)
     del others["same"]
     for column, sets in others.items():
         try:
@@ -101,9 +98,9 @@ def evaluate(
             continue
         if each:
             said, true = (torch.cat(parts) for parts in zip(*each, strict=True))
-            found |= _named(column, metrics(said, true, task, point))
+            found |= _named(column, compute_metrics(said, true, task, point))
     cannot |= {name: _UNDEFINED for name, value in found.items() if isnan(value) and name.endswith(_SHOWN)}
-    table = confusion(chances, _labels(same), task) if task.kind == "binary" else None
+    table = count_confusions(chances, _labels(same), task) if task.kind == "binary" else None
     reached = None if point is None else point.reached(chances, _labels(same), task)
     outcomes = encode(chances, _labels(same), task, point)
     return Report(found, cannot, table, _predictions(chances, same, task, drawn), point, reached, outcomes)
@@ -172,3 +169,118 @@ def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str,
         columns |= {name: known.numpy(), f"p_{name}": chance.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)
+
+
+def print_report(found: Report, title: str, console: Console | None = None) -> None:
+    """Print one line per label and one column per set of touches, accuracies in per cent, errors in degrees.
+
+    Args:
+        found: result of the evaluation.
+        title: of the table.
+        console: where to print; None: standard output.
+    """
+    console = console or Console()
+    console.print(metrics_table(found.metrics, title))
+    if found.point is not None and found.reached is not None:
+        said = f"{found.point.sentence()}; {found.reached.sentence()}"
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
+    for column, reason in found.cannot.items():
+        console.print(f"{column}: {reason}", markup=False)
+
+
+def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
+    """Return a table of the metrics with a suffix such as ``/accuracy``; others are omitted."""
+    names = [name for name in metrics if name.endswith(_SHOWN)]
+    sets = list(dict.fromkeys(name.split("/")[0] for name in names))
+    table = Table("", *sets, title=title)
+    for line in dict.fromkeys(name.split("/", 1)[1] for name in names):
+        values = (metrics.get(f"{column}/{line}") for column in sets)
+        unit = 1 if line.endswith("/degrees") else 100
+        table.add_row(line, *(format_number(value, unit) for value in values))
+    return table
+
+
+def format_number(value: float | None, unit: float = 100) -> str:
+    """Return a value with one decimal; "-" for NaN, and an empty string for None."""
+    return "" if value is None else "-" if isnan(value) else f"{unit * value:.1f}"
+
+
+def evaluation_markdown(found: Report, task: Task, title: str, about: str) -> str:
+    """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.
+
+    Args:
+        found: what an evaluation found.
+        task: the labels.
+        title: of the page.
+        about: a sentence on where the touches came from.
+    """
+    columns = list(dict.fromkeys(name.split("/")[0] for name in found.metrics))
+    lines = [f"# {title}", "", about, "", "Per cent:", "", f"| | {' | '.join(columns)} |"]
+    lines.append("|---" * (len(columns) + 1) + "|")
+    rows = dict.fromkeys(name.split("/", 1)[1] for name in found.metrics)
+    for row in rows:
+        if row.endswith(PERCENTAGES):
+            shares = (found.metrics.get(f"{column}/{row}") for column in columns)
+            lines.append(f"| {row} | {' | '.join(map(format_number, shares))} |")
+        if row.endswith("/degrees"):
+            sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
+            lines.append(
+                f"| {row} | {' | '.join(format_number(x, 1) + '°' * (x is not None) for x in sizes)} |"
+            )
+    if found.point is not None and found.reached is not None:
+        lines += ["", f"{found.point.sentence()}; {found.reached.sentence()}."]
+    lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
+    if found.confusion is not None:
+        lines += [
+            "",
+            "| label | no, said no | no, said yes | yes, said no | yes, said yes |",
+            "|---" * 5 + "|",
+        ]
+        for name, counts in zip(task.binary, found.confusion.numpy().astype(int), strict=True):
+            lines.append(f"| {name} | {' | '.join(map(str, counts.ravel().tolist()))} |")
+    return "\n".join(lines) + "\n"
+
+
+def publish_evaluation(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
+    """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
+    written = [write(evaluation_markdown(found, task, title, about), path)]
+    if found.confusion is not None:
+        named = dict(zip(task.binary, found.confusion.numpy(), strict=True))
+        written.append(save_figure(confusions(named, ("no", "yes")), path.with_suffix(".png")))
+    return written
+
+
+def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, path: Path) -> tuple[str, Path]:
+    """Write the probability of each label, gesture by gesture, where nobody knows the truth.
+
+    Args:
+        chances: (B, L); of a direction the mean cosines.
+        task: the labels.
+        point: where the alarm is raised; a gesture is said to be dangerous there, as ``live`` says it.
+        path: x.csv.
+
+    Returns:
+        lines for a person, and the path.
+    """
+    columns = {f"p_{name}": values.numpy() for name, values in zip(task.names, chances.T, strict=True)}
+    table = pa.table({"gesture": np.arange(len(chances)), **columns})
+    with whole(path) as partial:
+        pa.csv.write_csv(table, partial)
+    levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
+    said = [
+        f"gesture {number}: "
+        + ", ".join(
+            f"{'' if chance > levels[name] else 'not '}{name} ({chance:.2f})"
+            for name, chance in zip(task.binary, row, strict=False)
+        )
+        + (_slide(row, task) if task.direction else "")
+        for number, row in enumerate(chances.tolist())
+    ]
+    return "\n".join(said), path
+
+
+def _slide(row: Sequence[float], task: Task) -> str:
+    """Return where a touch slides that is said to be dynamic: 0° along x, 90° along y."""
+    if row[task.names.index("dynamic")] <= 0.5:
+        return ""
+    return f", sliding towards {math.degrees(math.atan2(row[-1], row[-2])):.0f}°"

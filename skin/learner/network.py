@@ -13,7 +13,6 @@ import torch
 from annotated_types import Ge, Le, Lt
 from torch import Tensor, nn
 
-from skin.config import PARENT
 from skin.error_messages import one_line
 from skin.errors import InputError
 from skin.fusion.base import AbstractFusion
@@ -21,6 +20,7 @@ from skin.learner.base import AbstractLearner
 from skin.recording import Touches
 from skin.representation.base import Frames
 from skin.safe_loading import check_archive
+from skin.shard import PARENT
 
 if TYPE_CHECKING:
     from pytorch_lightning import Callback, Trainer

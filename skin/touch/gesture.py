@@ -1,27 +1,108 @@
-"""Gesture settings, and random draws of shape, timing and path."""
+"""Gesture settings, random draws of shape, timing and path, and the frames sampled from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any
+from math import ceil, inf
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import torch
 from annotated_types import Ge, Le, MinLen
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from torch import Tensor
 
 from skin.errors import InputError
 from skin.labels import Thresholds
 from skin.settings import RISING, check_settings, checked, configured
-from skin.touch._bodies import Fit, draw_bodies
-from skin.touch._frames import GestureFrames
-from skin.touch.shapes import Shapes
+from skin.touch.shapes import Fit, Shapes, draw_bodies
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
-
-
 _From0 = Annotated[tuple[NonNegativeFloat, PositiveFloat], RISING]
 _Above0 = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
+
+
+class GestureFrames(NamedTuple):
+    """Durations in frames of the model, and speeds in m per frame; ranges are (least, most).
+
+    Attributes:
+        window: T.
+        tap, press: frames in contact.
+        speed: m per frame.
+        gap: idle frames between two touches of a stream.
+        stride: frames between the starts of two windows of a stream.
+        duration: frames of the longest tap; see ``Thresholds.duration``.
+        slide: fewest frames in contact of a sliding touch: those of its path at the highest speed.
+    """
+
+    window: int
+    tap: tuple[int, int]
+    press: tuple[int, int]
+    speed: tuple[float, float]
+    gap: tuple[int, int]
+    stride: tuple[int, int]
+    duration: int
+    slide: int
+
+    @classmethod
+    def of(cls, settings: "GestureSettings") -> "GestureFrames":
+        """Return ``round(seconds * rate)`` for every duration of the settings."""
+        rate = settings.rate
+
+        def frames(given: tuple[float, float]) -> tuple[int, int]:
+            return round(given[0] * rate), round(given[1] * rate)
+
+        return cls(
+            round(settings.window * rate),
+            frames(settings.tap),
+            frames(settings.press),
+            (settings.speed[0] / rate, settings.speed[1] / rate),
+            frames(settings.gap),
+            frames(settings.stride),
+            round(settings.thresholds.duration * rate),
+            # A path of a whole number of steps must not get one more by rounding.
+            1 + max(1, ceil(settings.path * rate / settings.speed[1] - 1e-9)),
+        )
+
+    def check(self, settings: "GestureSettings") -> None:
+        """Check that every duration has a frame, and taps and presses are on their sides of the threshold.
+
+        Raises:
+            InputError: naming the setting in s.
+        """
+        rate = settings.rate
+        for name, (least, most), low, high in (
+            ("window", (self.window, self.window), 1, inf),
+            ("tap", self.tap, 1, min(self.duration, self.window)),
+            ("press", self.press, self.duration + 1, self.window),
+            ("gap", self.gap, 1, inf),
+            ("stride", self.stride, 1, inf),
+        ):
+            if low <= least and most <= high:
+                continue
+            within = f"at least {low} ({low / rate:g} s)"
+            if high < inf:
+                within = (
+                    f"{low} to {high} ({low / rate:g} to {high / rate:g} s) with this touch.window and "
+                    "touch.thresholds.duration"
+                )
+            counts = f"{least}" if least == most else f"{least} to {most}"
+            raise InputError(
+                f"{_shown(settings, name)} gives {counts} frames at touch.rate={rate:g} Hz, valid are "
+                f"{within}"
+            )
+        if self.tap[1] < self.slide:
+            raise InputError(
+                f"{_shown(settings, 'tap')} gives at most {self.tap[1]} frames at touch.rate={rate:g} Hz, "
+                f"but a tap that slides over touch.path={settings.path:g} m at the highest touch.speed lasts "
+                f"{self.slide} ({self.slide / rate:g} s): raise touch.tap or touch.speed, or lower touch.path"
+            )
+
+
+def _shown(settings: "GestureSettings", name: str) -> str:
+    given = getattr(settings, name)
+    return f"touch.{name}={list(given) if isinstance(given, tuple) else given} s"
 
 
 @checked("touch")
@@ -153,10 +234,10 @@ def draw_gestures(
         shapes: the shapes and the sheet.
         padded: whether a touch begins at a random frame of the window instead of its first.
         generator: source of randomness; it draws for all gestures in every round.
-        fit, kept: see :func:`skin.touch._bodies.draw_bodies`.
+        fit, kept: see :func:`skin.touch.shapes.draw_bodies`.
 
     Returns:
-        The result of :func:`skin.touch._bodies.draw_bodies`, and duration and onset (frames).
+        The result of :func:`skin.touch.shapes.draw_bodies`, and duration and onset (frames).
     """
     dynamic, press = labels[:, 1], labels[:, 2]
     drawn = draw_bodies(labels[:, 0], settings, shapes, generator, fit, kept)
@@ -228,3 +309,106 @@ def heading(place: np.ndarray, first: np.ndarray) -> np.ndarray:
     steps[more] = steps[more + 1]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     return np.divide(steps, length, out=np.zeros_like(steps), where=length > 0)
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Gestures (B,) as distinct frames (U,); the frames of one gesture are adjacent.
+
+    Attributes:
+        owner: (U,), the gesture of each frame, ascending.
+        shape, angle, scale: (U,), as ``Shapes.render`` takes them.
+        place: (U, 2), m.
+        share: (U,), the largest share of full force at which a frame is shown.
+        index: (B, T), the frame at each time.
+        profile: (B, T), its share of full force; 0 without contact.
+        peak: (B,), the wanted highest cell pressure, Pa.
+        wanted: (B, 4), bool, the wanted labels in the order of ``skin.labels.TOUCH``.
+        stretch: (U,), as ``Shapes.render`` takes it.
+    """
+
+    owner: np.ndarray
+    shape: np.ndarray
+    angle: np.ndarray
+    scale: np.ndarray
+    place: np.ndarray
+    share: np.ndarray
+    index: Tensor
+    profile: Tensor
+    peak: np.ndarray
+    wanted: np.ndarray
+    stretch: np.ndarray | None = None
+
+    @property
+    def poses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Arguments of ``Shapes.render`` and ``Shapes.solids``."""
+        return self.shape, self.angle, self.scale, self.place, self.stretch
+
+
+class SampledPaths(NamedTuple):
+    """Sampled trajectories of gestures.
+
+    Attributes:
+        trajectories: the frames (U,) of gestures (B,).
+        place: (U, 2), place of each frame within the gesture's span, m.
+        first: (B,), the first frame of each gesture.
+        net: (B, 2), from its first place to its last, m.
+        travel: (B,), largest distance from its first place, m.
+    """
+
+    trajectories: Trajectories
+    place: np.ndarray
+    first: np.ndarray
+    net: np.ndarray
+    travel: np.ndarray
+
+
+def sample_paths(
+    gestures: Draws, wanted: np.ndarray, settings: GestureSettings, proportional: bool
+) -> SampledPaths:
+    """Return the distinct frames of gestures.
+
+    A sliding touch has one per step. A static touch has one, or one per force level where pressure is not
+    proportional to force.
+
+    Args:
+        gestures: the draws of ``draw_gestures`` and ``draw_paths``, (B, ...).
+        wanted: (B, 4), bool, the wanted labels.
+        settings: ranges of the gestures.
+        proportional: whether pressure is proportional to force.
+    """
+    duration, onset, sliding = gestures["duration"], gestures["onset"], gestures["speed"] > 0
+    time = np.arange(settings.frames.window) - onset[:, None]
+    rise = duration[:, None] // settings.ramp + 1
+    level = np.clip(np.minimum(time + 1, duration[:, None] - time), 0, rise)
+    scale = level / rise
+
+    peak_level = level.max(axis=1)
+    counts = np.where(sliding, duration, 1 if proportional else peak_level)
+    first = np.cumsum(counts) - counts
+    shown = np.where(sliding[:, None], time, level - 1)
+    index = first[:, None] + np.clip(shown, 0, counts[:, None] - 1)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    step = np.arange(len(owner)) - first[owner]
+    velocity = gestures["speed"] * np.stack([np.cos(gestures["direction"]), np.sin(gestures["direction"])])
+    place = fold(gestures["start"][owner] + step[:, None] * velocity.T[owner], gestures["span"][owner])
+
+    share = np.zeros(len(owner))
+    np.maximum.at(share, index, scale)
+    trajectories = Trajectories(
+        owner,
+        gestures["shape"][owner],
+        gestures["angle"][owner],
+        gestures["scale"][owner],
+        place - gestures["low"][owner],
+        share,
+        torch.from_numpy(index),
+        torch.from_numpy(scale).float(),
+        gestures["peak"],
+        wanted,
+        gestures["stretch"][owner],
+    )
+    from_first = place - place[first[owner]]
+    travel = np.zeros(len(first))
+    np.maximum.at(travel, owner, np.hypot(*from_first.T))
+    return SampledPaths(trajectories, place, first, from_first[first + counts - 1], travel)

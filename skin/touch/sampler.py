@@ -1,24 +1,30 @@
-"""Draw gestures with wanted labels and render their movies."""
+"""Random gestures with given labels: draws, their contact, and the movies of those that have the labels."""
 
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.gesture_measures import measure_gestures
 from skin.labels import TOUCH
-from skin.touch._bodies import Fit
-from skin.touch._paths import sample_paths
-from skin.touch.gesture import Draws, GestureSettings, draw_gestures, draw_paths, heading
+from skin.touch.gesture import (
+    Draws,
+    GestureSettings,
+    Trajectories,
+    draw_gestures,
+    draw_paths,
+    heading,
+    sample_paths,
+)
 from skin.touch.movie import Movie, join_movies
-from skin.touch.problem import ContactModel, ContactProblem, ContactResult
-from skin.touch.shapes import Shapes
+from skin.touch.shapes import Fit, Shapes
 
 _ATTEMPTS = 50
 _AHEAD = 64
@@ -26,6 +32,55 @@ _AHEAD = 64
 _LOYAL = 25
 _DRAWN = ("shape", "angle", "stretch", "misfits", "duration", "onset", "direction", "speed")
 _FOUND = ("peak", "force", "draws", "net_x", "net_y", "x", "y")
+
+
+class ContactProblem(NamedTuple):
+    """The touched body and the criteria for labels.
+
+    Attributes:
+        shapes: the shapes and the body.
+        footprints: (S, H * W), area weights of each sensor that sum to 1, float32.
+        settings: ranges of the gestures, and the thresholds of the labels.
+    """
+
+    shapes: Shapes
+    footprints: Tensor
+    settings: GestureSettings
+
+
+class ContactResult(NamedTuple):
+    """The pressure of trajectories.
+
+    Attributes:
+        frames: (U, H, W), Pa, float32, each divided by its share of full force, so that all frames of a
+            gesture have the same total force.
+        force: (B,), full force, N.
+        peak: (B,), peak cell pressure of the gesture, Pa.
+        refused: (B,), bool, gestures whose frames are not valid, because no force gives the wanted labels or
+            the contact did not converge.
+        hopeless: (B,), bool, the refused gestures for which no other path can succeed.
+        unconverged: (B,), number of frames that did not converge to the tolerance; None where all are exact.
+    """
+
+    frames: Tensor
+    force: np.ndarray
+    peak: np.ndarray
+    refused: np.ndarray
+    hopeless: np.ndarray
+    unconverged: np.ndarray | None = None
+
+
+class ContactModel(Protocol):
+    """The interface of a contact for the sampler; see :class:`skin.contact.base.AbstractContact`."""
+
+    @property
+    def proportional(self) -> bool: ...
+
+    @property
+    def advice(self) -> str: ...
+
+    def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
+        """Return the pressure of gestures at a force that gives the wanted labels, if there is one."""
 
 
 def balanced(count: int, generator: np.random.Generator) -> np.ndarray:

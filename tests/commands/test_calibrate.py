@@ -88,4 +88,4 @@ def test_a_session_with_other_axes_is_refused_until_that_is_confirmed(run, tmp_p
     assert all(f"{setting}" in done.stderr for setting in wrong)
     done = run(tmp_path, "calibrate", *SMALL, *files, *wrong, store=False)
     assert done.returncode == 0, done.stderr
-    assert read_calibration(out).channels == [1, 0, 2, 3]
+    assert list(read_calibration(out).channels) == [1, 0, 2, 3]

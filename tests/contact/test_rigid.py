@@ -16,9 +16,8 @@ from skin.gesture_measures import movie_labels
 from skin.layout.grid import Grid
 from skin.simulator.base import AbstractSimulator, Response
 from skin.simulator.naive import Naive
-from skin.touch.gesture import GestureSettings
-from skin.touch.problem import ContactProblem, Trajectories
-from skin.touch.sampler import TouchSampler
+from skin.touch.gesture import GestureSettings, Trajectories
+from skin.touch.sampler import ContactProblem, TouchSampler
 from skin.touch.shapes import Shapes
 
 from .halfspace import love

@@ -8,14 +8,14 @@ from hydra import compose, initialize_config_dir
 
 from skin.build import build_device
 from skin.class_balance import report_balance
-from skin.config import Evaluation
 from skin.device.base import AbstractDevice
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.evaluation.margins import margins
+from skin.evaluation.margins import measure_margins
 from skin.evaluation.operating_point import OperatingPoint, threshold_gestures
-from skin.evaluation.report import columns
-from skin.evaluation.sliding_windows import evaluate_windows
+from skin.evaluation.report import touch_sets
+from skin.evaluation.settings import Evaluation
+from skin.evaluation.streams import evaluate_windows
 from skin.hardware.wired import AbstractWired, open_source
 from skin.recording_file import write_recording
 
@@ -86,7 +86,7 @@ def test_a_blank_has_labelled_touches_of_the_same_shape(device):
 
 def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     settings = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
-    assert list(columns(made_up_device, settings)) == ["same", "holdout"]
+    assert list(touch_sets(made_up_device, settings)) == ["same", "holdout"]
     assert torch.equal(
         threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )
@@ -102,7 +102,10 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
         (lambda device: device.simulated("this is simulated"), "^this is simulated: leave out device="),
         (lambda device: device.recording(), "only simulated or recorded touches"),
         (open_source, "can be watched: give device=serial"),
-        (lambda device: margins(None, device, 20, POINT), "MadeUpDevice has none: .* add device=simulated"),
+        (
+            lambda device: measure_margins(None, device, 20, POINT),
+            "MadeUpDevice has none: .* add device=simulated",
+        ),
         (
             lambda device: evaluate_windows(None, device, None, POINT),
             "MadeUpDevice has none: .* add device=simulated",

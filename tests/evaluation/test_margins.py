@@ -5,7 +5,7 @@ import torch
 
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation.margins import ALARM, margins, spans
+from skin.evaluation.margins import ALARM_NAME, find_spans, measure_margins
 from skin.evaluation.operating_point import OperatingPoint
 from skin.labels import TOUCH
 from skin.recording import Touches
@@ -28,7 +28,7 @@ class Sure:
 def test_spans_hold_what_is_said_and_what_is_wrong():
     shares = torch.tensor([0.0, 0.97, 1.0, 1.01, 1.02, 3.0])
     said = torch.tensor([True, False, True, True, False, True])
-    found = spans(said, shares)
+    found = find_spans(said, shares)
     assert [(one.low, one.high, one.count, one.said, one.wrong) for one in found] == [
         (0, 0.5, 1, 1, 1),
         (0.95, 1, 2, 1, 1),  # a measure that only reaches its threshold does not pass it
@@ -40,7 +40,7 @@ def test_spans_hold_what_is_said_and_what_is_wrong():
 
 def test_ranges_are_exact():
     """None of ten: the upper end p has (1 - p)^10 = 0.025."""
-    (one,) = spans(torch.zeros(10, dtype=torch.bool), torch.zeros(10))
+    (one,) = find_spans(torch.zeros(10, dtype=torch.bool), torch.zeros(10))
     assert one.range == pytest.approx((0, 1 - 0.025**0.1))
 
 
@@ -53,8 +53,8 @@ def device(configured) -> AbstractDevice:
 
 def test_the_labels_are_what_the_measures_say(device):
     """A learner that says the labels is wrong in no span; every label changes where its measure passes 1."""
-    found = margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, POINT)
-    assert set(found.spans) == {*TOUCH.names, ALARM}
+    found = measure_margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, POINT)
+    assert set(found.spans) == {*TOUCH.names, ALARM_NAME}
     for each in found.spans.values():
         assert sum(one.count for one in each) == 200
         assert [one.said for one in each] == [0 if one.high <= 1 else one.count for one in each]
@@ -66,7 +66,7 @@ def test_the_labels_are_what_the_measures_say(device):
 def test_errors_are_found_where_they_are(device):
     but = torch.zeros(200, 4, dtype=torch.bool)
     but[:7, 1] = True
-    found = margins(Sure(but), device, 200, POINT)
+    found = measure_margins(Sure(but), device, 200, POINT)
     assert sum(one.wrong for one in found.spans["dynamic"]) == 7
     assert sum(one.wrong["dynamic"] for one in found.faint) == 7
     assert sum(one.wrong for one in found.spans["big"]) == 0
@@ -74,13 +74,13 @@ def test_errors_are_found_where_they_are(device):
 
 def test_only_simulated_touches_are_known(made_up_device):
     with pytest.raises(InputError, match="device=simulated"):
-        margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, POINT)
+        measure_margins(Sure(torch.zeros(40, 4, dtype=torch.bool)), made_up_device, 40, POINT)
 
 
 def test_the_alarm_is_raised_at_the_operating_point_and_the_label_at_one_half(device):
     """Whoever says 0.9 at most raises no alarm above 0.95."""
     shy = OperatingPoint(0.95, 0.02, 64, 1, 0)
-    found = margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, shy)
-    assert sum(one.said for one in found.spans[ALARM]) == 0
+    found = measure_margins(Sure(torch.zeros(200, 4, dtype=torch.bool)), device, 200, shy)
+    assert sum(one.said for one in found.spans[ALARM_NAME]) == 0
     assert sum(one.said for one in found.spans["dangerous"]) == 100
     assert (found.reached.recall, found.reached.false_alarm_rate, found.reached.safe) == (0, 0, 100)

@@ -2,13 +2,25 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, confusion_matrix
 
-from skin.evaluation.metrics import angles, calibration_error, confusion, metrics
+from skin.evaluation.metrics import (
+    calibration_error,
+    compute_metrics,
+    count_confusions,
+    decode,
+    disagreement,
+    encode,
+    measure_angles,
+    vote,
+)
 from skin.evaluation.operating_point import OperatingPoint
 from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
+
+POINT = OperatingPoint(0.7, 0.02, 64, 1, 0)
 
 
 @pytest.fixture
@@ -22,7 +34,7 @@ def scored():
 
 def test_accuracies_are_those_of_scikit_learn(scored):
     chances, labels = scored
-    found = metrics(chances, labels, TOUCH)
+    found = compute_metrics(chances, labels, TOUCH)
     for i, name in enumerate(TOUCH.names):
         said = chances[:, i] > 0.5
         assert found[f"{name}/accuracy"] == pytest.approx(accuracy_score(labels[:, i], said))
@@ -32,7 +44,7 @@ def test_accuracies_are_those_of_scikit_learn(scored):
 
 
 def test_overall_is_the_mean_of_the_labels(scored):
-    found = metrics(*scored, TOUCH)
+    found = compute_metrics(*scored, TOUCH)
     each = [found[f"{name}/accuracy"] for name in TOUCH.names]
     assert found["overall/accuracy"] == pytest.approx(sum(each) / 4)
 
@@ -40,14 +52,14 @@ def test_overall_is_the_mean_of_the_labels(scored):
 def test_calibration_error_of_a_constant_is_its_distance_from_the_share():
     labels = torch.zeros(100, 4)
     labels[:30] = 1
-    found = metrics(torch.full((100, 4), 0.9), labels, TOUCH)
+    found = compute_metrics(torch.full((100, 4), 0.9), labels, TOUCH)
     assert found["press/ece"] == pytest.approx(0.6, abs=1e-6)
     assert found["overall/ece"] == pytest.approx(0.6, abs=1e-6)
 
 
 def test_confusion_has_the_true_class_down(scored):
     chances, labels = scored
-    for i, counts in enumerate(confusion(chances, labels).numpy()):
+    for i, counts in enumerate(count_confusions(chances, labels).numpy()):
         assert (counts == confusion_matrix(labels[:, i], chances[:, i] > 0.5)).all()
 
 
@@ -55,7 +67,7 @@ def test_exclusive_labels_have_one_accuracy():
     task = Task(("poke", "stroke", "slap"), "exclusive")
     labels = torch.eye(3)[torch.tensor([0, 1, 2, 2])]
     chances = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.5, 0.3, 0.2], [0.2, 0.2, 0.6]])
-    assert metrics(chances, labels, task) == {"overall/accuracy": 0.75}
+    assert compute_metrics(chances, labels, task) == {"overall/accuracy": 0.75}
 
 
 def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
@@ -63,14 +75,14 @@ def test_a_gate_leaves_the_other_labels_to_the_touches_it_lets_through(scored):
     touched = torch.arange(400) % 3 > 0
     said = torch.where(torch.arange(400) % 4 > 0, 0.9, 0.2)
     labels = torch.cat([labels * touched[:, None], touched[:, None].float()], dim=1)
-    found = metrics(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
-    alone = metrics(chances[touched], labels[touched, :4], TOUCH)
+    found = compute_metrics(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
+    alone = compute_metrics(chances[touched], labels[touched, :4], TOUCH)
     gate = {name: value for name, value in found.items() if name.startswith("touch/")}
     assert {name: value for name, value in found.items() if name not in gate} == alone
     assert gate["touch/accuracy"] == pytest.approx(accuracy_score(touched, said > 0.5))
-    counts = confusion(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
+    counts = count_confusions(torch.cat([chances, said[:, None]], dim=1), labels, TOUCH_OR_NOT)
     assert counts.sum(dim=(1, 2)).tolist() == [int(touched.sum())] * 4 + [400]
-    assert torch.equal(counts[:4], confusion(chances[touched], labels[touched, :4]))
+    assert torch.equal(counts[:4], count_confusions(chances[touched], labels[touched, :4]))
 
 
 def test_angles_are_measured_on_touches_that_have_a_direction(scored):
@@ -79,13 +91,13 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
     slides = torch.stack([truth.cos(), truth.sin()], dim=1)
     slides[::3] = 0
     said = 0.3 * torch.stack([(truth + error).cos(), (truth + error).sin()], dim=1)
-    found = metrics(torch.cat([chances, said], 1), torch.cat([labels, slides], 1), TOUCH_SLIDING)
+    found = compute_metrics(torch.cat([chances, said], 1), torch.cat([labels, slides], 1), TOUCH_SLIDING)
     # The short way round; -3 + -4 and 3 + 4 pass behind the back.
     sizes = [min(abs(one), 2 * math.pi - abs(one)) for n, one in enumerate(error.tolist()) if n % 3]
     assert found["direction/degrees"] == pytest.approx(math.degrees(sum(sizes) / len(sizes)), rel=1e-5)
     within = sum(size <= math.pi / 4 for size in sizes) / len(sizes)
     assert found["direction/accuracy"] == pytest.approx(within)
-    alone = metrics(chances, labels, TOUCH)
+    alone = compute_metrics(chances, labels, TOUCH)
     assert {name: found[name] for name in alone} == alone
     assert len(found) == len(alone) + 2
 
@@ -93,7 +105,7 @@ def test_angles_are_measured_on_touches_that_have_a_direction(scored):
 def test_saying_no_direction_is_as_wrong_as_a_blind_guess():
     labels = torch.tensor([[1.0, 0.0]]).repeat(1, 3)[:, :6]
     said = torch.zeros(1, 6)
-    assert angles(said, labels, TOUCH_SLIDING).tolist() == [90.0]
+    assert measure_angles(said, labels, TOUCH_SLIDING).tolist() == [90.0]
 
 
 @pytest.mark.parametrize("dangerous", [0.0, 1.0])
@@ -101,7 +113,7 @@ def test_no_recall_is_made_up_where_no_gesture_is_safe_or_none_is_dangerous(scor
     chances, labels = scored
     labels = labels.clone()
     labels[:, 3] = dangerous
-    found = metrics(chances, labels, TOUCH, OperatingPoint(0.5, 0.02, 64, 1, 0))
+    found = compute_metrics(chances, labels, TOUCH, OperatingPoint(0.5, 0.02, 64, 1, 0))
     undefined, other = "false_alarm_rate", "alarm_recall"
     if not dangerous:
         undefined, other = other, undefined
@@ -128,3 +140,53 @@ def test_calibration_error_in_bins_of_equal_numbers_is_that_of_plain_python():
 def test_equal_probabilities_share_a_bin():
     label = torch.tensor([1, 0] * 50)
     assert calibration_error(torch.full((100,), 0.5), label) == pytest.approx(0, abs=1e-9)
+
+
+def test_means_over_gestures_are_the_metrics():
+    generator = torch.Generator().manual_seed(2)
+    chances = torch.rand(500, 4, generator=generator)
+    labels = (torch.rand(500, 4, generator=generator) > 0.4).float()
+    known = compute_metrics(chances, labels, TOUCH, POINT)
+    codes = encode(chances, labels, TOUCH, POINT)
+    assert codes.dtype == np.uint8
+    for metric in (
+        "overall/accuracy", "big/accuracy", "dangerous/accuracy", "dangerous/alarm_recall",
+        "dangerous/false_alarm_rate",
+    ):  # fmt: skip
+        assert np.nanmean(decode(codes, metric, TOUCH)) == pytest.approx(known[metric], abs=1e-6), metric
+    for metric in ("overall/ece", "made_up/accuracy", "dangerous/degrees"):
+        with pytest.raises(ValueError, match=metric):
+            decode(codes, metric, TOUCH)
+
+
+@pytest.mark.parametrize("task", [TOUCH_OR_NOT, TOUCH_SLIDING, Task(("a", "b", "c"), "exclusive")])
+def test_other_labels_have_no_outcomes(task):
+    assert encode(torch.rand(3, len(task)), torch.ones(3, len(task)), task) is None
+
+
+@pytest.mark.parametrize("members", [3, 5])
+def test_a_vote_is_the_outcome_of_the_answers_of_most_models(members):
+    """By the answers themselves; the alarm by the models' own alarms."""
+    generator = torch.Generator().manual_seed(members)
+    chances = torch.rand(members, 400, 4, generator=generator)
+    labels = (torch.rand(400, 4, generator=generator) > 0.4).float()
+    codes = np.stack([encode(one, labels, TOUCH, POINT) for one in chances])
+    found, answers = vote(codes), (chances > 0.5).float().mean(0)
+    known = compute_metrics(answers, labels, TOUCH)
+    for label in ("overall", *TOUCH.names):
+        assert decode(found, f"{label}/accuracy", TOUCH).mean() == pytest.approx(known[f"{label}/accuracy"])
+    alarms = (chances[..., TOUCH.names.index("dangerous")] > POINT.threshold).float().mean(0) > 0.5
+    dangerous = labels[:, TOUCH.names.index("dangerous")] > 0.5
+    recall = np.nanmean(decode(found, "dangerous/alarm_recall", TOUCH))
+    assert recall == pytest.approx(float(alarms[dangerous].float().mean()))
+    differ = ((chances > 0.5).any(0) & ~(chances > 0.5).all(0)).any(1)
+    assert disagreement(codes) == pytest.approx(float(differ.float().mean()))
+
+
+def test_a_tie_is_a_wrong_answer_and_no_alarm():
+    labels = torch.ones(2, 4)
+    right, wrong = labels.clone(), labels.clone()
+    wrong[0] = 0
+    codes = np.stack([encode(one, labels, TOUCH, POINT) for one in (right, wrong)])
+    assert decode(vote(codes), "overall/accuracy", TOUCH).tolist() == [0, 1]
+    assert decode(vote(codes), "dangerous/alarm_recall", TOUCH).tolist() == [0, 1]

@@ -10,24 +10,34 @@ import torch
 from scipy.stats import beta
 
 from skin.build import build_device
-from skin.config import Evaluation
 from skin.errors import InputError
-from skin.evaluation.alarm import Reached
-from skin.evaluation.metrics import metrics
+from skin.evaluation import operating_point
+from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import (
     OperatingPoint,
-    check_evaluation,
+    Reached,
+    Watching,
+    choose_for_touches,
     choose_operating_point,
     lowest_threshold,
     parse_operating_point,
     threshold_gestures,
+    touch_scores,
 )
 from skin.evaluation.report import evaluate
+from skin.evaluation.settings import Evaluation, check_evaluation
+from skin.hardware.live.engine import Detection, Engine
 from skin.labels import TOUCH, TOUCH_OR_NOT, Task
+from skin.rng import Stream, generator
+from skin.signal.frame import Frame
+from skin.touch.sampler import balanced
+from skin.wire.channels import UnitConversion
 
 SETTINGS = Evaluation(devices=0, layouts=0, false_alarm_rate=0.1, safe_gestures=64)
 POINT = OperatingPoint(0.25, 0.02, 2048, 40, 3)
 GESTURES = Task(("stroke", "dangerous", "slap"), "exclusive")
+SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "device.tare=true"]
+CONTACT = 0.5  # N
 
 
 class Peak:
@@ -105,7 +115,7 @@ def test_reached_rates_are_counted_and_their_range_is_exact():
     reached = POINT.reached(chances, labels, TOUCH)
     assert reached == Reached(dangerous=2, found=1, safe=4, raised=2)
     assert (reached.recall, reached.false_alarm_rate) == (0.5, 0.5)
-    found = metrics(chances, labels, TOUCH, POINT)
+    found = compute_metrics(chances, labels, TOUCH, POINT)
     assert (found["dangerous/alarm_recall"], found["dangerous/false_alarm_rate"]) == (0.5, 0.5)
     # None of ten: the upper end p has (1 - p)^10 = 0.025.
     assert Reached(0, 0, 10, 0).range == pytest.approx((0, 1 - 0.025**0.1))
@@ -113,7 +123,7 @@ def test_reached_rates_are_counted_and_their_range_is_exact():
 
 def test_accuracy_stays_that_of_one_half():
     chances, labels = torch.full((4, 4), 0.4), torch.zeros(4, 4)
-    found = metrics(chances, labels, TOUCH, POINT)
+    found = compute_metrics(chances, labels, TOUCH, POINT)
     assert found["dangerous/accuracy"] == 1
     assert found["dangerous/false_alarm_rate"] == 1
 
@@ -132,7 +142,7 @@ def test_a_shut_gate_and_an_exclusive_task_are_counted_right():
     labels = torch.tensor([[0, 0, 0, 1.0, 1], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]])
     assert POINT.reached(torch.ones(3, 5), labels, TOUCH_OR_NOT) == Reached(1, 1, 1, 1)
     chances = torch.tensor([[0.1, 0.6, 0.3], [0.7, 0.3, 0.0], [0.1, 0.1, 0.8]])
-    found = metrics(chances, torch.eye(3)[[1, 0, 2]], GESTURES, POINT)
+    found = compute_metrics(chances, torch.eye(3)[[1, 0, 2]], GESTURES, POINT)
     assert found == {
         "overall/accuracy": 1.0,
         "dangerous/alarm_recall": 1.0,
@@ -243,3 +253,105 @@ def test_what_is_no_operating_point_is_refused(text):
 def test_what_cannot_be_chosen_is_refused(change, said):
     with pytest.raises(InputError, match=said):
         check_evaluation(replace(SETTINGS, **change))
+
+
+class Largest:
+    """The probability of every label grows with the largest reading of the window."""
+
+    def probabilities(self, touches):
+        peak = touches.readings.flatten(1).amax(1)
+        return torch.sigmoid(peak - 5)[:, None].expand(-1, 4)
+
+
+@pytest.fixture(scope="module")
+def drawn(configured):
+    return build_device(configured(*SMALL, "device.randomise=true", "device.noise=0.1"))
+
+
+def watching(rate, **changes):
+    return Watching(rate, CONTACT, 2.0, **{"patience": 0.1, "column": 3, **changes})
+
+
+def engine_windows(drawn, readings, valid, ends, rate):
+    """Return the windows and contacts of the engine at the decisions of one touch (F, S)."""
+    windows, sensors = [], readings.shape[1]
+
+    def classify(values, known):
+        windows.extend(values)
+        return np.zeros((len(values), 4))
+
+    engine = Engine(classify, TOUCH, sensors, 30, 10.0, Detection(CONTACT, drift=0.0))
+    conversion = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, bool))
+    # The first decision comes at a tick of the engine.
+    times = 100.0 + (np.arange(len(readings)) - ends[0]) / rate
+    frames = [Frame(n, t, t, row, valid) for n, (t, row) in enumerate(zip(times, readings, strict=True))]
+    verdicts = engine.push(frames, conversion)
+    place = {round(verdict.t * rate): number for number, verdict in enumerate(verdicts)}
+    chosen = [place[round(times[end] * rate)] for end in ends]
+    return np.stack([windows[n] for n in chosen]), [verdicts[n].contact is not None for n in chosen]
+
+
+@pytest.mark.parametrize("rate", [20.0, 100.0, 500.0])
+def test_the_windows_are_those_that_the_engine_decides_on(drawn, rate):
+    """Independent code: frame by frame there, all touches at once here."""
+    drawn = drawn.replace(padded=False)
+    labels = balanced(16, generator(Stream.TEST, 3))
+    movie = drawn.sampler.sample(16, generator(Stream.TEST, 4), labels)
+    same = [generator(Stream.ALARM, 5) for _ in range(2)]
+    windows, valid, contact = operating_point._decision_windows(drawn, movie, watching(rate), same[0])
+    readings, _ = operating_point._measure_touches(drawn, movie, watching(rate), same[1])
+    step = max(1.0, rate / 20)
+    ends = operating_point._draw_decisions(readings.shape, round(30 * rate / 10), step, same[1])
+    longest = 0
+    for touch in range(16):
+        found, felt = engine_windows(
+            drawn, readings[touch].double().numpy(), valid[touch].numpy(), ends[touch].numpy(), rate
+        )
+        assert felt == contact[touch].tolist()
+        shown = contact[touch].numpy()
+        np.testing.assert_allclose(found[shown], windows[touch][shown].numpy(), atol=1e-5)
+        longest = max(longest, int(shown.sum()))
+    assert longest > 35  # presses of two seconds are among them
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 100.0])
+def test_the_share_of_new_safe_touches_is_the_one_that_was_asked_for(drawn, rate):
+    point = choose_for_touches(Largest(), drawn, watching(rate), 0.1, 400)
+    assert (point.safe, point.rate) == (400, None)
+    assert point.raised <= 40
+    labels = balanced(1600, generator(Stream.TEST, 8))
+    safe = labels[~labels[:, 3]]
+    share = float(point.alarm(touch_scores(Largest(), drawn, watching(rate), safe, 99)).float().mean())
+    # Both are counted: three standard deviations of 400 and 800 touches.
+    assert share == pytest.approx(0.1, abs=3 * (0.09 / 400 + 0.09 / 800) ** 0.5)
+
+
+class Onset(Largest):
+    """Looks at the change from one interval to the next."""
+
+    def probabilities(self, touches):
+        change = touches.readings[:, -1].amax(1) - touches.readings[:, -2].amax(1)
+        return torch.sigmoid(change)[:, None].expand(-1, 4)
+
+
+def test_one_decision_raises_more_alarms_than_two(drawn):
+    labels = balanced(64, generator(Stream.TEST, 8))
+    two, one = (
+        touch_scores(Onset(), drawn, watching(100.0, patience=patience), labels, 9) for patience in (0.1, 0)
+    )
+    assert (one >= two).all()
+    assert (one > two).any()
+
+
+def test_a_slow_device_needs_one_decision():
+    assert [watching(1).decisions(rate) for rate in (5.0, 10.0, 20.0, 100.0, 500.0)] == [1, 1, 2, 2, 2]
+
+
+def test_a_device_of_the_model_gives_its_frames(drawn):
+    """The simulator sends the frames of the model; a real one of that rate reads at any phase."""
+    labels = balanced(64, generator(Stream.TEST, 8))
+    aligned, real = (
+        touch_scores(Largest(), drawn, watching(10.0, aligned=aligned), labels, 9)
+        for aligned in (True, False)
+    )
+    assert aligned.mean() > real.mean()

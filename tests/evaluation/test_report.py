@@ -8,13 +8,12 @@ import torch
 from rich.console import Console
 
 from skin.build import build_device
-from skin.config import Evaluation
 from skin.errors import InputError
-from skin.evaluation.metrics_table import print_report as show
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.report import columns, evaluate
+from skin.evaluation.report import evaluate, evaluation_markdown, touch_sets
+from skin.evaluation.report import print_report as show
+from skin.evaluation.settings import Evaluation
 from skin.labels import TOUCH
-from skin.plot.evaluation_page import evaluation_markdown
 
 SETTINGS = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
@@ -73,7 +72,7 @@ def test_unseen_layouts_lean_as_the_known_one_does(configured):
     scattered = "layout=scattered", "layout.rows=3", "layout.columns=4", "device.test_gestures=16"
     known = build_device(configured(*solid, *scattered, "layout.tilt=0.5"))
     settings = replace(SETTINGS, layouts=1)
-    (unseen,) = columns(known, settings)["unseen_layout"]
+    (unseen,) = touch_sets(known, settings)["unseen_layout"]
     for tilt, same in ((0.5, True), (0.0, False)):
         other = configured(*solid, *scattered, f"layout.tilt={tilt}", "layout.seed=101")
         touches = build_device(other).touches("test")

@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from skin.datamodule import TouchData
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation.metrics import metrics
+from skin.evaluation.metrics import compute_metrics
 from skin.labels import TOUCH_SLIDING
 from skin.learner.rules import Rules
 from skin.recording import Touches
@@ -156,7 +156,7 @@ def test_a_direction_is_learnt_or_refused_by_name(made, configured, tmp_path):
     touches = device.touches("test")
     result = learner.probabilities(touches)
     assert result.shape == (80, 6)
-    found = metrics(result, touches.labels, device.task)
+    found = compute_metrics(result, touches.labels, device.task)
     assert found["direction/degrees"] < 30
     assert found["direction/accuracy"] > 0.8
     other = made[0]()

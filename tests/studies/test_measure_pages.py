@@ -8,9 +8,8 @@ from PIL import Image
 
 from experiments.studies.measure_pages import streams_page, streams_summary
 from experiments.studies.tables import publish_page
-from skin.evaluation.alarm import Alarms
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.sliding_windows import Bin, WindowReport
+from skin.evaluation.streams import Alarms, Bin, WindowReport
 
 NAMES = ("big", "dynamic", "press", "dangerous")
 FOUND = WindowReport(

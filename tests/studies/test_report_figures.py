@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from experiments.studies.report_figures import confusion_rows
-from skin.evaluation.outcomes import encode
+from skin.evaluation.metrics import encode
 from skin.labels import TOUCH
 
 

@@ -13,10 +13,9 @@ from skin.class_balance import accuracy_from_shape, check_label_leakage
 from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
 from skin.layout.grid import Grid
-from skin.touch._bodies import Fit, draw_bodies
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import TouchSampler
-from skin.touch.shapes import Shapes
+from skin.touch.shapes import Fit, Shapes, draw_bodies
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 DEFAULT = Sheet((0.16, 0.16), (32, 32), LAYER)

@@ -1,22 +1,39 @@
-"""Fit the constants of a simulated device to a bench session."""
+"""Fit the constants of a simulated device to a bench session, and test them on held-out presses."""
 
-from collections.abc import Collection
+import warnings
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.table import Table
 
 from skin.errors import InputError
-from skin.hardware.calibration import _channel
-from skin.hardware.calibration._channel import Idle
-from skin.hardware.calibration.bench_data import BenchData
-from skin.hardware.calibration.responses import collect_responses, find_polarity
+from skin.hardware.calibration.channels import (
+    Idle,
+    collect_responses,
+    find_polarity,
+    find_quantum,
+    fit_clip_and_gain,
+    fit_decay,
+    measure_idle,
+)
+from skin.hardware.calibration.presses import BenchData
 from skin.sensor_dynamics import first_order_lag, running_peak
-from skin.signal.calibration import Calibration
+from skin.signal.calibration import QUANTITIES, Calibration
+from skin.signal.imperfection import Imperfection
 
 _PRESSED = 0.05  # of the largest true reading: less determines no gain
-_SURE = 6.0  # standard errors above 0: less is no answer either
+_SURE = 6.0  # standard errors: a slope of noise alone exceeds them in 2 of 1e9 channels
 _LIMIT = 0.95  # of the largest reading of all: a channel that is always there is saturated
+_RESPONDING = 0.05  # of the press's strongest reading: sensors that count
+_LOADED = 0.2  # of a press's peak: frames in which its force is estimated
+_CLIPPED = 0.95  # of the limit: a reading above may be cut off
+_TOO_FAR = 0.25  # error of a held-out force; positions off by 2 mm cause less
+_WEAK = 0.05  # of the median gain: such a channel has 20 times the noise of others
+_UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 
 @dataclass
@@ -49,19 +66,19 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     Raises:
         InputError: no channel responds to a press.
     """
-    used = bench.of(range(len(bench.gauge)) if presses is None else presses)
-    channels = [_at_rest(bench, number) for number in range(bench.each.shape[1])]
-    _respond(bench, channels)
+    used = bench.frames_of(range(len(bench.gauge)) if presses is None else presses)
+    channels = [_measure_rest(bench, number) for number in range(bench.each.shape[1])]
+    _mark_silent(bench, channels)
     driven = np.where(used[:, None], bench.true, 0.0)
     pressed = driven.max(axis=0) >= _PRESSED * driven.max()
     answering = [int(n) for n in np.flatnonzero(pressed) if channels[n].broken is None]
     for number in answering:
-        channels[number].time_constant = _time_constant(bench, used, number, channels[number])
-    lagged, bends = _regressors(
+        channels[number].time_constant = _fit_time_constant(bench, used, number, channels[number])
+    lagged, bends = _simulate_lag(
         bench.true, [channel.time_constant for channel in channels], bench.session.time
     )
     for number in answering:
-        _answer(bench, used, number, channels[number], lagged[:, number], bends[:, number])
+        _fit_branches(bench, used, number, channels[number], lagged[:, number], bends[:, number])
     gains = [gain for n in answering if (gain := channels[n].gain)]
     typical = float(np.median(gains)) if gains else 0.0
     if not gains:
@@ -69,32 +86,32 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
             "no channel responds to a press below its limit: check layout, indenter, the forces and the "
             "session's clock"
         )
-    return _calibration(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
+    return _convert_to_newton(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
 
 
-def _at_rest(bench: BenchData, number: int) -> _Channel:
+def _measure_rest(bench: BenchData, number: int) -> _Channel:
     """Return the idle statistics of a channel; one that never changes is broken."""
     raw = bench.session.raw
     measured = raw[:, number]
-    there = np.isfinite(measured)
-    if not there.any():
+    present = np.isfinite(measured)
+    if not present.any():
         return _Channel(Idle(0.0, 0.0, 0.0), 0.0, broken="dead")
-    if np.ptp(measured[there]) == 0:
-        level = float(measured[there][0])
+    if np.ptp(measured[present]) == 0:
+        level = float(measured[present][0])
         full = 2**bench.session.bits - 1 if bench.session.bits else np.inf
         limit = level >= min(full, _LIMIT * float(np.nanmax(raw))) > 0
         kind = "dead" if level == 0 else "saturated" if limit else "stuck"
         return _Channel(Idle(level, 0.0, 0.0), 0.0, broken=kind)
-    step = _channel.quantum(measured[there])
-    quiet = there & bench.idle
+    step = find_quantum(measured[present])
+    quiet = present & bench.idle
     if quiet.sum() < 10:
         raise InputError(
             f"channel {number} has {quiet.sum()} idle frames: do not touch the skin for some seconds"
         )
-    return _Channel(_channel.idle(bench.session.time[quiet], measured[quiet], step), step)
+    return _Channel(measure_idle(bench.session.time[quiet], measured[quiet], step), step)
 
 
-def _respond(bench: BenchData, channels: list[_Channel]) -> None:
+def _mark_silent(bench: BenchData, channels: list[_Channel]) -> None:
     """Set the polarity of every channel; one that is silent in the whole session is dead."""
     responses = collect_responses(bench)
     polarity = find_polarity(responses, bench.each)
@@ -105,30 +122,32 @@ def _respond(bench: BenchData, channels: list[_Channel]) -> None:
             channel.broken = "dead"
 
 
-def _rest_taken(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
+def _subtract_rest(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
     """Return the change of a channel against its rest, (T,), in the session's unit, above 0 under force."""
     rest = channel.idle.offset + channel.idle.drift * bench.session.time
     return channel.polarity * (bench.session.raw[:, number] - rest)
 
 
-def _time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
+def _fit_time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
     """Return the weighted mean over releases of presses that reach the channel, s."""
-    measured, time = _rest_taken(bench, number, channel), bench.session.time
+    measured, time = _subtract_rest(bench, number, channel), bench.session.time
     # Clipped readings contain no information on the lag.
     most = 0.8 * np.nanmax(measured)
-    found = []
+    decays = []
     for release in bench.releases:
         if not used[release.start - 2] and not used[release.start - 1]:
             continue
         values = measured[release]
         start = int(np.argmax(values < most)) if len(values) and (values < most).any() else 0
         floor = max(8 * channel.idle.noise, 3 * channel.quantum, 1e-9)
-        found.append(_channel.decay(time[release][start:], np.nan_to_num(values[start:]), floor))
-    weight = sum(one for _, one in found)
-    return sum(value * one for value, one in found) / weight if weight else 0.0
+        decays.append(fit_decay(time[release][start:], np.nan_to_num(values[start:]), floor))
+    weight = sum(share for _, share in decays)
+    return sum(value * share for value, share in decays) / weight if weight else 0.0
 
 
-def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _simulate_lag(
+    true: np.ndarray, constants: list[float], time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return lagged true readings, and the effect of a hysteresis of 1 on them, each (T, S), N."""
     force = torch.from_numpy(true)[None]
     peak = running_peak(force)
@@ -139,35 +158,35 @@ def _regressors(true: np.ndarray, constants: list[float], time: np.ndarray) -> t
     return both[:, : true.shape[1]], both[:, true.shape[1] :]
 
 
-def _answer(
+def _fit_branches(
     bench: BenchData, used: np.ndarray, number: int, channel: _Channel, lagged: np.ndarray, bend: np.ndarray
 ) -> None:
     """Fit gain and clip on the loading branch, hysteresis on the unloading branch."""
-    measured = _rest_taken(bench, number, channel)
+    measured = _subtract_rest(bench, number, channel)
     true = np.where(used, bench.true[:, number], 0.0)
     # In a solid, every press reaches every sensor a little; such readings are noise.
-    there = np.isfinite(measured) & (true > _PRESSED * true.max())
-    up = there & bench.loading & (lagged > 0)
+    pressed = np.isfinite(measured) & (true > _PRESSED * true.max())
+    up = pressed & bench.loading & (lagged > 0)
     if up.sum() < 10:
         return
-    gain, channel.error, channel.clip = _channel.clip_and_gain(lagged[up], measured[up], channel.idle.noise)
+    gain, channel.error, channel.clip = fit_clip_and_gain(lagged[up], measured[up], channel.idle.noise)
     if np.isnan(gain):  # every reading is at the limit
         return
     # A slope within its error may be noise.
     channel.gain = gain if gain > _SURE * channel.error else None
     limit = np.inf if channel.clip is None else 0.9 * channel.clip
     # A gap no larger than the noise is not used.
-    down = there & bench.unloading & (measured < limit) & (bend > 0.05 * lagged.max())
+    down = pressed & bench.unloading & (measured < limit) & (bend > 0.05 * lagged.max())
     if down.sum() < 10 or not channel.gain:
         return
-    rest, lever = measured[down] - gain * lagged[down], gain * bend[down]
-    keep = np.abs(rest - np.median(rest)) <= 6 * np.median(np.abs(rest - np.median(rest)))
-    share = float((rest[keep] * lever[keep]).sum() / (lever[keep] ** 2).sum())
-    error = float(np.std(rest[keep] - share * lever[keep]) / np.sqrt((lever[keep] ** 2).sum()))
+    bent, lever = measured[down] - gain * lagged[down], gain * bend[down]
+    keep = np.abs(bent - np.median(bent)) <= 6 * np.median(np.abs(bent - np.median(bent)))
+    share = float((bent[keep] * lever[keep]).sum() / (lever[keep] ** 2).sum())
+    error = float(np.std(bent[keep] - share * lever[keep]) / np.sqrt((lever[keep] ** 2).sum()))
     channel.hysteresis = share if share > 2 * error else 0.0
 
 
-def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Calibration:
+def _convert_to_newton(bench: BenchData, channels: list[_Channel], scale: float) -> Calibration:
     """Convert channels to N, and compute ranges over the working ones."""
     alive = [channel.broken is None for channel in channels]
     # Counts have an unknown zero, common to all channels; readings in N do not.
@@ -182,33 +201,199 @@ def _calibration(bench: BenchData, channels: list[_Channel], scale: float) -> Ca
         "gain": [channel.gain for channel in channels],
     }
     sensors: dict[str, list[float | None]] = {
-        name: [_six(value, scale) for value in values] for name, values in in_newton.items()
+        name: [_round(value, scale) for value in values] for name, values in in_newton.items()
     }
-    sensors["hysteresis"] = [_six(channel.hysteresis) for channel in channels]
-    sensors["time_constant"] = [_six(channel.time_constant if channel.gain else None) for channel in channels]
+    sensors["hysteresis"] = [_round(channel.hysteresis) for channel in channels]
+    sensors["time_constant"] = [
+        _round(channel.time_constant if channel.gain else None) for channel in channels
+    ]
     for name in ("gain", "clip", "hysteresis", "time_constant"):
-        sensors[name] = [one if live else None for one, live in zip(sensors[name], alive, strict=True)]
+        sensors[name] = [value if live else None for value, live in zip(sensors[name], alive, strict=True)]
     broken = {
         kind: [n for n, channel in enumerate(channels) if channel.broken == kind]
         for kind in ("dead", "stuck", "saturated")
     }
-    ranges = _ranges(sensors, alive)
+    ranges = _find_ranges(sensors, alive)
     error = 2 * scale * float(np.median([channel.error for channel in channels if channel.gain]))
     ranges["gain"] = [max(ranges["gain"][0] - error, 0.0), ranges["gain"][1] + error]
     about = {"unit": bench.session.unit, "presses": len(bench.gauge), "frames": len(bench.session.time)}
     polarity = [int(channel.polarity) for channel in channels]
-    known = polarity if min(polarity) < 0 else ()
-    return Calibration(sensors, broken, ranges, scale, zero, about, polarity=known)
+    signs = polarity if min(polarity) < 0 else ()
+    return Calibration(sensors, broken, ranges, scale, zero, about, polarity=signs)
 
 
-def _six(value: float | None, scale: float = 1.0) -> float | None:
+def _round(value: float | None, scale: float = 1.0) -> float | None:
     return None if value is None else float(f"{value * scale:.6g}") + 0.0  # no negative 0
 
 
-def _ranges(sensors: dict[str, list[float | None]], alive: list[bool]) -> dict[str, list[float]]:
+def _find_ranges(sensors: dict[str, list[float | None]], alive: list[bool]) -> dict[str, list[float]]:
     """Return the least and the largest of every quantity among sensors that live, and how many do not."""
     ranges: dict[str, list[float]] = {"dead": [0, alive.count(False)]}
     for name, values in sensors.items():
-        known = [one for one, live in zip(values, alive, strict=True) if live and one is not None]
-        ranges |= {name: [min(known), max(known)]} if known else {}
+        working = [value for value, live in zip(values, alive, strict=True) if live and value is not None]
+        ranges |= {name: [min(working), max(working)]} if working else {}
     return ranges
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Errors on presses that were not used for the calibration.
+
+    Attributes:
+        simulated: RMSE of the simulated true readings (gain 1, no offset), N.
+        tared: RMSE with each sensor's offset added, N.
+        calibrated: RMSE of the calibrated simulation, N.
+        held_out: numbers of these presses.
+        force: ratio of estimated force to the gauge's, median over the loading of each held-out press, (n,);
+            empty if no sensor could be used.
+    """
+
+    simulated: float
+    tared: float
+    calibrated: float
+    held_out: Sequence[int]
+    force: np.ndarray
+
+    @property
+    def helps(self) -> bool:
+        """Whether the calibrated simulation has a smaller error than taring alone."""
+        return self.calibrated < min(self.simulated, self.tared)
+
+
+def hold_out(bench: BenchData, share: float) -> list[int]:
+    """Return the held-out presses: a share of all, each with an earlier press at the same strongest sensor.
+
+    Raises:
+        InputError: no sensor has two presses.
+    """
+    strongest = bench.each.argmax(axis=1)
+    spare = [n for n in range(len(strongest)) if (strongest[:n] == strongest[n]).any()]
+    if not spare:
+        raise InputError("no press can be held out: press near every sensor at least twice")
+    count = min(len(spare), max(1, round(share * len(strongest))))
+    return [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
+
+
+def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
+    """Calibrate without some presses, and compare their simulation with the measured readings.
+
+    Args:
+        bench: the session.
+        share: of the presses that is held out.
+    """
+    held = hold_out(bench, share)
+    calibration = fit_calibration(bench, [n for n in range(len(bench.gauge)) if n not in held])
+    answers = bench.each[bench.applied[1]]
+    responding = answers > _RESPONDING * answers.max(axis=1, keepdims=True)
+    alive = ~calibration.values()["dead"] & np.isfinite(bench.session.raw)
+    counted = bench.frames_of(held)[:, None] & responding & alive
+    measured, true = calibration.newtons(bench.session.raw), bench.true
+
+    def rmse(guess: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((guess[counted] - measured[counted]) ** 2)))
+
+    offset = calibration.values()["offset"]
+    return HeldOutErrors(
+        rmse(true),
+        rmse(true + offset),
+        rmse(predict_session(bench, calibration)),
+        held,
+        _estimate_forces(bench, held, calibration),
+    )
+
+
+def predict_session(bench: BenchData, calibration: Calibration) -> np.ndarray:
+    """Return the simulated readings of a calibrated device without noise, (T, S), N."""
+    imperfection = Imperfection(calibration=calibration)
+    randomness = np.random.default_rng(0)
+    constants = imperfection.constants(bench.each.shape[1], randomness)
+    constants = constants._replace(noise=torch.zeros(()))
+    time = torch.from_numpy(bench.session.time).float()
+    true = torch.from_numpy(bench.true)[None].float()
+    return imperfection.raw(true, constants, randomness, time)[0].double().numpy()
+
+
+def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """Estimate the force of a press from readings, (...), N, by least squares over usable sensors.
+
+    Args:
+        raw: (..., S), in the session's unit.
+        each: (S,), true readings per N of that indenter at that place, as
+            :func:`skin.hardware.calibration.bench.per_newton` gives them.
+        calibration: of this skin.
+
+    Returns:
+        NaN if every sensor that responds to the press is broken or at its limit.
+    """
+    true, values = calibration.corrected(raw), calibration.values()
+    below = calibration.newtons(raw) - values["offset"] < _CLIPPED * values["clip"]
+    weights = np.where(below & np.isfinite(true) & (each > _RESPONDING * each.max()), each, 0.0)
+    square = (weights**2).sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (weights * np.nan_to_num(true)).sum(axis=-1) / np.where(square > 0, square, np.nan)
+
+
+def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Calibration) -> np.ndarray:
+    """Return the ratio of estimated force to the lagged force of the gauge, of each press."""
+    force, press = bench.applied
+    lag = torch.tensor([float(np.median(calibration.known("time_constant")))]).double()
+    late = first_order_lag(torch.from_numpy(force)[None, :, None], lag, torch.from_numpy(bench.session.time))
+    late_force = late[0, :, 0].numpy()
+    per_second = calibration.signs * calibration.known("drift") / calibration.scale
+    drift = per_second * bench.session.time[:, None]
+    raw, shares = bench.session.raw - drift, []
+    for number in presses:
+        mine = bench.loading & (press == number)
+        mine &= force > _LOADED * force[press == number].max()
+        shares.append(estimate_force(raw[mine], bench.each[number], calibration) / late_force[mine])
+    finite = [ratios[np.isfinite(ratios)] for ratios in shares]
+    return np.array([np.median(ratios) for ratios in finite if len(ratios)])
+
+
+def summarise_held_out(outcome: HeldOutErrors) -> dict[str, Any]:
+    """Return the rounded errors on held-out presses, for the calibration file."""
+    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
+    return {"held_out": list(outcome.held_out), "rmse": rmse}
+
+
+def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
+    """Print the constants of working sensors, the broken, inverse and weak ones, and held-out errors."""
+    table = Table("", "median", "least", "largest", "", box=None, pad_edge=False)
+    for name in QUANTITIES:
+        values = [value for value in calibration.sensors[name] if value is not None]
+        if values and name in calibration.ranges:
+            low, high = calibration.ranges[name]
+            middle = f"{np.median(values):.4g}"
+            table.add_row(name, middle, f"{low:.4g}", f"{high:.4g}", _UNITS.get(name, "N"))
+    Console().print(table)
+    for kind, numbers in calibration.broken.items():
+        if numbers:
+            print(f"{kind}: sensors {', '.join(map(str, numbers))} (from 0)")
+    if len(inverse := np.flatnonzero(calibration.signs < 0)):
+        print(f"inverse, values fall with force: sensors {', '.join(map(str, inverse))}")
+    gains = [gain for gain in calibration.sensors["gain"] if gain is not None]
+    weak = [n for n, gain in enumerate(calibration.sensors["gain"]) if _is_weak(gain, gains)]
+    if weak:
+        print(f"weak, less than {_WEAK:.0%} of the median gain: sensors {', '.join(map(str, weak))}")
+    broken = {number for group in calibration.broken.values() for number in group}
+    unknown = [n for n, gain in enumerate(calibration.sensors["gain"]) if gain is None and n not in broken]
+    if unknown:
+        print(f"not pressed, or at the limit, so of median gain: sensors {', '.join(map(str, unknown))}")
+    print(
+        f"RMSE on {len(outcome.held_out)} held-out presses: simulated {outcome.simulated:.4f} N, with tare "
+        f"{outcome.tared:.4f} N, calibrated {outcome.calibrated:.4f} N"
+    )
+    if len(outcome.force):
+        off = np.abs(outcome.force - 1)
+        print(f"force of these presses from readings: off by {np.median(off):.1%}, at most {off.max():.1%}")
+        if off.max() > _TOO_FAR:
+            warnings.warn(
+                f"the force of a held-out press is off by {off.max():.0%}: sensors are probably not where "
+                "the layout says, and then their gains are wrong; measure their positions",
+                UserWarning,
+                stacklevel=2,
+            )
+
+
+def _is_weak(gain: float | None, gains: list[float]) -> bool:
+    return gain is not None and gain < _WEAK * float(np.median(gains))

@@ -6,25 +6,57 @@ it would be if the places of the presses were mirrored or turned, or the channel
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_data import BenchData, build_bench_data
-from skin.hardware.calibration.bench_session import BenchSession
-from skin.hardware.calibration.gauge import Gauge, per_newton
-from skin.hardware.calibration.places import TURNS, WORDS, Turn, composed, inside, turn_gauge
-from skin.hardware.calibration.responses import (
+from skin.hardware.calibration.bench import BenchSession, Gauge, per_newton
+from skin.hardware.calibration.channels import (
     Match,
     Responses,
     collect_responses,
     match_channels,
 )
+from skin.hardware.calibration.presses import BenchData, build_bench_data
 from skin.settings import checked
 from skin.signal.calibration import Calibration
 
+Turn = Literal[
+    "as_given",
+    "mirror_x",
+    "mirror_y",
+    "rotate_180",
+    "transpose",
+    "rotate_90",
+    "rotate_270",
+    "transpose_other",
+]
+TURNS: tuple[Turn, ...] = get_args(Turn)
+"""What ``calibrate.places`` takes, the simplest first."""
+WORDS: dict[Turn, str] = {
+    "as_given": "as given",
+    "mirror_x": "mirrored in x (the x axis counts to the left)",
+    "mirror_y": "mirrored in y (the y axis counts upwards)",
+    "rotate_180": "turned by 180 degrees (both axes count backwards)",
+    "transpose": "transposed (x and y are exchanged)",
+    "rotate_90": "turned by 90 degrees",
+    "rotate_270": "turned by 270 degrees",
+    "transpose_other": "mirrored at the other diagonal (x and y are exchanged, and both count backwards)",
+}
+_MATRICES: dict[Turn, tuple[tuple[int, int], tuple[int, int]]] = {
+    "as_given": ((1, 0), (0, 1)),
+    "mirror_x": ((-1, 0), (0, 1)),
+    "mirror_y": ((1, 0), (0, -1)),
+    "rotate_180": ((-1, 0), (0, -1)),
+    "transpose": ((0, 1), (1, 0)),
+    "rotate_90": ((0, -1), (1, 0)),
+    "rotate_270": ((0, 1), (-1, 0)),
+    "transpose_other": ((0, -1), (-1, 0)),
+}
+"""From the direction in the gauge's frame to that on the sheet, x right and y down."""
 _PLAIN = 0.05  # residual: channels that are explained at least as well need no turn to be tried
 _FITS = 0.45  # residual: sensors misplaced by 5 mm leave 0.25, another sensor 0.6 and more
 _WELL = 0.15  # residual: a channel that is called exchanged has to fit its new place at least as well
@@ -33,6 +65,33 @@ _MOST = 0.25  # share of the responding channels that an explanation may leave, 
 _PRESSED = 0.2  # of the largest prediction: a sensor with less was not pressed, so it identifies no channel
 _LISTED = 12  # channels in a message
 _FEWEST = 3  # channels that a turn must explain, because two exchanged channels look like a mirrored axis
+
+
+def turn_gauge(gauge: Gauge, turn: Turn, size: Sequence[float]) -> Gauge:
+    """Return a gauge with its places and angles in the frame of the sheet.
+
+    Args:
+        gauge: with places in a frame of other axes.
+        turn: from this frame to that of the sheet.
+        size: of the sheet, x and y, m.
+    """
+    matrix = np.array(_MATRICES[turn], dtype=float)
+    middle = np.array(size) / 2
+    centred = gauge.place - np.abs(matrix).T @ middle
+    direction = matrix @ np.stack([np.cos(gauge.angle), np.sin(gauge.angle)])
+    angle = gauge.angle if turn == "as_given" else np.arctan2(direction[1], direction[0])
+    return replace(gauge, place=centred @ matrix.T + middle, angle=angle)
+
+
+def lies_on_sheet(gauge: Gauge, size: Sequence[float]) -> bool:
+    """Return whether all places of a gauge are on a sheet of this size, x and y, m."""
+    return bool((gauge.place >= 0).all() and (gauge.place <= np.array(size)).all())
+
+
+def compose_turns(first: Turn, then: Turn) -> Turn:
+    """Return the turn that is the same as one turn after another."""
+    product = np.array(_MATRICES[then]) @ np.array(_MATRICES[first])
+    return next(turn for turn in TURNS if (np.array(_MATRICES[turn]) == product).all())
 
 
 @checked("calibrate")
@@ -114,23 +173,23 @@ def wired_bench(
     """
     rows = session.gauge if rows is None else rows
     if session.raw.shape[1] == len(device.sensors):
-        session = replace(session, raw=_confirmed_raw(session.raw, confirmed))
+        session = replace(session, raw=_order_channels(session.raw, confirmed))
     if rows is None:
         return build_bench_data(device, session, rows)
     gauge = turn_gauge(rows, confirmed.places, device.size)
     turned = {turn: turn_gauge(gauge, turn, device.size) for turn in TURNS}
-    allowed = {turn: places for turn, places in turned.items() if inside(places, device.size)}
+    allowed = {turn: places for turn, places in turned.items() if lies_on_sheet(places, device.size)}
     # Where no turn brings all places onto the sheet, they are refused here.
     bench = build_bench_data(device, session, next(iter(allowed.values()), gauge))
     responses = collect_responses(bench)
-    own, best = _compared(device, bench, responses, allowed)
-    clear = [each for each in best if _concluded(each, own, responses.responding)]
+    own, best = _compare_turns(device, bench, responses, allowed)
+    clear = [each for each in best if _is_conclusive(each, own, responses.responding)]
     if own is not None and not len(own.unexplained) and (not clear or any(each is own for each in best)):
         return bench
-    raise InputError(_refusal(own, best[0], clear, confirmed, responses.responding))
+    raise InputError(_phrase_refusal(own, best[0], clear, confirmed, responses.responding))
 
 
-def _confirmed_raw(raw: np.ndarray, confirmed: Confirmed) -> np.ndarray:
+def _order_channels(raw: np.ndarray, confirmed: Confirmed) -> np.ndarray:
     """Return raw values in the order of the sensors; broken ones are NaN."""
     sensors = raw.shape[1]
     channels = confirmed.order(sensors)
@@ -143,7 +202,7 @@ def _confirmed_raw(raw: np.ndarray, confirmed: Confirmed) -> np.ndarray:
     return ordered
 
 
-def _compared(
+def _compare_turns(
     device: AbstractSimulated, bench: BenchData, responses: Responses, allowed: Mapping[Turn, Gauge]
 ) -> tuple[_Explanation | None, list[_Explanation]]:
     """Return the explanation by the layout as it is, and those about as good as the best, simplest first.
@@ -153,7 +212,7 @@ def _compared(
     explanations = list[_Explanation]()
     for turn, gauge in allowed.items():
         each = bench.each if gauge is bench.gauge else per_newton(device.model, device.body, gauge)
-        straight, permuted = _explanations(match_channels(responses, each), responses.responding, turn)
+        straight, permuted = _explain(match_channels(responses, each), responses.responding, turn)
         plain = straight.residual.max(initial=0.0) < _PLAIN and not straight.clearly_worse(permuted)
         if turn == "as_given" and plain:
             return straight, [straight]
@@ -164,14 +223,14 @@ def _compared(
     return own, sorted(good, key=lambda each: each.parts)
 
 
-def _explanations(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explanation, _Explanation]:
+def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explanation, _Explanation]:
     """Return the explanation that leaves channels at their sensors, and the one that permutes them best."""
     channels = np.arange(len(responding))
     cost = np.where(responding[:, None], match.residual, 0.5)
     # Among equal places a channel stays at its own.
     _, sensors = linear_sum_assignment(cost - 1e-6 * np.eye(len(cost)))
     settled = responding & (cost[channels, sensors] <= _FITS)
-    sensors = _left_in_place(sensors, settled)
+    sensors = _keep_unsettled(sensors, settled)
     own, there = (np.where(responding, cost[channels, place], 0.0) for place in (channels, sensors))
     factor, least = _CLEARER
     moved = np.flatnonzero(settled & (sensors != channels))
@@ -185,7 +244,7 @@ def _explanations(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Ex
     return _Explanation(turn, channels, own), _Explanation(turn, sensors, there, all(seconds))
 
 
-def _left_in_place(sensors: np.ndarray, settled: np.ndarray) -> np.ndarray:
+def _keep_unsettled(sensors: np.ndarray, settled: np.ndarray) -> np.ndarray:
     """Return an assignment whose unsettled channels stay at their own sensors, where these are free."""
     sensors = np.where(settled, sensors, -1)
     for channel in np.flatnonzero(~settled):
@@ -194,7 +253,7 @@ def _left_in_place(sensors: np.ndarray, settled: np.ndarray) -> np.ndarray:
     return sensors
 
 
-def _refusal(
+def _phrase_refusal(
     own: _Explanation | None,
     best: _Explanation,
     clear: Sequence[_Explanation],
@@ -212,19 +271,19 @@ def _refusal(
         noun, verb, place = ("channels", "respond", "their sensors") if len(wrong) > 1 else (
             "channel", "responds", "its sensor"
         )  # fmt: skip
-        trouble = f"{noun} {listed(sorted(order[wrong]))} {verb}, but not to the presses near {place}"
+        trouble = f"{noun} {list_numbers(sorted(order[wrong]))} {verb}, but not to the presses near {place}"
     if not clear:
-        return f"{trouble}: {_advice(wrong, order, responding)}"
-    sentences = [f"{trouble}: the session fits if {_words(clear[0], confirmed, order)}"]
+        return f"{trouble}: {_phrase_advice(wrong, order, responding)}"
+    sentences = [f"{trouble}: the session fits if {_phrase_explanation(clear[0], confirmed, order)}"]
     # A turn that is made up for by another order says nothing new.
     others = [each for each in clear[1:] if each.turn == "as_given" or not len(each.moved)]
-    sentences += [f"it fits as well if {_words(each, confirmed, order)}" for each in others[:2]]
+    sentences += [f"it fits as well if {_phrase_explanation(each, confirmed, order)}" for each in others[:2]]
     if len(left := clear[0].unexplained):
-        sentences.append(f"channel {listed(sorted(order[left]))} fits nowhere: check the wiring")
+        sentences.append(f"channel {list_numbers(sorted(order[left]))} fits nowhere: check the wiring")
     return ". ".join(text[0].upper() * bool(n) + text[bool(n) :] for n, text in enumerate(sentences))
 
 
-def _concluded(each: _Explanation, own: _Explanation | None, responding: np.ndarray) -> bool:
+def _is_conclusive(each: _Explanation, own: _Explanation | None, responding: np.ndarray) -> bool:
     """Return whether an explanation is sure and explains enough to be named."""
     if not each.parts or not each.sure or len(each.unexplained) > _MOST * responding.sum():
         return False
@@ -237,7 +296,7 @@ def _concluded(each: _Explanation, own: _Explanation | None, responding: np.ndar
     return int((own.residual > _CLEARER[0] * each.residual + _CLEARER[1]).sum()) >= _FEWEST
 
 
-def _advice(wrong: np.ndarray, order: np.ndarray, responding: np.ndarray) -> str:
+def _phrase_advice(wrong: np.ndarray, order: np.ndarray, responding: np.ndarray) -> str:
     """Return what to check where no order of channels and no turn of the places explains a session."""
     if 2 * len(wrong) > responding.sum():
         return (
@@ -251,16 +310,16 @@ def _advice(wrong: np.ndarray, order: np.ndarray, responding: np.ndarray) -> str
     )
 
 
-def _words(each: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:
+def _phrase_explanation(each: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:
     """Return an explanation in words, with its settings."""
     words, settings = list[str](), list[str]()
     if each.turn != "as_given":
         words.append(f"the places of the presses are {WORDS[each.turn]}")
-        settings.append(f"calibrate.places={composed(confirmed.places, each.turn)}")
+        settings.append(f"calibrate.places={compose_turns(confirmed.places, each.turn)}")
     if len(each.moved):
         moved = sorted(order[each.moved])
         verb = "exchanged" if len(moved) == 2 else "in another order"
-        words.append(f"channels {listed(moved)} are {verb}")
+        words.append(f"channels {list_numbers(moved)} are {verb}")
         channels = ",".join(str(channel) for channel in order[np.argsort(each.sensors)])
         settings.append(f"'calibrate.channels=[{channels}]'")
     return f"{' and '.join(words)}; to confirm that, add {' '.join(settings)}"
@@ -279,14 +338,14 @@ def check_usable(calibration: Calibration) -> None:
     count = len({number for numbers in kinds.values() for number in numbers})
     if count <= _MOST * len(calibration):
         return
-    words = "; ".join(f"{kind}: {listed(numbers)}" for kind, numbers in kinds.items())
+    words = "; ".join(f"{kind}: {list_numbers(numbers)}" for kind, numbers in kinds.items())
     raise InputError(
         f"{count} of {len(calibration)} sensors would be unusable ({words}), and at most a quarter may be: "
         "press near every sensor, check the supply and the cables of these channels, and record again"
     )
 
 
-def listed(numbers: Sequence[int] | np.ndarray) -> str:
+def list_numbers(numbers: Sequence[int] | np.ndarray) -> str:
     """Return numbers in words, as ``2``, ``2 and 5`` or ``2, 5 and 7``; of many, the first ones."""
     words = [str(number) for number in numbers]
     if len(words) > _LISTED:

@@ -36,7 +36,7 @@ class Converter:
     """Converts N to counts.
 
     The middle of the converter is at 0 N and its ends are at twice the clip, as in
-    skin.hardware.calibration.protocol.
+    skin.hardware.calibration.presses.
 
     Attributes:
         bits: of the converter; None: N are sent.

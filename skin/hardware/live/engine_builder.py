@@ -11,7 +11,7 @@ from torch import Tensor
 from skin import __version__
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation.report import Predictor
+from skin.evaluation.operating_point import Predictor
 from skin.exported.metadata import ModelMetadata
 from skin.hardware.live.engine import Classify, DebounceSettings, Detection, Engine, EngineSettings
 from skin.hardware.wired import AbstractWired

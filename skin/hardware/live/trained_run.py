@@ -18,9 +18,8 @@ from skin.build import build_device
 from skin.config import plain
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.evaluation import operating_point, touch_alarm
-from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.touch_alarm import Watching, choose_for_touches
+from skin.evaluation import operating_point
+from skin.evaluation.operating_point import LABEL, OperatingPoint, Watching, choose_for_touches
 from skin.hardware.live import engine_builder
 from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.watched import Watched, measured_rate, used_settings
@@ -35,7 +34,7 @@ from skin.trained import Trained, load_trained, threshold_device
 
 _EXPECTED = 20.0  # s
 _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
-_SOURCES = (touch_alarm, operating_point, decisions, device_sampling, imperfection)
+_SOURCES = (operating_point, decisions, device_sampling, imperfection)
 
 
 def watch_run(
@@ -147,7 +146,7 @@ def choose_threshold(
     calibration = read_calibration(path) if path and settings.profile is None else None
     if calibration is not None:
         device = device.replace(**imperfections_of(calibration), randomise=True, calibration=None)
-    target, count = settings.false_alarm_rate, min(settings.safe_gestures, touch_alarm.SAFE)
+    target, count = settings.false_alarm_rate, min(settings.safe_gestures, operating_point.SAFE_TOUCHES)
     content = _content(run, stored, watched, watching, device) | {"target": target, "count": count}
     key = array_cache.hashed(content, [Path(str(module.__file__)) for module in _SOURCES])
 

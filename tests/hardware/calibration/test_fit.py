@@ -7,12 +7,14 @@ import torch
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_data import BenchData, build_bench_data
-from skin.hardware.calibration.calibration_report import print_calibration
-from skin.hardware.calibration.fit import fit_calibration
-from skin.hardware.calibration.gauge import Gauge, per_newton
-from skin.hardware.calibration.held_out import estimate_force, evaluate_held_out
-from skin.hardware.calibration.protocol import Protocol, emulate_session
+from skin.hardware.calibration.bench import Gauge, per_newton
+from skin.hardware.calibration.fit import (
+    estimate_force,
+    evaluate_held_out,
+    fit_calibration,
+    print_calibration,
+)
+from skin.hardware.calibration.presses import BenchData, Protocol, build_bench_data, emulate_session
 from skin.layout.grid import Grid
 from skin.signal.calibration import Calibration, write_calibration
 from skin.signal.imperfection import Imperfection

@@ -9,13 +9,18 @@ import pytest
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench_data import BenchData
-from skin.hardware.calibration.bench_session import BenchSession
+from skin.hardware.calibration.bench import BenchSession, Gauge
 from skin.hardware.calibration.fit import fit_calibration
-from skin.hardware.calibration.gauge import Gauge
-from skin.hardware.calibration.places import TURNS, composed, inside, turn_gauge
-from skin.hardware.calibration.protocol import Protocol, emulate_session
-from skin.hardware.calibration.wiring import Confirmed, check_usable, wired_bench
+from skin.hardware.calibration.presses import BenchData, Protocol, emulate_session
+from skin.hardware.calibration.wiring import (
+    TURNS,
+    Confirmed,
+    check_usable,
+    compose_turns,
+    lies_on_sheet,
+    turn_gauge,
+    wired_bench,
+)
 from skin.layout.file import File
 from skin.layout.grid import Grid
 from skin.signal.calibration import Calibration
@@ -96,10 +101,10 @@ def test_turns_come_back_and_compose(turn):
     back = turn_gauge(in_frame(gauge, turn, size), turn, size)
     np.testing.assert_allclose(back.place, gauge.place, atol=1e-12)
     np.testing.assert_allclose(np.cos(back.angle), np.cos(gauge.angle), atol=1e-12)
-    assert composed(BACK.get(turn, turn), turn) == composed("as_given", "as_given") == "as_given"
-    assert composed("as_given", turn) == composed(turn, "as_given") == turn
-    assert composed("mirror_x", "mirror_y") == "rotate_180"
-    assert inside(gauge, size)
+    assert compose_turns(BACK.get(turn, turn), turn) == compose_turns("as_given", "as_given") == "as_given"
+    assert compose_turns("as_given", turn) == compose_turns(turn, "as_given") == turn
+    assert compose_turns("mirror_x", "mirror_y") == "rotate_180"
+    assert lies_on_sheet(gauge, size)
 
 
 @pytest.mark.parametrize("name", SKINS)

@@ -138,10 +138,10 @@ def test_another_layout_is_refused(tmp_path):
 
 
 def test_calibration_reads_it_too(tmp_path):
-    from skin.hardware.calibration import bench_session
+    from skin.hardware.calibration import bench
 
     recorded(tmp_path / "x.csv", 0, 1).close()
-    found = bench_session.read_bench_session(tmp_path / "x.csv", "disc", 0.01)
+    found = bench.read_bench_session(tmp_path / "x.csv", "disc", 0.01)
     assert (found.raw.shape, found.unit) == ((40, 2), "adc")
 
 

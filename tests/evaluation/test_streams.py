@@ -1,15 +1,17 @@
 """A learner that knows the answer, and one that never does, on windows of streams."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
+from scipy.stats import poisson
 
 from skin.build import build_device
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.evaluation.sliding_windows import bins, evaluate_windows
-from skin.evaluation.stream_settings import StreamSettings
+from skin.evaluation.settings import StreamSettings
+from skin.evaluation.streams import Alarms, bin_by_share, count_alarms, evaluate_windows
 from skin.labels import TOUCH, TOUCH_OR_NOT
 
 COURSE = StreamSettings(hours=0.05, gap=[2.0, 10.0], stride=0.3, windows=(2.0, 6.0))
@@ -134,7 +136,7 @@ def test_bins_by_hand():
     share = torch.tensor([0.0, 0.2, 0.25, 1.0, 1.0])
     labels = torch.tensor([[0, 0, 0, 0, 0], *[[1, 0, 1, 0, 1]] * 3, [0, 0, 1, 1, 1]]).float()
     chances = torch.tensor([[0.9, 0.9, 0.1, 0.1]] * 5)
-    found = bins(chances, labels, share, TOUCH)
+    found = bin_by_share(chances, labels, share, TOUCH)
     assert [(one.name, one.count) for one in found] == [("0-0.2", 1), ("0.2-0.4", 1), ("whole", 2)]
     assert found[2].accuracy == {"big": 0.5, "dynamic": 0.0, "press": 0.0, "dangerous": 0.5}
     assert found[2].majority == {"big": 0.5, "dynamic": 1.0, "press": 1.0, "dangerous": 0.5}
@@ -149,3 +151,43 @@ def test_devices_without_streams_are_refused(made_up_device):
 def test_courses_that_lead_nowhere(wrong):
     with pytest.raises(InputError, match=r"measure\."):
         StreamSettings(**wrong)
+
+
+def count(alarm, gesture, dangerous=(True, False, True, True)):
+    said = torch.tensor([one == "!" for one in alarm])
+    shown = torch.tensor([int(one) if one.isdigit() else -1 for one in gesture])
+    return count_alarms(said, shown, torch.tensor(dangerous), 0.5)
+
+
+def test_an_alarm_that_lasts_is_one_and_one_that_outlasts_its_touch_is_false():
+    found = count("!!..!.!!!!..!", "...........2.")
+    assert (found.false, found.idle_hours) == (4, 6.0)
+    found = count(".!!!!..", ".000...")
+    assert (found.false, found.found) == (1, 1)
+    assert count(".!!!...", ".000...").false == 0
+
+
+def test_touches_that_raised_an_alarm():
+    found = count("..!..!.......", ".000.111.222.")
+    assert (found.dangerous, found.found, found.safe, found.raised) == (2, 1, 1, 1)
+    assert found.false == 0
+
+
+def test_touches_that_no_window_shows_are_not_counted():
+    found = count("....", "....")
+    assert (found.dangerous, found.safe, found.false) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("false", [0, 1, 7, 40])
+def test_the_range_holds_the_rates_under_which_the_count_is_no_surprise(false):
+    found = Alarms(2.0, false, 0, 0, 0, 0)
+    low, high = found.range
+    assert found.per_hour == false / 2
+    assert poisson.cdf(false, high * 2) == pytest.approx(0.025)
+    assert low == 0 if not false else poisson.sf(false - 1, low * 2) == pytest.approx(0.025)
+
+
+def test_without_idle_time_there_is_no_rate():
+    found = count("!!", "00")
+    assert math.isnan(found.per_hour)
+    assert math.isnan(found.range[1])

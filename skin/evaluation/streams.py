@@ -7,21 +7,79 @@ from statistics import fmean
 from typing import Any
 
 import torch
+from scipy.stats import chi2
 from torch import Tensor
 from torchmetrics.functional.classification import binary_confusion_matrix
 
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
-from skin.evaluation.alarm import Alarms, count_alarms
-from skin.evaluation.metrics import metrics
-from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.evaluation.report import Predictor
-from skin.evaluation.stream_settings import StreamSettings
+from skin.evaluation.metrics import compute_metrics
+from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor
+from skin.evaluation.settings import StreamSettings
 from skin.labels import TOUCH_OR_NOT, Task
 from skin.signal.contact_threshold import ContactThreshold, Gate, gates, rise
 
 _CHUNK = 1024
 _EDGES = (0.2, 0.4, 0.6, 0.8)
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """The alarms on sliding windows over a stream.
+
+    Attributes:
+        idle_hours: time in which the window showed no touch.
+        false: alarms that began in that time; consecutive alarms count once.
+        dangerous: number of dangerous touches.
+        found: those that raised an alarm while the window showed them.
+        safe: number of safe touches.
+        raised: those that raised an alarm.
+    """
+
+    idle_hours: float
+    false: int
+    dangerous: int
+    found: int
+    safe: int
+    raised: int
+
+    @property
+    def per_hour(self) -> float:
+        """False alarms per hour without touch."""
+        return self.false / self.idle_hours if self.idle_hours else float("nan")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """95 % confidence interval of the rate per hour, exact for independent events (Garwood, 1936)."""
+        if not self.idle_hours:
+            return float("nan"), float("nan")
+        low = chi2.ppf(0.025, 2 * self.false) / 2 if self.false else 0.0
+        return float(low) / self.idle_hours, float(chi2.ppf(0.975, 2 * self.false + 2)) / 2 / self.idle_hours
+
+
+def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float) -> Alarms:
+    """Return the alarms of W consecutive windows.
+
+    Args:
+        alarm: (W,), bool.
+        gesture: (W,), the touch in each window, as an index into ``dangerous``; -1: none.
+        dangerous: (G,), bool, of each touch.
+        hours: time from one window to the next.
+    """
+    idle = gesture < 0
+    wrong = alarm & idle
+    began = wrong & ~torch.cat([torch.zeros(1, dtype=torch.bool), wrong[:-1]])
+    shown, raised = torch.zeros(2, len(dangerous), dtype=torch.bool)
+    shown[gesture[~idle]] = True
+    raised[gesture[alarm & ~idle]] = True
+    return Alarms(
+        idle_hours=float(idle.sum()) * hours,
+        false=int(began.sum()),
+        dangerous=int((shown & dangerous).sum()),
+        found=int((raised & dangerous).sum()),
+        safe=int((shown & ~dangerous).sum()),
+        raised=int((raised & ~dangerous).sum()),
+    )
 
 
 @dataclass(frozen=True)
@@ -121,7 +179,7 @@ def evaluate_windows(
     chances = learner.probabilities(touches)
     said = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
     return WindowReport(
-        bins(chances, labels, recording.parameters["share"], device.task),
+        bin_by_share(chances, labels, recording.parameters["share"], device.task),
         {name: binary_confusion_matrix(answer.long(), labels[:, -1].long()) for name, answer in said.items()},
         threshold.least,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
@@ -139,7 +197,7 @@ def _tuned(device: AbstractSimulated) -> ContactThreshold:
     return ContactThreshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
 
 
-def bins(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:
+def bin_by_share(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:
     """Return accuracies by the share of the touch in the window, for windows that show a touch.
 
     Args:
@@ -216,7 +274,7 @@ def _length(learner: Predictor, device: AbstractSimulated, window: float) -> flo
         press = settings.press[0], min(settings.press[1], window)
         other = device.replace(touch=replace(settings, window=window, press=press)).touches("test")
         assert other.labels is not None
-        found = metrics(learner.probabilities(other), other.labels, device.task)
+        found = compute_metrics(learner.probabilities(other), other.labels, device.task)
     except InputError as reason:
         return str(reason)
     return found["overall/accuracy"]

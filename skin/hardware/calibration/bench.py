@@ -1,0 +1,359 @@
+"""Files of a bench: raw readings at the device's own rate, and the force gauge's rows."""
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import torch
+from annotated_types import Ge, Le
+
+from skin.body._memory import require_memory
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+from skin.files import tabular, whole, write
+from skin.settings import checked
+from skin.simulator.base import AbstractSimulator
+from skin.touch.shapes import Shapes
+
+_KEY = b"skin_session"
+_RECORDED = b"time,seq,raw_"  # of skin record: all its columns are numbers
+_NUMBERS = b"0123456789+-.e,"
+_log = logging.getLogger("skin.hardware.record")
+GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
+"""Columns besides ``time``; the first three are required."""
+_PAUSE = 1.0  # s without a row end a press
+_OTHER = ("time", "t_us", "seq", *GAUGE)
+
+
+def load_table(path: str | Path, what: str) -> tuple[pa.Table, dict[str, Any]]:
+    """Return a table and its metadata: JSON in the Parquet schema, or in ``x.csv.json`` beside a CSV.
+
+    Lines of a CSV that start with ``#`` are comments. Damaged lines of a session of skin record are
+    skipped, with a warning.
+
+    Raises:
+        InputError: no such file, another ending, unreadable, or no rows.
+    """
+    path = tabular(path, f"a {what}")
+    if not path.is_file():
+        raise InputError(f"no {what} {path}")
+    try:
+        if path.suffix == ".parquet":
+            with pa.parquet.ParquetFile(path) as file:
+                size = 16.0 * file.metadata.num_rows * file.metadata.num_columns
+                require_memory(size, f"the {what} {path}", "give fewer rows")
+                table = file.read()
+            about = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
+        else:
+            table = pa.csv.read_csv(pa.py_buffer(_rows(path)))
+            sidecar = path.with_name(path.name + ".json")
+            about = json.loads(sidecar.read_text(encoding="utf-8")) if sidecar.is_file() else {}
+        if not isinstance(about, dict):
+            raise ValueError(f"its metadata are {about!r}, and must be an object, as in {{}}")
+        if not len(table):
+            raise ValueError("it has no rows below its header")
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, RecursionError) as error:
+        raise InputError(f"cannot read the {what} {path}: {' '.join(str(error).split())}") from error
+    return table.rename_columns([name.strip() for name in table.column_names]), about
+
+
+def _rows(path: Path) -> bytes:
+    """Return a CSV without comments and, for sessions of skin record, without damaged lines."""
+    lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
+    rows = [(number, line) for number, line in enumerate(lines, 1) if not line.startswith(b"#")]
+    header = rows[0][1] if rows else b""
+    if header.startswith(_RECORDED):
+        columns = header.count(b",")
+        good = [
+            row for row in rows[1:] if not row[1].translate(None, _NUMBERS) and row[1].count(b",") == columns
+        ]
+        if damaged := [number for number, _ in sorted(set(rows[1:]) - set(good))]:
+            _log.warning("%s: %d damaged lines skipped, the first is line %d", path, len(damaged), damaged[0])
+        rows = [rows[0], *good]
+    return b"".join(line + b"\n" for _, line in rows)
+
+
+def save_table(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
+    """Write a table and its metadata atomically, in the format of :func:`load_table`.
+
+    Raises:
+        InputError: another ending, or the file cannot be written.
+    """
+    path, table = tabular(path, "a session"), pa.table(dict(columns))
+    with whole(path) as partial:
+        if path.suffix == ".parquet":
+            pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
+        else:
+            pa.csv.write_csv(table, partial)
+            write(json.dumps(dict(about)) + "\n", path.with_name(path.name + ".json"))
+    return path
+
+
+def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
+    """Return a column as float64; empty cells are NaN.
+
+    Raises:
+        InputError: the column is missing or is not numeric.
+    """
+    try:
+        # A copy, because Arrow's memory cannot be written to and torch warns of that.
+        return np.array(table[name].cast(pa.float64()).to_numpy())
+    except (KeyError, pa.ArrowException) as error:
+        found = ", ".join(table.column_names)
+        raise InputError(f"{where}: the column {name} must hold numbers, found {found}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Rows of a force gauge, in order of time; one press after the other.
+
+    Attributes:
+        time: (N,), s, by the clock of the session.
+        force: (N,), N.
+        place: (N, 2), m: centre of the indenter, x right and y down from the upper left corner.
+        radius: (N,), m: half the larger extent of the indenter.
+        angle: (N,), rad: rotation from x towards y.
+        indenter: (N,), names as in ``touch.shapes``.
+        press: (N,): number of the press.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    place: np.ndarray
+    radius: np.ndarray
+    angle: np.ndarray
+    indenter: np.ndarray
+    press: np.ndarray
+
+    def __len__(self) -> int:
+        return int(self.press.max()) + 1
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """The first row of every press, (P,)."""
+        return np.searchsorted(self.press, np.arange(len(self)))
+
+    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return force, (T,), N, and number of the press, (T,), -1 outside of presses, at times (T,), s."""
+        row = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 1)
+        after = np.minimum(row + 1, len(self.time) - 1)
+        press = np.where(self.press[row] == self.press[after], self.press[row], -1)
+        press = np.where(time == self.time[row], self.press[row], press)
+        press[(time < self.time[0]) | (time > self.time[-1])] = -1
+        return np.where(press >= 0, np.interp(time, self.time, self.force), 0.0), press
+
+
+def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+    """Read a gauge file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
+
+    Args:
+        path: .csv or .parquet.
+        indenter: of a file without this column.
+        radius: m, of a file without this column.
+        delay: s, added to the times of the file to match the session's.
+
+    Raises:
+        InputError: the file is invalid.
+    """
+    table, _ = load_table(path, "gauge file")
+    return gauge_from_table(table, str(path), indenter, radius, delay)
+
+
+def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+    """Return a gauge from the complete rows of a table; see :func:`read_gauge`."""
+    columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
+    for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
+        present = name in table.column_names
+        columns[name] = numbers(table, name, where) if present else np.full(len(table), spare)
+    names = (
+        table["indenter"].fill_null("").to_numpy(zero_copy_only=False)
+        if "indenter" in table.column_names
+        else np.full(len(table), indenter, dtype=object)
+    )
+    rows = np.isfinite(np.stack(list(columns.values()))).all(axis=0)
+    if not rows.any():
+        raise InputError(f"{where}: no row has a time, a force and a place")
+    complete = {name: values[rows] for name, values in columns.items()}
+    time, force = complete["time"] + delay, complete["force"]
+    if (np.diff(time) <= 0).any():
+        raise InputError(f"{where}: time must grow from row to row, in s")
+    if force.min() < -0.05 * force.max():
+        raise InputError(f"{where}: force must be at least 0 N, got {force.min():g}: zero the gauge")
+    place = np.stack([complete["x_m"], complete["y_m"]], axis=1)
+    same = np.column_stack([place, complete["radius_m"], complete["angle"], complete["press"]])
+    new = (np.diff(same, axis=0) != 0).any(axis=1) | (names[rows][1:] != names[rows][:-1])
+    press = np.concatenate([[0], np.cumsum(new | (np.diff(time) > _PAUSE))])
+    return Gauge(
+        time,
+        np.maximum(force, 0),
+        place,
+        complete["radius_m"],
+        complete["angle"],
+        names[rows].astype(str),
+        press,
+    )
+
+
+def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -> np.ndarray:
+    """Return the true readings of every sensor per N of each press, (P, S).
+
+    Simulators are positively homogeneous, so one frame of 1 N determines a press of any force.
+
+    Raises:
+        InputError: a place outside the sheet, a radius that is not above 0, or an unknown indenter.
+    """
+    rows = gauge.first
+    place, radius, angle = gauge.place[rows], gauge.radius[rows], gauge.angle[rows]
+    if (place < 0).any() or (place > body.size).any():
+        wrong = place[((place < 0) | (place > body.size)).any(axis=1)][0]
+        raise InputError(
+            f"a press at {wrong.tolist()} m is outside the sheet of {list(body.size)} m: x_m and y_m are "
+            "metres from its upper left corner"
+        )
+    if not (radius > 0).all():
+        raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
+    return (
+        torch.cat(_press_once(simulator, body, gauge.indenter[rows], place, radius, angle)).double().numpy()
+    )
+
+
+@torch.no_grad()
+def _press_once(
+    simulator: AbstractSimulator,
+    body: AbstractBody,
+    indenter: Sequence[str] | np.ndarray,
+    place: np.ndarray,
+    radius: np.ndarray,
+    angle: np.ndarray,
+) -> list[torch.Tensor]:
+    names = sorted(set(indenter))
+    shapes = Shapes(names, body)
+    kind = np.array([names.index(name) for name in indenter])
+    # The image has a black border, so its outline is smaller than its texture.
+    reach = np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
+    scale = radius / reach[kind]
+    area = float(np.prod(body.cell))
+    rows = (slice(n, n + 1) for n in range(len(kind)))
+    return [simulator(shapes.render(kind[n], angle[n], scale[n], place[n]) / area).readings for n in rows]
+
+
+@checked("session")
+@dataclass(frozen=True)
+class BenchSession:
+    """Raw readings of a skin, and the force gauge during the same time.
+
+    Attributes:
+        time: (T,), s.
+        raw: (T, S), in ``unit``; NaN where a frame was lost.
+        unit: ``N``, or ``adc`` for counts of a converter.
+        gauge: rows of the force gauge in the same file; None if they are in another file.
+        bits: of the converter; None if unknown.
+        channels: the device's channel of every column, where skin record has put them into the order of the
+            layout; None: columns are in the device's order.
+
+    Raises:
+        InputError: another unit, or times that do not increase.
+    """
+
+    time: np.ndarray
+    raw: np.ndarray
+    unit: Literal["N", "adc"]
+    gauge: Gauge | None = None
+    bits: Annotated[int, Ge(1), Le(64)] | None = None
+    channels: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.time) < 2:
+            raise InputError(f"a session needs at least two frames, this one has {len(self.time)}")
+        if (self.time == self.time[0]).all():
+            raise InputError(
+                f"the device's clock stood still: all {len(self.time)} frames of the session have the time "
+                f"{self.time[0]:g} s; let it send micros() and record again"
+            )
+        if (back := np.flatnonzero(~(np.diff(self.time) > 0))).size:
+            before, after = self.time[back[0] : back[0] + 2]
+            raise InputError(
+                f"the session's time must grow from frame to frame: after frame {back[0]} it goes from "
+                f"{before:.9g} to {after:.9g} s"
+            )
+
+
+def read_bench_session(
+    path: str | Path, indenter: str, radius: float, unit: str | None = None
+) -> BenchSession:
+    """Read a session.
+
+    The file has a column ``time`` (s) or ``t_us`` (microseconds) and one per sensor in the layout's order, of
+    any name; ``seq`` is ignored. Columns of a gauge may stand beside them, empty outside the presses. Unit
+    and bits may stand in the Parquet schema or in ``x.csv.json``: ``{"unit": "adc", "bits": 10}``.
+
+    Args:
+        path: .csv or .parquet.
+        indenter: of gauge rows without one.
+        radius: m, of gauge rows without one.
+        unit: ``N`` or ``adc``; None: the unit in the file, else N.
+
+    Raises:
+        InputError: the file is invalid.
+    """
+    table, about = load_table(path, "session")
+    names = [name for name in table.column_names if name not in _OTHER]
+    if not names:
+        raise InputError(f"{path}: no column of a sensor beside {', '.join(table.column_names)}")
+    in_microseconds = "time" not in table.column_names and "t_us" in table.column_names
+    time = numbers(table, "t_us" if in_microseconds else "time", str(path))
+    time = 1e-6 * time if in_microseconds else time
+    raw = np.stack([numbers(table, name, str(path)) for name in names], axis=1)
+    inside = "force" in table.column_names
+    if inside and in_microseconds:
+        table = table.append_column("time", [time])
+    rows = gauge_from_table(table, str(path), indenter, radius) if inside else None
+    try:
+        known: Any = unit or about.get("unit", "N")
+        return BenchSession(time, raw, known, rows, about.get("bits"), about.get("channels"))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write_bench_session(session: BenchSession, path: str | Path) -> Path:
+    """Write a session with its gauge atomically; readings have single precision.
+
+    Raises:
+        InputError: another ending than .csv or .parquet, or the file cannot be written.
+    """
+    digits = max(2, len(str(session.raw.shape[1] - 1)))
+    columns = {"time": session.time}
+    counts = session.unit == "adc" and np.isfinite(session.raw).all()
+    for number, values in enumerate(session.raw.T):
+        columns[f"raw_{number:0{digits}d}"] = values.astype(np.int32 if counts else np.float32)
+    about = {"unit": session.unit, "bits": session.bits}
+    return save_table(columns | _gauge_columns(session), about, path)
+
+
+def _gauge_columns(session: BenchSession) -> dict[str, np.ndarray]:
+    """Return the gauge's columns at the session's times, masked outside of presses."""
+    if session.gauge is None:
+        return {}
+    gauge = session.gauge
+    force, press = gauge.at(session.time)
+    row = gauge.first[np.maximum(press, 0)]
+    columns = {
+        "force": force,
+        "x_m": gauge.place[row, 0],
+        "y_m": gauge.place[row, 1],
+        "indenter": gauge.indenter[row],
+        "radius_m": gauge.radius[row],
+        "angle": gauge.angle[row],
+        "press": press,
+    }
+    return {name: np.ma.masked_array(values, press < 0) for name, values in columns.items()}

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from skin.adaptation_target import Target, choose_gestures, find_target
+from skin.alarm_threshold import alarm_point
 from skin.build import build_data, build_learner
 from skin.config import plain
 from skin.device.base import AbstractDevice
@@ -16,13 +17,13 @@ from skin.evaluation.metrics_table import metrics_table
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.evaluation.report import evaluate
 from skin.fine_tuning import Adaptation, FineTuning, fine_tune
+from skin.finished_run import TAG, FinishedRun
 from skin.learner.base import AbstractLearner
 from skin.progress import Steps
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_learner, log_report, tags
 from skin.settings import configured
 from skin.source import note_reuse
-from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
 ADAPTED = "adapted"
@@ -60,33 +61,28 @@ def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
     settings = configured(FineTuning, plain(config)["adapt"], "adapt")
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
-    store = Store.existing(config.tracking)
-    parent = find_run(store, config.run)
-    stored = load_configuration(store, parent, config.trust)
-    target = find_target(parent, stored, config, settings, overrides)
-    identity = tags(target.config) | {ADAPTED: parent.info.run_id, "target": " ".join(overrides)}
+    parent = FinishedRun.named(config)
+    store = parent.store
+    target = find_target(parent, config, settings, overrides)
+    identity = tags(target.config) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
     done = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
     if done:
         note_reuse(done[0])
         print(f"run {done[0].info.run_id} did this before: tracking.resume=false repeats it")
         return
     learner, data = build_learner(target.config), build_data(target.config, target.device.blank())
-    load_learner(store, parent, learner, data)
+    parent.load_weights(learner, data)
     network = learner.network  # refuses another learner before gestures are read from a port
     steps.begin("reading or simulating the gestures")
     steps.silent = target.device.wired is not None
     touches, others = choose_gestures(target.device, settings)
     steps.silent = False
     steps.begin("choosing the threshold of the alarm")
-    # The threshold of a run of drawn skins holds for all of them together.
-    if "skins" in stored.device or target.config.evaluation.profile is not None:
-        point = choose_operating_point(learner, target.twin, target.config.evaluation)
-    else:
-        point = load_operating_point(parent, learner, stored, target.config.evaluation)
+    point = alarm_point(parent, learner, target.config, one_skin=True, device=target.twin)
     values = {} if others is None else _before(learner, others, point)
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
     store = Store.open(config.tracking)
-    with store.run(name, identity, parent.info.run_id) as run:
+    with store.run(name, identity, parent.identity) as run:
         describe(store, run.info.run_id, target.config, touches_hash(touches))
         steps.begin("fine-tuning")
         found = fine_tune(network, data, touches, settings)
@@ -150,7 +146,7 @@ def _log_trials(store: Store, run: Run, found: Adaptation) -> None:
     store.client.set_tag(run.info.run_id, "chosen", found.choice)
 
 
-def _sentence(found: Adaptation, parent: Run, others: AbstractDevice | None) -> str:
+def _sentence(found: Adaptation, parent: FinishedRun, others: AbstractDevice | None) -> str:
     """Return what was done, and which gestures the figures are for."""
     about = "validation: the gestures to adapt on, each predicted by a network that was not trained on it"
     about += "" if others is None else "; before, same: other gestures of the skin"
@@ -158,5 +154,5 @@ def _sentence(found: Adaptation, parent: Run, others: AbstractDevice | None) -> 
         return f"{about}\nfine-tuned: {found.choice}"
     return (
         f"{about}\nfine-tuning is not better on held-out gestures: the new run keeps the weights of run "
-        f"{parent.info.run_id}"
+        f"{parent.identity}"
     )

@@ -5,19 +5,19 @@ from dataclasses import asdict, dataclass
 
 import torch
 from hydra import compose
-from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 
+from skin.alarm_threshold import threshold_device
 from skin.build import build_device
 from skin.config import plain, validate_config
 from skin.device._blank import Blank
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.fine_tuning import LEAST, FineTuning
+from skin.finished_run import FinishedRun
 from skin.recording import Touches
 from skin.rng import Stream, generator
 from skin.run_overrides import apply_overrides
-from skin.trained import threshold_device
 
 _DEFAULT = 48  # gestures of a simulated device
 _OWN = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run
@@ -40,13 +40,12 @@ class Target:
 
 
 def find_target(
-    parent: Run, stored: DictConfig, config: DictConfig, settings: FineTuning, overrides: Sequence[str]
+    parent: FinishedRun, config: DictConfig, settings: FineTuning, overrides: Sequence[str]
 ) -> Target:
     """Return the skin that a command describes.
 
     Args:
         parent: the run to adapt.
-        stored: its configuration, as :func:`skin.stored_run.load_configuration` gives it.
         config: of the command.
         settings: of the fine-tuning.
         overrides: of the command line.
@@ -54,6 +53,7 @@ def find_target(
     Raises:
         InputError: no skin is given, or its gestures have other labels than the run.
     """
+    stored = parent.stored
     given = [one for one in overrides if _group(one) not in _OWN]
     there = apply_overrides(stored, config, given)
     # The device of the run, on this skin: its fresh gestures determine the threshold of the alarm.
@@ -67,7 +67,7 @@ def find_target(
     _check(parent, device, twin)
     content = plain(nominal if device.simulation is None else there)
     content["adapt"] = asdict(settings) | {
-        "run": parent.data.tags["fingerprint"],
+        "run": parent.run.data.tags["fingerprint"],
         "device": plain(there)["device"],
     }
     if device.simulation is not None:
@@ -89,16 +89,16 @@ def _twin(nominal: DictConfig, config: DictConfig) -> AbstractDevice:
     return threshold_device(nominal, asked)
 
 
-def _check(parent: Run, device: AbstractDevice, twin: AbstractDevice) -> None:
+def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) -> None:
     """Raise InputError if a device is not one skin, or has other labels than the run."""
     if device.simulation is None and device.reference is not None:
         raise InputError(
-            f"run {parent.info.run_id} was trained on many skins: name the one to adapt to, as in "
+            f"run {parent.identity} was trained on many skins: name the one to adapt to, as in "
             "device=recording device.path=session.parquet or device=simulated layout.path=sensors.csv"
         )
     if device.task != twin.task:
         raise InputError(
-            f"run {parent.info.run_id} predicts {', '.join(twin.task.names)}, the gestures have the labels "
+            f"run {parent.identity} predicts {', '.join(twin.task.names)}, the gestures have the labels "
             f"{', '.join(device.task.names)}: give gestures with the labels of the run"
         )
 

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
+from skin.alarm_threshold import threshold_device
 from skin.build import build_data, build_device, build_learner
 from skin.claim import claim, refuse_twice
 from skin.class_balance import report_balance
@@ -32,6 +33,7 @@ from skin.evaluation.operating_point import check_evaluation, choose_operating_p
 from skin.evaluation.outcomes import OUTCOMES
 from skin.evaluation.report import Report, evaluate
 from skin.fingerprint import MACHINE
+from skin.finished_run import TAG
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.option import option_name
@@ -39,9 +41,7 @@ from skin.plot.figures import confusions, save_figure
 from skin.run_logger import RunLogger
 from skin.settings import import_target
 from skin.source import note_reuse
-from skin.stored_run import TAG
 from skin.tracking import Store
-from skin.trained import threshold_device
 from skin.unfinished import find_unfinished, unfinished_folder
 
 _log = logging.getLogger(__name__)
@@ -119,7 +119,7 @@ def _limit_threads(number: int | None) -> None:
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
-    """Log what a learner has learned, for :func:`skin.stored_run.load_learner`."""
+    """Log what a learner has learned, for :meth:`skin.finished_run.FinishedRun.load_weights`."""
     with tempfile.TemporaryDirectory() as folder:
         path = learner.save(Path(folder))
         store.client.log_artifact(run.info.run_id, str(path))
@@ -219,7 +219,7 @@ def _holds(value: Any, name: str) -> bool:
 def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
     """Log an evaluation, with its predictions and confusion matrices, and further values.
 
-    The operating point is stored as the tag ``TAG``; :func:`skin.stored_run.load_operating_point` reads it.
+    The operating point is stored as the tag ``TAG``; :attr:`skin.finished_run.FinishedRun.point` reads it.
     """
     point = report.point
     if point is not None:

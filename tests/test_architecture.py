@@ -26,11 +26,10 @@ device fusion
 classifier class_balance
 datamodule
 learner
-evaluation build unfinished claim run_logger pretrained
-stored_run run_overrides skin_settings model_card fine_tuning
-trained
-adaptation_target
-exported
+evaluation build unfinished claim run_logger run_overrides trained_model
+finished_run exported fine_tuning
+alarm_threshold model_folder
+model_of_run adaptation_target
 hardware
 plot
 design

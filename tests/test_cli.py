@@ -13,7 +13,7 @@ from skin.paths import ROOT
 
 VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
 OTHERS = ["bench", "results", "study", "table", "validate"]
-NEW = ["adapt", "demo", "design", "export", "publish"]  # never were scripts
+NEW = ["adapt", "design", "export"]  # never were scripts
 MOVED = ["animate", "calibrate", "compare", "emulate", "listen"]
 HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
 
@@ -34,10 +34,10 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     main([verb, "--help"])
     text = capsys.readouterr().out
     assert f"skin {verb}" in text
-    trained = ("adapt", "compare", "demo", "evaluate", "export", "live", "train")
+    trained = ("adapt", "compare", "evaluate", "export", "live", "train")
     assert ("fusion" in text) == (verb in trained)
-    assert ("[serial]" in text) == (verb in ("demo", "listen", "record"))
-    assert ("[simulated]" in text) == (verb not in ("demo", "listen", "publish", "record"))
+    assert ("[serial]" in text) == (verb in ("listen", "record"))
+    assert ("[simulated]" in text) == (verb not in ("listen", "record"))
     assert "hydra" not in text
 
 

@@ -14,8 +14,8 @@ from experiments.benchmarks.harness import training_config
 from skin.build import build_data, build_device, build_learner
 from skin.device.base import AbstractSimulated
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.engine_builder import window_classifier
 from skin.learner.network import Network
+from skin.model_of_run import window_classifier
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion
 
@@ -74,22 +74,17 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Engine]:
 
 
 def _trained(run: str, uri: str | None) -> tuple[AbstractSimulated, Engine]:
-    from skin.hardware.live import engine_builder
+    from skin.finished_run import find_run
+    from skin.hardware.live.engine_builder import engine_settings
     from skin.hardware.live.verdict import DebounceSettings
-    from skin.run_overrides import apply_overrides
-    from skin.stored_run import find_run
-    from skin.stored_run import load_configuration as stored
+    from skin.model_of_run import load_model
     from skin.tracking import Store
-    from skin.trained import load_trained
 
     config = training_config(*([f"tracking.uri={uri}"] if uri else []))
-    store = Store.open(config.tracking)
-    found = find_run(store, run)
-    known = stored(store, found)
-    of = load_trained(store, found, apply_overrides(known, config, []), known)
-    return of.device.simulated("the stream is simulated"), engine_builder.make_engine(
-        of, DebounceSettings(), _TOUCH
-    )
+    found = find_run(Store.open(config.tracking), run)
+    of = load_model(found, found.configured(config, []))
+    device = of.device.simulated("the stream is simulated")
+    return device, engine_settings(of, DebounceSettings(), _TOUCH).build()
 
 
 def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:

@@ -24,10 +24,9 @@ from skin.device.base import AbstractSimulated
 from skin.exported.model import ExportedModel
 from skin.exported.writer import write_model
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.engine_builder import describe
 from skin.learner.network import Network
+from skin.model_of_run import RunModel
 from skin.paths import ROOT
-from skin.trained import Trained
 from skin.wire.text import Header, encode_header, encode_line
 
 _TOUCH = 0.3  # N
@@ -67,9 +66,8 @@ def _untrained(config: DictConfig, device: AbstractSimulated, path: Path) -> Pat
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    known = data.touches("train")
-    of = Trained(device, learner, device.window, known.positions, device.model_rate)
-    write_model(learner.pipeline(of.positions), describe(of, "none", "untrained", _TOUCH), known, path)
+    of = RunModel(device, learner, data.example, touch=_TOUCH)
+    write_model(learner.pipeline(of.places), of.describe(), data.touches("train"), path)
     return path
 
 

@@ -115,10 +115,12 @@ class Holds:
         from skin.hardware.live import engine_builder
         from skin.hardware.live.alarm_timing import FIELDS, time_courses
         from skin.hardware.live.verdict import DebounceSettings
-        from skin.trained import load_trained
+        from skin.model_of_run import load_model
 
-        of = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
-        engine = engine_builder.make_engine(of, DebounceSettings(), self.touch, self.drift)
+        run = subject.of.trained.run
+        assert run is not None  # it was loaded
+        of = load_model(run, subject.config)
+        engine = engine_builder.engine_settings(of, DebounceSettings(), self.touch, self.drift).build()
         device = of.device.simulated("held touches are simulated").replace(stream=False)
         table = [
             FIELDS,
@@ -150,8 +152,6 @@ class TouchAlarms:
         from skin.evaluation.alarm import Reached
         from skin.evaluation.operating_point import LABEL, choose_operating_point
         from skin.evaluation.touch_alarm import choose_for_touches, touch_scores
-        from skin.hardware.live import engine_builder
-        from skin.hardware.live.trained_run import watching_of
         from skin.hardware.live.verdict import DebounceSettings
         from skin.labels import TOUCH
         from skin.rng import Stream, generator
@@ -159,11 +159,10 @@ class TouchAlarms:
 
         of, settings = subject.of.trained, subject.config.evaluation
         device = subject.device.simulated("touches are simulated")
-        contact = engine_builder.nominal_settings(of).detection.threshold
         patience = DebounceSettings().alarm
         aligned = device.rate <= device.model_rate
-        watching = watching_of(of, contact, device.rate, patience, aligned)
-        one = watching_of(of, contact, device.rate, 0.0, aligned)
+        watching = of.watching(device.rate, patience, aligned)
+        one = of.watching(device.rate, 0.0, aligned)
         target = settings.false_alarm_rate
         touch = choose_for_touches(subject.learner, device, watching, target)
         window = choose_operating_point(subject.learner, device, settings)

@@ -14,11 +14,11 @@ from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.evaluation.operating_point import choose_operating_point, threshold_gestures
 from skin.evaluation.report import columns, evaluate
+from skin.finished_run import FinishedRun
 from skin.labels import Task
 from skin.recording import Touches, touches_hash
 from skin.run import describe, log_report, simulator, tags
 from skin.source import note_reuse
-from skin.stored_run import load_learner
 from skin.tracking import Store
 
 Way = Callable[[Tensor, Task], Tensor]
@@ -133,7 +133,7 @@ def _ask(store: Store, members: Sequence[tuple[DictConfig, Run]], device: Abstra
     left_out: dict[str, str] = {}
     for config, run in members:
         learner = build_learner(config)
-        load_learner(store, run, learner, build_data(config, device))
+        FinishedRun(store, run).load_weights(learner, build_data(config, device))
         for column, drawn in sets.items():
             try:
                 given = [(touches_hash(touches), learner.probabilities(touches)) for touches in drawn]

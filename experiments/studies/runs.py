@@ -22,10 +22,10 @@ from skin.commands import train
 from skin.config import PARENT, fingerprint, validate_config
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
+from skin.finished_run import find_run
 from skin.run import SWEPT, simulator
 from skin.shard import LEFT_OUT, Shard
 from skin.source import note_reuse
-from skin.stored_run import find_run
 from skin.tracking import Store
 
 
@@ -77,7 +77,7 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     """
     if study.rows is None:
         assert study.run is not None
-        run = find_run(store, study.run)
+        run = find_run(store, study.run).run
         return [Planned(Variant(_name(run), {}, {}), run.data.tags.get("seed", ""), run)]
     found: dict[tuple[str, str], Planned] = {}
     data = simulator(config)

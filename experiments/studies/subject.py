@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learner.base import AbstractLearner
+    from skin.model_of_run import RunModel
     from skin.tracking import Store
-    from skin.trained import Trained
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Finished:
     store: "Store"
     run: "Run"
     stored: "DictConfig"
-    trained: "Trained"
+    trained: "RunModel"
 
 
 @dataclass(frozen=True)
@@ -74,14 +74,12 @@ class Subject:
 
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm on this device."""
+        from skin.alarm_threshold import alarm_point
         from skin.evaluation.operating_point import OperatingPoint
-        from skin.trained import choose_for_skin
 
-        drawn = "skins" in self.config.device
-        point = None if drawn else choose_for_skin(self.learner, self.of.stored, self.config)
-        return (
-            point or self.of.trained.point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
-        )
+        run = self.of.trained.run
+        point = self.of.trained.point if run is None else alarm_point(run, self.learner, self.config)
+        return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,13 @@ from experiments.studies.study import Study, Variant, as_overrides, passed_overr
 from experiments.studies.subject import Finished, Measure, Subject
 from experiments.studies.tables import publish_page
 from skin.build import build_device
-from skin.config import fingerprint, validate_config
+from skin.config import fingerprint
 from skin.errors import InputError
 from skin.evaluation.outcomes import OUTCOMES
-from skin.run_overrides import apply_overrides
+from skin.finished_run import TAG, FinishedRun, MissingWeightsError
+from skin.model_of_run import RunModel, load_model
 from skin.source import note_reuse
-from skin.stored_run import TAG, MissingWeightsError, load_configuration
 from skin.tracking import Store
-from skin.trained import Trained, load_trained
 
 
 @dataclass(frozen=True)
@@ -140,17 +139,15 @@ class _Run:
     def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
         self.store, self.run, self.config = store, run, config
 
-    @cached_property
-    def stored(self) -> DictConfig:
-        return load_configuration(self.store, self.run, self.config.trust)
+        self.finished = FinishedRun(store, run, config.trust)
 
     @cached_property
-    def trained(self) -> Trained:
-        return load_trained(self.store, self.run, validate_config(self.stored), self.stored)
+    def trained(self) -> RunModel:
+        return load_model(self.finished)
 
     def measured(self, study: Study, base: Sequence[str], line: Sequence[str]) -> Run:
         """Return the MLflow run with the results of a study on the device that the overrides describe."""
-        own = apply_overrides(self.stored, compose("train", [*base, *line]), line)
+        own = self.finished.configured(compose("train", [*base, *line]), line)
         what = study.measure or Accuracy()
         asked = [repr(what), fingerprint(own), self.run.data.tags.get(TAG)]
         key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:16]
@@ -167,7 +164,9 @@ class _Run:
 
     def _measure(self, what: Measure, own: DictConfig, name: str, tags: dict[str, str], changed: bool) -> Run:
         """Measure, and log it beside the run; ``changed``: not on the run's own device."""
-        subject = Subject(own, build_device(own), Finished(self.store, self.run, self.stored, self.trained))
+        subject = Subject(
+            own, build_device(own), Finished(self.store, self.run, self.finished.stored, self.trained)
+        )
         with self.store.run(name, tags, self.run.info.run_id) as logged, TemporaryDirectory() as made:
             found = what(subject)
             self.store.log_metrics(logged, found.metrics)

@@ -71,16 +71,12 @@ def _verdicts(
 
     import numpy as np
 
-    from skin.build import build_data, build_learner
     from skin.device._blank import Blank
+    from skin.finished_run import FinishedRun
+    from skin.model_of_run import load_model
     from skin.plot.press_comparison import Verdicts
-    from skin.stored_run import find_run, load_configuration, load_learner
-    from skin.tracking import Store
 
-    store = Store.existing(config.tracking)
-    run = find_run(store, config.run)
-    trained = load_configuration(store, run, config.trust)
-    learner = build_learner(trained)
-    load_learner(store, run, learner, build_data(trained, Blank.of(device.task, device.size, both[0])))
-    simulated, recorded = ((learner.probabilities(side) > 0.5).numpy() for side in both)
+    measured = Blank.of(device.task, device.size, both[0])
+    model = load_model(FinishedRun.named(config), device=measured, alarm=False)
+    simulated, recorded = ((model.predict(side) > 0.5).numpy() for side in both)
     return Verdicts(device.task.names, simulated, recorded, None if truth is None else np.array(truth))

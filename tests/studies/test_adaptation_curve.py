@@ -8,8 +8,8 @@ from hydra import initialize_config_dir
 from experiments.studies.adaptation_curve import measure_adaptation
 from experiments.studies.subject import Finished, Subject
 from skin.build import build_data, build_device, build_learner
+from skin.model_of_run import RunModel
 from skin.paths import CONF
-from skin.trained import Trained
 
 SETTINGS = [
     "simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "representation=features",
@@ -24,7 +24,7 @@ def test_a_run_is_measured_before_and_after_and_is_itself_again_then(configured)
     learner = build_learner(config)
     learner.fit(build_data(config, device))
     before = deepcopy(learner.network.state_dict())
-    trained = Trained(device, learner, 30, device.touches("train").positions, 10.0)
+    trained = RunModel(device, learner, device.touches("train")[:1])
     other = device.replace(gestures=300, data_seed=1, gain_spread=0.5, time_constant=0.4, seed=2)
     subject = Subject(config, other, Finished(None, None, config, trained))
     quick = {"layers": ["all"], "lr": [1e-3], "epochs": 15}

@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from experiments.studies.recorded_runs import export_runs, import_runs, read_records, write_records
 from skin.config import Tracking
 from skin.errors import InputError
+from skin.finished_run import MissingWeightsError, find_pretrained
+from skin.model_of_run import load_run
 from skin.paths import ROOT
-from skin.pretrained import find_pretrained
-from skin.stored_run import MissingWeightsError
 from skin.tracking import Store
-from skin.trained import load_run
 from tests.damage import DAMAGED_FILES, damaged, opened
 
 # MLflow's own business with SQLAlchemy.

@@ -11,8 +11,7 @@ from experiments.studies.study import Study, Variant
 from experiments.studies.trials import _Run, numbered_settings, run_trials
 from skin.config import fingerprint
 from skin.errors import InputError
-from skin.pretrained import find_pretrained
-from skin.stored_run import MissingWeightsError
+from skin.finished_run import MissingWeightsError, find_pretrained
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -6,9 +6,9 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.verdict import Debounce, DebounceSettings
 from skin.labels import TOUCH, Task
+from skin.model_of_run import window_classifier
 from skin.recording import Touches
 from skin.signal.frame import Frame
 from skin.wire.conversion import UnitConversion

@@ -12,11 +12,11 @@ import torch
 from skin.errors import InputError
 from skin.hardware.live.display import Display, DisplayInfo
 from skin.hardware.live.engine import Detection, EngineSettings
-from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.loop import LiveLoop
 from skin.hardware.live.selftest import SelfTest
 from skin.hardware.live.verdict import DebounceSettings
 from skin.labels import TOUCH
+from skin.model_of_run import window_classifier
 from skin.wire.conversion import UnitConversion
 from skin.wire.health import RawRange
 from skin.wire.serial_source import SerialSource

@@ -12,11 +12,11 @@ from skin.build import build_data, build_device, build_learner
 from skin.device.serial import Serial
 from skin.hardware.live.display import Display, DisplayInfo
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.loop import LiveLoop
 from skin.hardware.record.recorder import convert_session, record_session
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
+from skin.model_of_run import window_classifier
 from skin.recording_file import read_recording
 from skin.wire.announcement import Announcement, encode_announcement
 from skin.wire.binary import encode_comment, encode_frame

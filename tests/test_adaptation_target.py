@@ -8,12 +8,11 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from skin.adaptation_target import choose_gestures, find_target, simulated_budget
+from skin.adaptation import FineTuning, choose_gestures, find_target, simulated_budget
 from skin.build import build_device
 from skin.config import plain, validate_config
 from skin.device._split import split_slices
 from skin.errors import InputError
-from skin.fine_tuning import FineTuning
 from skin.finished_run import FinishedRun
 from skin.paths import CONF
 

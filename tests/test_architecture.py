@@ -27,9 +27,9 @@ classifier class_balance
 datamodule
 learner
 evaluation build unfinished claim run_logger run_overrides trained_model
-finished_run exported fine_tuning
+finished_run exported
 alarm_threshold model_folder
-model_of_run adaptation_target
+model_of_run
 hardware
 plot
 design

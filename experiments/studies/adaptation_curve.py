@@ -8,11 +8,11 @@ from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.studies.subject import Measurement, Subject
+from skin.adaptation import FineTuning, fine_tune
 from skin.build import build_data, build_learner
 from skin.config import plain, validate_config
 from skin.device.base import AbstractSimulated
 from skin.evaluation.metrics import metrics
-from skin.fine_tuning import FineTuning, fine_tune
 from skin.learner.base import AbstractLearner
 from skin.settings import configured
 

@@ -111,8 +111,8 @@ class BoostedTrees(AbstractLearner):
                 f"{path.name} holds the training data of trees, from which an earlier version grew them: "
                 "train the run again, with tracking.resume=false"
             )
-        check_archive(path)
         try:
+            check_archive(path)
             models = load(path, trusted=_TRUSTED)
         except Exception as error:  # whatever zipfile, zlib, JSON, numpy and skops raise
             raise ValueError(" ".join(str(error).split()) or "it is cut off") from error

@@ -218,7 +218,7 @@ def watch(
     """
     above = live.patience.above
     if above is not None:
-        say(f"alarm above {above:.4f}")
+        say(f"alarm above {above:g}")
         # A threshold of the command line is tested against the usual one.
         usual = model.threshold
     elif model.alarms:

@@ -135,7 +135,7 @@ def test_the_command_replaces_settings_of_the_file(model, skin):
     said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
         watched = watch_exported(str(model), {"port": skin}, other, said.append, opened)
-    assert said[-1] == "alarm above 0.7500"
+    assert said[-1] == "alarm above 0.75"
     assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 

@@ -78,7 +78,7 @@ peers: $(READY) $(PEERS)/.ready  ## train aeon's ROCKETs with their defaults (SE
 		experiment=minirocket,multirocket_hydra
 
 demo: $(READY)  ## show the predictions of a pretrained model for an emulated skin on 127.0.0.1:8765; Ctrl-C stops
-	@$(BIN)/skin demo
+	@$(BIN)/skin live demo=true
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
 	@$(BIN)/python -c "from skin.tracking import print_table_link; print_table_link()"
@@ -98,7 +98,7 @@ wheel-check: $(READY)  ## install the wheel in an empty environment; train and e
 	$(BIN)/python -m hatchling build --target wheel --directory $(WHEEL)/dist
 	$(PYTHON) -m venv $(WHEEL)/env
 	$(WHEEL)/env/bin/python -m pip install --quiet --constraint constraints.txt $(WHEEL)/dist/*.whl
-	cd $(WHEEL)/empty && unset PYTHONPATH && ../env/bin/skin train $(SMOKE) && ../env/bin/skin evaluate run=latest && ../env/bin/skin demo seconds=5 live.web_port=0
+	cd $(WHEEL)/empty && unset PYTHONPATH && ../env/bin/skin train $(SMOKE) && ../env/bin/skin evaluate run=latest && ../env/bin/skin live demo=true seconds=5 live.web_port=0
 	rm -rf $(WHEEL)
 
 docs: $(READY)  ## build the documentation site in site/, offline; run tutorials and gallery; warnings are errors

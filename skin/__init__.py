@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from skin.errors import InputError as InputError
     from skin.layout.file import File as LayoutFile
     from skin.layout.grid import Grid as Grid
+    from skin.model_of_run import load_run as load_run
     from skin.recording_file import read_recording as read_recording
     from skin.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.simulator.solid import Solid as Solid
-    from skin.trained import load_run as load_run
     from skin.wire.skin import open_skin as open_skin
 
 __version__ = "0.1.0"
@@ -30,7 +30,7 @@ _PLACES = {
     "PlatesAndBeams": "skin.simulator.fem",
     "Sheet": "skin.body.sheet",
     "Solid": "skin.simulator.solid",
-    "load_run": "skin.trained",
+    "load_run": "skin.model_of_run",
     "open_skin": "skin.wire.skin",
     "read_recording": "skin.recording_file",
 }

@@ -95,6 +95,7 @@ class Config:
     link: str | None = None
     seconds: float | None = None
     web: bool | None = None
+    demo: bool | None = None
     live: dict[str, Any] | None = None
     export: dict[str, Any] | None = None
     gestures: int | None = None

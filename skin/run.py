@@ -25,6 +25,7 @@ from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
+from skin.alarm_threshold import threshold_device
 from skin.build import build_data, build_device, build_learner
 from skin.class_balance import report_balance
 from skin.config import PARENT, Tracking, fingerprint, overrides, plain
@@ -37,15 +38,14 @@ from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
 from skin.files import unwritable
 from skin.fingerprint import MACHINE, source_tags
+from skin.finished_run import TAG
 from skin.labels import Task
 from skin.learner.base import AbstractLearner
 from skin.learner.network import LAST
 from skin.option import option_name
 from skin.plot.figures import confusions, save_figure
 from skin.settings import import_target
-from skin.stored_run import TAG
 from skin.tracking import Store, note_reuse
-from skin.trained import threshold_device
 
 _log = logging.getLogger(__name__)
 
@@ -228,7 +228,7 @@ def _limit_threads(number: int | None) -> None:
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
-    """Log what a learner has learned, for :func:`skin.stored_run.load_learner`."""
+    """Log what a learner has learned, for :meth:`skin.finished_run.FinishedRun.load_weights`."""
     with tempfile.TemporaryDirectory() as folder:
         path = learner.save(Path(folder))
         store.client.log_artifact(run.info.run_id, str(path))
@@ -328,7 +328,7 @@ def _holds(value: Any, name: str) -> bool:
 def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
     """Log an evaluation, with its predictions and confusion matrices, and further values.
 
-    The operating point is stored as the tag ``TAG``; :func:`skin.stored_run.load_operating_point` reads it.
+    The operating point is stored as the tag ``TAG``; :attr:`skin.finished_run.FinishedRun.point` reads it.
     """
     point = report.point
     if point is not None:

@@ -1,18 +1,23 @@
-"""The configuration of a finished run with the overrides of a command line."""
+"""The configuration of a finished run with the overrides of a command line, or a skin built in Python."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.defaults_list import create_defaults_list
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from skin.body.base import AbstractBody
 from skin.config import plain, validate_config
 from skin.errors import InputError
+from skin.layout._listed import Listed
+from skin.layout.base import AbstractLayout
 from skin.paths import CONF
+from skin.settings import check_groups
 
 # Groups that the weights of a run depend on.
 _FIXED = (
@@ -35,7 +40,7 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
     docs/your-skin.md has a body, positions and a simulator. All of its settings are taken.
 
     Args:
-        stored: as :func:`skin.stored_run.load_configuration` gives it.
+        stored: as :attr:`skin.finished_run.FinishedRun.stored` gives it.
         composed: a new configuration with the overrides.
         overrides: of the command line; only these settings are taken from ``composed``.
 
@@ -196,3 +201,78 @@ def _follow(whole: DictConfig, composed: DictConfig) -> None:
 def _raw(config: DictConfig) -> dict[str, Any]:
     """Return plain containers with interpolations as they stand."""
     return OmegaConf.to_container(config, resolve=False)  # type: ignore[return-value]
+
+
+def with_skin(
+    groups: dict[str, Any], body: AbstractBody | str | None, layout: AbstractLayout | str | None
+) -> dict[str, Any]:
+    """Return the settings of a run with another body or layout.
+
+    Args:
+        groups: plain settings; interpolations are resolved.
+        body: the body, the name of an option (``arm``), or None for that of the settings.
+        layout: the layout, the name of an option (``grid``), the path of a CSV file, or None.
+
+    Raises:
+        InputError: there is no such option or file, or a sensor lies outside the body.
+    """
+    if body is not None:
+        groups = groups | {
+            "body": _default_option("body", body) if isinstance(body, str) else _body_settings(body)
+        }
+    if isinstance(layout, str):
+        groups = groups | {"layout": _layout_settings(layout)}
+    elif layout is not None:
+        check_groups({"body": groups["body"]})
+        groups = groups | {"layout": _listed_settings(layout, instantiate(groups["body"]))}
+    return groups
+
+
+def _body_settings(body: AbstractBody) -> dict[str, Any]:
+    """Return the settings of a body: the arguments that it was built from."""
+    if not isinstance(body, AbstractBody):
+        raise InputError(f"body must be a body such as skin.Sheet, or the name of one, got {body!r}")
+    settings = {field.name: getattr(body, field.name) for field in fields(body) if field.init}
+    settings["layers"] = [asdict(layer) for layer in body.layers]
+    for layer in settings["layers"]:
+        layer["material"] = {key: value for key, value in layer["material"].items() if value is not None}
+    plain = {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()}
+    return {"_target_": _class_name(body), "_convert_": "all", **plain}
+
+
+def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, Any]:
+    """Return settings for the sensors that a layout has in a body."""
+    if not isinstance(layout, AbstractLayout):
+        raise InputError(f"layout must be a layout such as skin.Grid, a name or a CSV file, got {layout!r}")
+    sensors = layout.sensors(body)
+    return {
+        "_target_": f"{Listed.__module__}.{Listed.__qualname__}",
+        "_convert_": "all",
+        "positions": sensors.positions.tolist(),
+        "footprint": list(sensors.footprint),
+        "normals": sensors.normals.tolist(),
+    }
+
+
+def _layout_settings(given: str) -> dict[str, Any]:
+    """Return the settings of a layout that is given by its name or by its file."""
+    if given.lower().endswith(".csv"):
+        return _default_option("layout", "file") | {"path": given}
+    return _default_option("layout", given)
+
+
+def _default_option(group: str, name: str) -> dict[str, Any]:
+    """Return the default settings of an option.
+
+    Raises:
+        InputError: there is no such option.
+    """
+    options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    if name not in options:
+        raise InputError(f"there is no {group} {name}: give one of {', '.join(options)}, or build one")
+    settings: Any = OmegaConf.to_container(OmegaConf.load(CONF / group / f"{name}.yaml"))
+    return settings
+
+
+def _class_name(built: object) -> str:
+    return f"{type(built).__module__}.{type(built).__qualname__}"

@@ -128,20 +128,24 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
 
 
 def check_archive(path: Path, most: int = _BYTES) -> None:
-    """Check that what a zip archive, such as weights of torch, expands to fits into memory.
+    """Check that what a zip archive, such as weights of torch, expands to fits into memory, as its arrays do.
 
     Args:
         path: of the file.
         most: largest total size of its entries, bytes.
 
     Raises:
-        ValueError: no regular file, no zip archive, or larger entries.
+        ValueError: no regular file, no zip archive, larger entries, or arrays that claim another size.
         OSError: unreadable.
     """
     regular(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            total = sum(entry.file_size for entry in archive.infolist())
+            entries = archive.infolist()
+            total = sum(entry.file_size for entry in entries)
+            for entry in entries:
+                if entry.filename.endswith(".npy"):
+                    _claimed(archive, entry)
     except zipfile.BadZipFile as error:
         raise ValueError(f"it is no archive of weights: {error}") from error
     if total > most:

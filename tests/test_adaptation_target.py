@@ -8,12 +8,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from skin.adaptation_target import choose_gestures, find_target, simulated_budget
+from skin.adaptation import FineTuning, choose_gestures, find_target, simulated_budget
 from skin.build import build_device
 from skin.config import plain, validate_config
 from skin.device._split import split_slices
 from skin.errors import InputError
-from skin.fine_tuning import FineTuning
+from skin.finished_run import FinishedRun
 from skin.paths import CONF
 
 NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
@@ -71,11 +71,13 @@ def test_the_threshold_of_the_alarm_may_be_for_a_profile():
     words = ["evaluation.profile=rough", "device.noise=0.3"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         stored = OmegaConf.create(plain(validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))))
-        parent = SimpleNamespace(
+        run = SimpleNamespace(
             info=SimpleNamespace(run_id="a"), data=SimpleNamespace(tags={"fingerprint": "b"})
         )
+        parent = FinishedRun(None, run)
+        parent.__dict__["stored"] = stored
         found = {
-            given: find_target(parent, stored, compose("adapt", given), FineTuning(), given)
+            given: find_target(parent, compose("adapt", given), FineTuning(), given)
             for given in (tuple(words), ())
         }
     profiled, plainly = found.values()

@@ -28,11 +28,10 @@ fusion
 classifier class_balance
 datamodule
 learner
-evaluation build pretrained
-stored_run run_overrides skin_settings model_card fine_tuning
-trained
-adaptation_target
-exported
+evaluation build unfinished claim run_logger run_overrides trained_model
+finished_run exported
+alarm_threshold model_folder
+model_of_run
 hardware
 design
 console

@@ -33,10 +33,10 @@ def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
     main([verb, "--help"])
     text = capsys.readouterr().out
     assert f"skin {verb}" in text
-    trained = ("adapt", "compare", "demo", "evaluate", "export", "live", "train")
+    trained = ("adapt", "compare", "evaluate", "export", "live", "train")
     assert ("fusion" in text) == (verb in trained)
-    assert ("[serial]" in text) == (verb in ("demo", "listen", "record"))
-    assert ("[simulated]" in text) == (verb not in ("demo", "listen", "publish", "record"))
+    assert ("[serial]" in text) == (verb in ("listen", "record"))
+    assert ("[simulated]" in text) == (verb not in ("listen", "record"))
     assert "hydra" not in text
 
 

@@ -13,11 +13,20 @@ from hypothesis import strategies as st
 import skin
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL
-from skin.model_card import model_card
+from skin.finished_run import (
+    CARD,
+    CONFIG,
+    MODELS,
+    RECORD,
+    SUMS,
+    FinishedRun,
+    checksums,
+    find_pretrained,
+    is_name,
+)
+from skin.model_folder import model_card
 from skin.paths import ROOT
-from skin.pretrained import CARD, CONFIG, MODELS, RECORD, SUMS, checksums, find_pretrained, is_name
 from skin.safe_loading import load_yaml
-from skin.stored_run import load_configuration
 from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
@@ -187,10 +196,10 @@ def test_a_model_of_somebody_else_works_or_is_refused(model, name):
         (model / SUMS).write_text(checksums(model, "weights.pt"))
         run = opened(lambda: find_pretrained("mine"))
         if run is not None and name == CONFIG:
-            opened(lambda: load_configuration(store, run))
+            opened(lambda: FinishedRun(store, run).stored)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("skin.stored_run.fetch", lambda store, run, file, folder: model / file)
+        patch.setattr(FinishedRun, "fetch", lambda run, file, folder: model / file)
         try_it()
 
 

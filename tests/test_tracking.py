@@ -12,10 +12,10 @@ import pytest
 from skin import tracking
 from skin.config import Tracking
 from skin.fingerprint import source_tags
+from skin.finished_run import FinishedRun
+from skin.model_of_run import load_run
 from skin.paths import ROOT
-from skin.stored_run import fetch
 from skin.tracking import TAGS, Store, print_table_link
-from skin.trained import load_run
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -180,7 +180,7 @@ def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
     store = Store.open(Tracking(None, None, "skin", True, None))
     with store.run("here", {}) as run:
         store.client.log_text(run.info.run_id, "text", "note.txt")
-    assert fetch(store, run, "note.txt", str(tmp_path)).read_text() == "text"
+    assert FinishedRun(store, run).fetch("note.txt", str(tmp_path)).read_text() == "text"
     assert (folder / "mlflow.db").is_file()
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]
 

@@ -15,10 +15,9 @@ from skin.device.base import AbstractSimulated
 from skin.exported.model import ExportedModel
 from skin.exported.writer import write_model
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.engine_builder import describe, window_classifier
 from skin.learner.network import Network
+from skin.model_of_run import RunModel, window_classifier
 from skin.signal.frame import Frame
-from skin.trained import Trained
 from skin.wire.channels import UnitConversion
 from skin.wire.decoder import Decoder
 from skin.wire.protocol import encode_line
@@ -73,11 +72,10 @@ def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
     torch.set_num_threads(1)
     device, learner, data = _untrained(row)
     touches = data.touches("train")
-    trained = Trained(device, learner, device.window, touches.positions, device.model_rate)
+    model = RunModel(device, learner, data.example, touch=_TOUCH)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.onnx"
-        about = describe(trained, "none", "untrained", _TOUCH)
-        write_model(learner.pipeline(trained.positions), about, touches, path)
+        write_model(learner.pipeline(model.places), model.describe(), touches, path)
         exported = ExportedModel(path)
     about = exported.metadata
     engine = Engine(

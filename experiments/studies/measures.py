@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learner.base import AbstractLearner
+    from skin.model_of_run import RunModel
     from skin.tracking import Store
-    from skin.trained import Trained
 
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
 
@@ -42,7 +42,7 @@ class Finished:
     store: "Store"
     run: "Run"
     stored: "DictConfig"
-    trained: "Trained"
+    trained: "RunModel"
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,12 @@ class Subject:
 
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm on this device."""
+        from skin.alarm_threshold import alarm_point
         from skin.evaluation.operating_point import OperatingPoint
-        from skin.trained import choose_for_skin
 
-        drawn = "skins" in self.config.device
-        point = None if drawn else choose_for_skin(self.learner, self.of.stored, self.config)
-        return (
-            point or self.of.trained.point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
-        )
+        run = self.of.trained.run
+        point = self.of.trained.point if run is None else alarm_point(run, self.learner, self.config)
+        return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
 
 
 @dataclass(frozen=True)
@@ -214,11 +212,13 @@ class Holds:
         from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
         from skin.hardware.live.selftest import FIELDS, time_courses
-        from skin.trained import load_trained
+        from skin.model_of_run import load_model
 
-        trained = load_trained(subject.of.store, subject.of.run, subject.config, subject.of.stored)
-        engine = engine_builder.make_engine(trained, DebounceSettings(), self.touch, self.drift)
-        device = trained.device.simulated("held touches are simulated").replace(stream=False)
+        run = subject.of.trained.run
+        assert run is not None  # it was loaded
+        model = load_model(run, subject.config)
+        engine = engine_builder.engine_settings(model, DebounceSettings(), self.touch, self.drift).build()
+        device = model.device.simulated("held touches are simulated").replace(stream=False)
         table = [
             FIELDS,
             *time_courses(engine, device, self.gestures, self.rate, partial(track, transient=True)),
@@ -253,20 +253,17 @@ class TouchAlarms:
             choose_operating_point,
             touch_scores,
         )
-        from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
-        from skin.hardware.live.trained_run import watching_of
         from skin.labels import TOUCH
         from skin.rng import Stream, generator
         from skin.touch.sampler import balanced
 
         trained, settings = subject.of.trained, subject.config.evaluation
         device = subject.device.simulated("touches are simulated")
-        contact = engine_builder.nominal_settings(trained).detection.threshold
         patience = DebounceSettings().alarm
         aligned = device.rate <= device.model_rate
-        watching = watching_of(trained, contact, device.rate, patience, aligned)
-        at_once = watching_of(trained, contact, device.rate, 0.0, aligned)
+        watching = trained.watching(device.rate, patience, aligned)
+        at_once = trained.watching(device.rate, 0.0, aligned)
         target = settings.false_alarm_rate
         touch = choose_for_touches(subject.learner, device, watching, target)
         window = choose_operating_point(subject.learner, device, settings)

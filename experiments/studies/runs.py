@@ -20,9 +20,9 @@ from skin.commands import train
 from skin.config import PARENT, fingerprint
 from skin.errors import InputError
 from skin.evaluation.metrics import OUTCOMES
+from skin.finished_run import find_run
 from skin.run import SWEPT, simulator
 from skin.shard import LEFT_OUT, Shard
-from skin.stored_run import find_run
 from skin.tracking import Store, note_reuse
 
 
@@ -77,7 +77,7 @@ def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
     """
     if study.rows is None:
         assert study.run is not None
-        run = find_run(store, study.run)
+        run = find_run(store, study.run).run
         row, seed = run.data.tags.get("row", ""), run.data.tags.get("seed", "")
         return [Planned(Variant(_name(run), {"row": row}, {}), seed, run)]
     newest: dict[tuple[str, str], Planned] = {}

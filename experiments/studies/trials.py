@@ -28,16 +28,15 @@ from experiments.studies.study import Study, Variant, as_overrides, passed_overr
 from experiments.studies.tables import publish_page
 from skin.build import build_device
 from skin.checksum import check_seal, write_parquet
-from skin.config import fingerprint, validate_config
+from skin.config import fingerprint
 from skin.errors import InputError
 from skin.evaluation.metrics import decode, disagreement, vote
 from skin.files import whole
 from skin.fingerprint import source_tags
+from skin.finished_run import TAG, FinishedRun
 from skin.labels import TOUCH
-from skin.run_overrides import apply_overrides
-from skin.stored_run import TAG, load_configuration
+from skin.model_of_run import RunModel, load_model
 from skin.tracking import Store, note_source
-from skin.trained import Trained, load_trained
 
 FOLDER = Path("results/trials")
 """Of all trials, in the current folder; those of a study are in a folder of its name."""
@@ -164,22 +163,18 @@ class RestoredRun:
 
     def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
         self.store, self.run, self.config = store, run, config
+        self.finished = FinishedRun(store, run, config.trust)
 
     @cached_property
-    def stored(self) -> DictConfig:
-        """Its configuration."""
-        return load_configuration(self.store, self.run, self.config.trust)
-
-    @cached_property
-    def trained(self) -> Trained:
+    def trained(self) -> RunModel:
         """What it learned."""
-        return load_trained(self.store, self.run, validate_config(self.stored), self.stored)
+        return load_model(self.finished)
 
     def measure(
         self, study: Study, condition: str, device: str, base: Sequence[str], line: Sequence[str]
     ) -> dict[str, Any]:
         """Return the row with the results of a study on the device that the overrides describe."""
-        config = apply_overrides(self.stored, compose("train", [*base, *line]), line)
+        config = self.finished.configured(compose("train", [*base, *line]), line)
         measure, run = study.measure or Accuracy(), self.run
         # A training that was repeated has other weights, and ended at another time.
         depends = [repr(measure), fingerprint(config), run.data.tags.get(TAG), run.info.end_time]
@@ -199,7 +194,7 @@ class RestoredRun:
     def _measured(self, measure: Measure, config: DictConfig, name: str) -> dict[str, Any]:
         """Measure, and return the row; its files have a name."""
         subject = Subject(
-            config, build_device(config), Finished(self.store, self.run, self.stored, self.trained)
+            config, build_device(config), Finished(self.store, self.run, self.finished.stored, self.trained)
         )
         result = measure(subject)
         files: dict[str, bytes] = {}

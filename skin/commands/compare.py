@@ -50,19 +50,14 @@ def _compare_predictions(
     """Return the predictions of a run for both sides."""
     import numpy as np
 
-    from skin.build import build_data, build_learner
     from skin.device._blank import Blank
+    from skin.finished_run import FinishedRun
     from skin.hardware.comparison import Agreement
-    from skin.stored_run import find_run, load_configuration, load_learner
-    from skin.tracking import Store
+    from skin.model_of_run import load_model
 
-    store = Store.existing(config.tracking)
-    run = find_run(store, config.run)
-    trained = load_configuration(store, run, config.trust)
-    learner = build_learner(trained)
     blank = Blank.of(device.task, device.size, comparison.touches[0])
-    load_learner(store, run, learner, build_data(trained, blank))
-    simulated, measured = ((learner.probabilities(side) > 0.5).numpy() for side in comparison.touches)
+    model = load_model(FinishedRun.named(config), device=blank, alarm=False)
+    simulated, measured = ((model.predict(side) > 0.5).numpy() for side in comparison.touches)
     labels = [pair.labels for pair in comparison.pairs if pair.labels is not None]
     truth = np.array([[bool(row[name]) for name in device.task.names] for row in labels])
     return Agreement(device.task.names, simulated, measured, truth if labels else None)

@@ -40,32 +40,28 @@ def main(config: DictConfig) -> None:
 def _evaluate(config: DictConfig, steps: "Steps") -> None:
     from skin.console import quiet
     from skin.evaluation.report import evaluate, print_report, publish_evaluation, write_chances
-    from skin.hardware.wired import AbstractWired
+    from skin.finished_run import FinishedRun
+    from skin.model_of_run import load_model
     from skin.option import option_name
     from skin.run import log_report
-    from skin.run_overrides import apply_overrides
-    from skin.stored_run import find_run, load_configuration
     from skin.tracking import Store
-    from skin.trained import load_trained
 
     quiet()
-    store, folder = Store.existing(config.tracking), results(config.out)
-    run = find_run(store, config.run)
-    stored, given = load_configuration(store, run, config.trust), overrides()
-    config = apply_overrides(stored, config, given)
+    run, folder, given = FinishedRun.named(config), results(config.out), overrides()
+    config = run.configured(config, given)
     if "skins" in config.device and config.evaluation.profile is not None:
         raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
-    of = load_trained(store, run, config, stored)
-    device, learner, point = of.device, of.learner, of.point
+    model = load_model(run, config)
+    device, learner, point = model.device, model.learner, model.point
     steps.begin("reading or simulating the touches")
-    steps.silent = isinstance(device, AbstractWired)
+    steps.silent = device.real
     touches = device.touches("test")  # read before anything is logged, because a port may fail
     steps.silent = False
     steps.begin("evaluating them")
-    title = f"{run.info.run_name} ({run.info.run_id})"
-    tags = {"evaluated": run.info.run_id, "overrides": " ".join(given)}
+    title = f"{run.title} ({run.identity})"
+    tags = {"evaluated": run.identity, "overrides": " ".join(given)}
     store = Store.open(config.tracking)
-    with store.run(f"evaluation of {run.info.run_name}", tags, run.info.run_id) as evaluation:
+    with store.run(f"evaluation of {run.title}", tags, run.identity) as evaluation:
         # Evaluations do not overwrite each other's files.
         name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
         if touches.labels is None:
@@ -74,13 +70,13 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
             store.client.log_artifact(evaluation.info.run_id, str(path))
             print(f"{title}\n{text}\n{path}")
             return
-        found = evaluate(learner, device, config.evaluation, point)
-        log_report(store, evaluation, found, device.task, {})
-        about = describe_evaluation(title, given, len(found.predictions))
-        written = publish_evaluation(folder / f"{name}.md", found, device.task, run.info.run_name, about)
+        report = evaluate(learner, device, config.evaluation, point)
+        log_report(store, evaluation, report, device.task, {})
+        about = describe_evaluation(title, given, len(report.predictions))
+        written = publish_evaluation(folder / f"{name}.md", report, device.task, run.title, about)
         for path in written:
             store.client.log_artifact(evaluation.info.run_id, str(path))
-    print_report(found, title)
+    print_report(report, title)
     print(*written, sep="\n")
 
 

@@ -1,14 +1,15 @@
-"""Write the network of a finished run, from readings to probabilities, as one ONNX file.
+"""Write a finished run as one ONNX file, or as a folder of models/ with weights, configuration and card.
 
     skin export run=latest out=skin.onnx
     skin export run=any_skin body=arm layout.path=sensors.csv
     skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
+    skin export run=latest format=folder name=my_skin licence=MIT
 
-The file is compared with the run on simulated or recorded touches first.
+The ONNX file holds a network, from readings to probabilities, and is compared with the run on simulated or
+recorded touches first. The folder holds any run: run=my_skin then selects it wherever a run is accepted.
 """
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,12 +23,11 @@ from skin.errors import InputError
 from skin.files import results
 
 if TYPE_CHECKING:
-    from mlflow.entities import Run
-
-    from skin.exported.metadata import ModelMetadata
+    from skin.model_of_run import RunModel
     from skin.progress import Steps
     from skin.recording import Touches
-    from skin.trained import Trained
+
+_FORMATS = ("onnx", "folder")
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class ExportSettings:
 _THRESHOLDS = "choosing the thresholds of the alarm for touches"
 # Expected seconds of each step, for the share in the progress.
 _STEPS = {
-    "loading the run": 10.0,
-    "choosing the threshold of the alarm": 15.0,
+    "loading the run and the threshold of its alarm": 25.0,
     "tuning the contact threshold": 10.0,
     _THRESHOLDS: 80.0,
     "simulating touches to compare": 10.0,
@@ -59,14 +58,35 @@ _STEPS = {
 
 @command("export")
 def main(config: DictConfig) -> None:
-    """Restore a finished run, write its network, and print the path."""
+    """Restore a finished run, write it, and print the path."""
+    if config.format not in _FORMATS:
+        raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
+    if config.format == "folder":
+        _export_folder(config)
+        return
+
     from skin.progress import Steps
 
+    if config.name is not None or config.licence is not None:
+        raise InputError("name and licence are those of a folder: add format=folder, or leave them out")
     with Steps(_STEPS) as steps:
-        _export(config, steps)
+        _export_file(config, steps)
 
 
-def _export(config: DictConfig, steps: "Steps") -> None:
+def _export_folder(config: DictConfig) -> None:
+    """Write the files of a pretrained model, all or none."""
+    from skin.finished_run import FinishedRun
+    from skin.model_folder import check_folder, write_folder
+
+    if config.out is not None:
+        raise InputError(f"a folder is written to models/NAME, not to out={config.out}: add name=my_skin")
+    folder = check_folder(config.name, config.licence)
+    write_folder(FinishedRun.named(config), folder, config.licence)
+    print(folder)
+
+
+def _export_file(config: DictConfig, steps: "Steps") -> None:
+    """Write the network of a run for one skin, with the thresholds of its alarm."""
     from skin.settings import configured
 
     settings = configured(ExportSettings, plain(config)["export"], "export")
@@ -75,64 +95,39 @@ def _export(config: DictConfig, steps: "Steps") -> None:
         raise InputError(f"out={config.out} must end in .onnx: as in out=skin.onnx")
 
     from skin.console import quiet
-    from skin.exported.identity import describe_skin
+    from skin.exported.model import describe_skin
     from skin.exported.writer import write_model
-    from skin.hardware.live.engine_builder import describe, simulator_warning
-    from skin.run_overrides import apply_overrides
-    from skin.stored_run import find_run, load_configuration
-    from skin.tracking import Store
-    from skin.trained import choose_for_skin, load_trained
+    from skin.finished_run import FinishedRun
+    from skin.hardware.live.engine import DebounceSettings
+    from skin.model_of_run import equation10_warning, load_model
 
     quiet()
-    store = Store.existing(config.tracking)
-    run = find_run(store, config.run)
-    stored = load_configuration(store, run, config.trust)
-    whole = apply_overrides(stored, config, overrides())
-    of = load_trained(store, run, whole, stored)
-    steps.begin("choosing the threshold of the alarm")
-    if "skins" in stored.device:
-        of = replace(of, point=choose_for_skin(of.learner, stored, whole))
-    module = of.learner.pipeline(of.positions)  # refused before anything is simulated
-    if advice := simulator_warning(stored):
+    run = FinishedRun.named(config)
+    whole = run.configured(config, overrides())
+    model = load_model(run, whole, touch=settings.touch, one_skin=True)
+    module = model.learner.pipeline(model.places)  # refused before anything else is simulated
+    if advice := equation10_warning(run.stored):
         print(advice, file=sys.stderr)
     steps.begin("tuning the contact threshold")
-    described = describe(of, run.info.run_id, str(run.info.run_name), settings.touch)
-    if "simulator" in stored.device and described.threshold is not None:
+    described = replace(model.describe(), skin=describe_skin(whole, model.positions))
+    if "simulator" in run.stored.device and model.threshold is not None:
         steps.begin(_THRESHOLDS)
+        patience = DebounceSettings().alarm
+        points = {f"{rate:g}": model.point_at(rate, patience, False, print) for rate in settings.rates}
         described = replace(
-            described, thresholds=_thresholds(of, run, stored, whole, described, settings.rates)
+            described, thresholds={rate: point.threshold for rate, point in points.items() if point}
         )
-    described = replace(described, skin=describe_skin(whole, of.positions.numpy()))
-    path = path or results(None) / f"{str(run.info.run_name).split()[0]}_{run.info.run_id[:8]}.onnx"
+    path = path or results(None) / f"{run.title.split()[0]}_{run.identity[:8]}.onnx"
     steps.begin("simulating touches to compare")
-    touches = _touches(of, settings.touches)
+    touches = _touches(model, settings.touches)
     steps.begin("writing the file and comparing it")
     difference = write_model(module, described, touches, path)
     print(f"{path}: differs from the run by {difference:.1g} at most on {len(touches)} touches")
 
 
-def _thresholds(
-    of: "Trained",
-    run: "Run",
-    stored: DictConfig,
-    whole: DictConfig,
-    described: "ModelMetadata",
-    rates: Sequence[float],
-) -> dict[str, float]:
-    """Return the thresholds of the alarm for safe touches, by the rate of the device, Hz."""
-    from skin.hardware.live.engine import DebounceSettings
-    from skin.hardware.live.trained_run import choose_threshold, watching_of
-
-    thresholds = {}
-    for rate in rates:
-        watching = watching_of(of, described.contact, rate, DebounceSettings().alarm, False)
-        thresholds[f"{rate:g}"] = choose_threshold(of, run, stored, whole, watching, print).threshold
-    return thresholds
-
-
-def _touches(of: "Trained", count: int) -> "Touches":
+def _touches(model: "RunModel", count: int) -> "Touches":
     """Return at most ``count`` touches; a run on a recording has those of its own only."""
-    if (simulation := of.device.reference) is None:
-        return of.device.touches("test")[:count]
+    if (simulation := model.device.reference) is None:
+        return model.device.touches("test")[:count]
     # A tenth of the gestures is the validation split.
     return simulation.replace(gestures=10 * max(10, count)).touches("validation")[:count]

@@ -3,32 +3,87 @@
     skin live device=serial device.port=/dev/ttyACM0
     skin live run=skin.onnx device=serial device.port=/dev/ttyACM0
     skin live web=true
+    skin live demo=true
 
 run=latest names the run, or a file of skin export, which starts faster; web=true also serves a page. Without
-device= the simulator of the run is used: no hardware is needed. Ctrl-C stops.
+device= the simulator of the run is used: no hardware is needed. demo=true emulates the skin of a pretrained
+model at a port of this machine and serves the page. Ctrl-C stops.
 """
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from skin.command import command
-from skin.config import overrides, plain
+from skin.config import overrides, plain, validate_config
+from skin.errors import InputError
 
 if TYPE_CHECKING:
     from skin.hardware.live.live_settings import LiveSettings
     from skin.hardware.live.loop import Display
 
 
+_DEMO = ("run=default_skin", "web=true")
+"""Settings of a demonstration, unless others are given."""
+
+
 @command("live")
 def main(config: DictConfig) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
-    show(config, overrides())
+    if config.demo:
+        with emulated_skin(overrides()) as (demo, words):
+            show(demo, words, own_mechanics=True)
+    else:
+        show(config, overrides())
+
+
+@contextmanager
+def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]]:
+    """Emulate the skin of a run, without the imperfections of its training, at a port of this machine.
+
+    Args:
+        words: overrides of the command line.
+
+    Yields:
+        The configuration of a live view of this skin, and its overrides.
+
+    Raises:
+        InputError: a device is given, or the run cannot be emulated.
+    """
+    from threading import Thread
+
+    from hydra import compose
+
+    from skin.build import build_device
+    from skin.console import quiet
+    from skin.finished_run import FinishedRun
+    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
+
+    quiet()
+    if given := [word for word in words if word.startswith("device=")]:
+        raise InputError(f"demo=true emulates a skin at a port: leave out {given[0]}, or demo=true")
+    words = ["device=serial", *words]
+    config = validate_config(compose("live", [*_DEMO, *words]))
+    run = FinishedRun.named(config)
+    device = build_device(run.configured(compose("train"), ["device=simulated"]))
+    port = open_port("tcp:0", None)
+    emulator = Emulator(device.simulated("a skin is emulated"), port, EmulatorSettings(), Faults())
+    thread = Thread(target=emulator.run, name="skin-emulator", daemon=True)
+    thread.start()
+    try:
+        settings = {"port": port.address, "scale": emulator.converter.scale}
+        merged = OmegaConf.merge(config, {"device": settings})
+        assert isinstance(merged, DictConfig)
+        yield merged, [*words, *(f"device.{name}={value}" for name, value in settings.items())]
+    finally:
+        emulator.stop()
+        thread.join()
+        port.unplug()
 
 
 def show(config: DictConfig, given: Sequence[str], own_mechanics: bool = False) -> None:
@@ -52,20 +107,19 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_m
     from rich.console import Console
 
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
-    from skin.hardware.live.watched import check_settings
     from skin.interrupt import ends_on_signal
 
     messages = Console(stderr=True, highlight=False)
     if str(config.run).endswith(".onnx"):
-        from skin.exported.identity import check_overrides
-        from skin.hardware.live.watched import watch_model
+        from skin.exported.model import check_overrides
+        from skin.hardware.live.engine_builder import watch_exported
 
         check_overrides(config.run, config, given)
         device = plain(config)["device"]
-        watch = partial(watch_model, config.run, device, live, messages.print)
+        watch = partial(watch_exported, config.run, device, live, messages.print)
     else:
         from skin.console import quiet
-        from skin.hardware.live.trained_run import watch_run
+        from skin.hardware.live.engine_builder import watch_run
 
         quiet()
         watch = partial(watch_run, config, live, messages.print, given, own_mechanics=own_mechanics)
@@ -73,12 +127,13 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_m
         open_.enter_context(ends_on_signal())
         watched = watch(opened=open_)
         source = watched.source
+        model = watched.model
         display = Display(
-            DisplayInfo(watched.title, source.name, watched.positions, watched.size, live.top, watched.span)
+            DisplayInfo(model.title, source.name, model.positions, model.size, live.top, watched.span)
         )
         for text in _views(display, config, live, open_):
             messages.print(text)
-        before = partial(check_settings, watched, live.selftest, messages.print)
+        before = partial(watched.check, live.selftest, messages.print)
         session = LiveLoop(source.skin, source.tare, watched.settings.build(), display, before)
         open_.callback(lambda: messages.print(f"{session.verdicts} verdicts, {session.line}"))
         session.run(config.seconds)

@@ -33,12 +33,14 @@ class AbstractDevice(ABC):
         size: extent (x, y) of the sheet, m.
         surface: the touched body, for plots; None: a flat sheet of ``size``.
         name: of the source of :meth:`strips`, for the live view.
+        real: whether touches are read from a real skin, which may ask a person for them.
     """
 
     task: Task
     size: tuple[float, float]
     surface: AbstractBody | None = None
     name: str = "simulator"
+    real: bool = False
 
     @property
     def simulation(self) -> "AbstractSimulated | None":

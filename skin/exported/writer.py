@@ -17,8 +17,7 @@ from skin import files
 from skin.checksum import BLANK, seal
 from skin.checksum import KEY as CHECKSUM
 from skin.errors import InputError
-from skin.exported.metadata import KEY, ModelMetadata
-from skin.exported.model import ExportedModel
+from skin.exported.model import KEY, ExportedModel, ModelMetadata
 from skin.recording import Touches
 
 TOLERANCE = 1e-5

@@ -27,6 +27,7 @@ class AbstractWired(AbstractDevice):
         calibration: calibration file of the device; or None.
     """
 
+    real = True
     wire: SerialSource
     sensors: Sensors
     window: int

@@ -1,4 +1,4 @@
-"""`skin demo` as a person starts and ends it."""
+"""`skin live demo=true` as a person starts and ends it."""
 
 import json
 import re
@@ -46,7 +46,7 @@ def refuses(address):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_the_page_shows_an_emulated_skin_until_a_signal_ends_both(begin, tmp_path, number, code):
     store = f"tracking.uri=sqlite:///{tmp_path}/m.db"
-    with begin(tmp_path, "demo", "live.web_port=0", store) as demo:
+    with begin(tmp_path, "live", "demo=true", "live.web_port=0", store) as demo:
         page = page_of(demo)
         with urlopen(page, timeout=PATIENCE) as answer:
             assert b"<!doctype html>" in answer.read()
@@ -68,7 +68,13 @@ def test_the_page_shows_an_emulated_skin_until_a_signal_ends_both(begin, tmp_pat
 
 
 def test_another_run_is_refused_with_a_sentence(run, tmp_path):
-    done = run(tmp_path, "demo", "run=none")
+    done = run(tmp_path, "live", "demo=true", "run=none")
     assert done.returncode == 2
     assert "no finished training run none" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_device_is_refused(run, tmp_path):
+    done = run(tmp_path, "live", "demo=true", "device=serial")
+    assert done.returncode == 2
+    assert done.stderr == "demo=true emulates a skin at a port: leave out device=serial, or demo=true\n"

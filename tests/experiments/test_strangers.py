@@ -15,9 +15,9 @@ from skin.body.sheet import Sheet
 from skin.build import build_device, build_learner
 from skin.config import Tracking, plain, validate_config
 from skin.errors import InputError
+from skin.finished_run import FinishedRun, find_run
 from skin.simulator._elastic import Elastic
 from skin.simulator.solid import hexahedra
-from skin.stored_run import find_run, load_configuration
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -124,9 +124,9 @@ def test_what_is_refused_would_have_run(case, store, put, bait, marker):
     """Trust proves that the payloads work."""
     found = find_run(store, put(CASES[case][1](bait, marker)))
     with pytest.raises(InputError, match="trust=true"):
-        load_configuration(store, found)
+        found.stored  # noqa: B018 - raises
     assert not marker.exists()
-    trusted = load_configuration(store, found, trust=True)
+    trusted = FinishedRun(store, found.run, trust=True).stored
     for build in (build_device, build_learner):
         with suppress(Exception):
             build(trusted)
@@ -153,14 +153,14 @@ def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, 
 def test_yaml_makes_no_objects_and_does_not_grow(text, store, put, marker):
     found = find_run(store, put(text=text.replace("MARKER", str(marker))))
     with pytest.raises(InputError, match=found.info.run_id):
-        load_configuration(store, found)
+        found.stored  # noqa: B018 - raises
     assert not marker.exists()
 
 
 def test_what_a_run_is_called_leads_out_of_no_folder(store, put):
     found = find_run(store, put({"row": "x/../../marker"}))
     with pytest.raises(InputError, match="row"):
-        load_configuration(store, found)
+        found.stored  # noqa: B018 - raises
 
 
 @pytest.mark.parametrize("learner", ["boosted_trees", "network"])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from skin.build import build_data, build_device, build_learner
-from skin.trained import Trained
+from skin.model_of_run import RunModel
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=400"]
 
@@ -15,27 +15,26 @@ SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", 
 def untrained(configured):
     """Return a function that builds a run of a learner without training it."""
 
-    def build(*overrides: str) -> Trained:
+    def build(*overrides: str) -> RunModel:
         config = configured(*SMALL, *overrides)
         device, learner = build_device(config), build_learner(config)
         data = build_data(config, device)
         with torch.random.fork_rng():
             torch.manual_seed(0)
             learner.build(data)
-        return Trained(device, learner, device.window, data.touches("train").positions, device.model_rate)
+        return RunModel(device, learner, data.example, touch=0.3)
 
     return build
 
 
 @pytest.fixture(scope="session")
-def exported(untrained, tmp_path_factory) -> tuple[Trained, Path]:
+def exported(untrained, tmp_path_factory) -> tuple[RunModel, Path]:
     """Return the run with features, and its exported file."""
     pytest.importorskip("onnxruntime")
     from skin.exported.writer import write_model
-    from skin.hardware.live.engine_builder import describe
 
     of = untrained("experiment=best_fresh")
     path = tmp_path_factory.mktemp("exported") / "skin.onnx"
-    module = of.learner.pipeline(of.positions)
-    write_model(module, describe(of, "abc", "best_fresh naive seed 0", 0.3), of.device.touches("train"), path)
+    module = of.learner.pipeline(of.places)
+    write_model(module, of.describe(), of.device.touches("train"), path)
     return of, path

@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 
 from skin.checksum import KEY as CHECKSUM
 from skin.errors import InputError
-from skin.exported.identity import check_overrides, describe_skin
+from skin.exported.model import check_overrides, describe_skin
 from skin.paths import CONF
 
 onnx = pytest.importorskip("onnx")
@@ -20,13 +20,12 @@ SIZES = ["layout=grid", "layout.rows=2", "layout.columns=3"]
 def model(untrained, configured, tmp_path_factory):
     """Return the file of a network with the description of its skin."""
     from skin.exported.writer import write_model
-    from skin.hardware.live.engine_builder import describe
 
     of = untrained("representation=readings", "model=mlp", "fusion=early")
-    skin = describe_skin(configured("simulator=naive", *SIZES), of.positions.numpy())
+    skin = describe_skin(configured("simulator=naive", *SIZES), of.positions)
     path = tmp_path_factory.mktemp("identity") / "skin.onnx"
-    module = of.learner.pipeline(of.positions)
-    metadata = replace(describe(of, "abc", "small", 0.3), skin=skin)
+    module = of.learner.pipeline(of.places)
+    metadata = replace(of.describe(), skin=skin)
     write_model(module, metadata, of.device.touches("train")[:20], path)
     return path
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from skin import checksum
 from skin.errors import InputError
-from skin.exported.metadata import KEY, ModelMetadata
-from skin.exported.model import ExportedModel
+from skin.exported.model import KEY, ExportedModel, ModelMetadata
 from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 onnx = pytest.importorskip("onnx")

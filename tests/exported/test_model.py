@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.exported.metadata import KEY, ModelMetadata
-from skin.exported.model import ExportedModel
+from skin.exported.model import KEY, ExportedModel, ModelMetadata
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -18,7 +17,7 @@ def test_it_describes_itself(exported):
     about = ExportedModel(path).metadata
     assert about.task == of.device.task
     assert (about.rate, about.window, len(about.positions)) == (10.0, 30, 6)
-    assert (about.run, about.contact, about.saturation) == ("abc", 0.3, 10.0)
+    assert (about.run, about.contact, about.saturation) == ("none", 0.3, 10.0)
     entry = {one.key: one.value for one in onnx.load(path).metadata_props}[KEY]
     assert json.loads(entry)["schema"] == 1
     assert json.loads(entry)["sensors"] == 6

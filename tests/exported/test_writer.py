@@ -6,7 +6,6 @@ import torch
 
 from skin.errors import InputError
 from skin.exported.model import ExportedModel
-from skin.hardware.live.engine_builder import describe
 from skin.learner.rules import Rules
 from skin.recording import Touches
 from skin.representation.graph import Graph
@@ -16,7 +15,7 @@ from skin.exported.writer import TOLERANCE, write_model
 
 
 def difference(of, path, readings, valid):
-    expected = of.learner.probabilities(Touches(readings, valid, of.positions, None, of.rate))
+    expected = of.learner.probabilities(Touches(readings, valid, of.places, None, of.rate))
     found = ExportedModel(path).probabilities(readings.numpy(), valid.numpy())
     assert found.shape == tuple(expected.shape)
     return float(np.abs(found - expected.numpy()).max())
@@ -65,9 +64,9 @@ def test_invalid_readings_idle_windows_and_single_sensors(exported):
 )
 def test_other_networks(untrained, tmp_path, overrides):
     of = untrained(*overrides)
-    described = describe(of, "abc", "row", 0.3)
+    described = of.describe()
     touches = of.device.touches("train")
-    found = write_model(of.learner.pipeline(of.positions), described, touches, tmp_path / "skin.onnx")
+    found = write_model(of.learner.pipeline(of.places), described, touches, tmp_path / "skin.onnx")
     assert found <= TOLERANCE
 
 
@@ -78,9 +77,9 @@ def test_a_learner_that_is_no_network_is_refused():
 
 def test_a_graph_per_frame_is_refused_and_nothing_is_written(untrained, tmp_path):
     of = untrained("experiment=sequence_graph")
-    described, touches = describe(of, "abc", "row", 0.3), of.device.touches("test")[:9]
-    pipeline = of.learner.pipeline(of.positions)
-    pipeline.representation = Graph(of.positions, of.device.size, positions="deformed")
+    described, touches = of.describe(), of.device.touches("test")[:9]
+    pipeline = of.learner.pipeline(of.places)
+    pipeline.representation = Graph(of.places, of.device.size, positions="deformed")
     with pytest.raises(InputError, match="needs touches with displacements"):
         write_model(pipeline, described, touches, tmp_path / "x.onnx")
     assert not list(tmp_path.iterdir())
@@ -95,7 +94,7 @@ def test_a_file_that_differs_is_not_written(exported, tmp_path):
         def forward(self, readings, valid):
             return readings.mean(dim=1)[:, :4].sigmoid() + torch.compiler.is_exporting()
 
-    described = describe(of, "abc", "row", 0.3)
+    described = of.describe()
     with pytest.raises(InputError, match="would differ from the network by 1"):
         write_model(Drifting(), described, of.device.touches("train"), tmp_path / "skin.onnx")
     assert not list(tmp_path.iterdir())

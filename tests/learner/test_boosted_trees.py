@@ -1,5 +1,8 @@
 """Boosted trees."""
 
+import zipfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -42,8 +45,20 @@ def test_a_label_that_never_changes_is_refused(made_up_device):
         BoostedTrees(rounds=2).fit(TouchData(made_up_device, Readings))
 
 
-def test_what_is_stored_needs_no_pickle(made_up_device, tmp_path):
-    features = BoostedTrees(rounds=2)
-    features.fit(TouchData(made_up_device, Readings))
-    with np.load(features.save(tmp_path), allow_pickle=False) as stored:
-        assert stored["train"].shape[0] == 160
+def test_what_is_stored_predicts_the_same_bits_without_a_pickle(made_up_device, tmp_path):
+    features, again = BoostedTrees(rounds=20), BoostedTrees()
+    data = TouchData(made_up_device, Readings)
+    features.fit(data)
+    path = features.save(tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        assert {Path(name).suffix for name in archive.namelist()} == {".json", ".npy"}
+    again.load(data, path)
+    assert again.parameters == features.parameters
+    touches = made_up_device.touches("test")
+    assert torch.equal(again.probabilities(touches), features.probabilities(touches))
+
+
+def test_trees_of_an_earlier_version_are_refused(made_up_device, tmp_path):
+    np.savez(tmp_path / "features.npz", train=np.zeros(3))
+    with pytest.raises(InputError, match=r"features.npz holds the training data .*: train the run again"):
+        BoostedTrees().load(TouchData(made_up_device, Readings), tmp_path / "features.npz")

@@ -15,7 +15,7 @@ from experiments.studies.study import Study, Variant
 from experiments.studies.trials import RestoredRun, Trial, numbered_settings, read_row, votes, write_row
 from skin.config import fingerprint
 from skin.errors import InputError
-from skin.pretrained import find_pretrained
+from skin.finished_run import find_pretrained
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.

@@ -1,177 +1,249 @@
-"""Build an engine from a finished run."""
+"""Build the engine of a live view from a trained model, a skin and settings. torch is not imported."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from time import monotonic
+from typing import Any
 
-import numpy as np
-import torch
-from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
+from omegaconf import DictConfig
 
-from skin import __version__
-from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.evaluation.operating_point import Predictor
-from skin.exported.metadata import ModelMetadata
-from skin.hardware.live.engine import Classify, DebounceSettings, Detection, Engine, EngineSettings
-from skin.hardware.wired import AbstractWired
-from skin.recording import Touches
+from skin.exported.model import ExportedModel
+from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.hardware.live.live_settings import LiveSettings
+from skin.hardware.live.selftest import SelfTest
 from skin.signal.contact_detection import DRIFT
-from skin.signal.contact_threshold import ContactThreshold, rise
-from skin.trained import Trained
+from skin.trained_model import TrainedModel
+from skin.wire.channels import UnitConversion
+from skin.wire.reader import PortSettings, SkinTimeout
+from skin.wire.skin import Skin
+from skin.wire.source import SerialSource, Source
 
-_FAINT = 0.3  # N, default contact threshold
-_MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
+USUAL_RATE = 100.0
+"""Hz: of a device whose rate is not known yet, for the choice of a threshold."""
+
+_PATIENCE = 3.0  # s
+_ENOUGH = 20  # frames that show the rate
 
 
-def nominal_settings(of: Trained, above: float | None = None) -> EngineSettings:
-    """Return the settings of the engine of a run that it brings itself.
+@dataclass(frozen=True)
+class Watched:
+    """The settings of an engine and what it is fed with.
+
+    Attributes:
+        model: that predicts.
+        source: open.
+        settings: of the engine, in use.
+        nominal: those that the model brings.
+    """
+
+    model: TrainedModel
+    source: Source
+    settings: EngineSettings
+    nominal: EngineSettings
+
+    @property
+    def span(self) -> float:
+        """Length of the window, s."""
+        return self.settings.frames / self.settings.rate
+
+    @property
+    def selftest(self) -> SelfTest | None:
+        """The test of the alarm; None where no alarm is raised, or no touches are known."""
+        if self.nominal.presses is None or not self.model.alarms:
+            return None
+        return SelfTest(self.nominal.presses, self.settings, self.nominal)
+
+    def check(self, test: bool, say: Callable[[str], None], conversion: UnitConversion) -> None:
+        """Run the self-test with the conversion that is in use.
+
+        Args:
+            test: ``live.selftest``.
+            say: called with each message for the user.
+            conversion: of the device's values to N.
+
+        Raises:
+            InputError: the settings in use hide dangerous touches.
+        """
+        if not test:
+            say("no self-test: live.selftest=false")
+        elif (selftest := self.selftest) is None:
+            say("no self-test: this run brings no alarm or no simulated skin")
+        else:
+            selftest.run(conversion, self.source.raw_range, say)
+
+
+def watch_exported(
+    path: str, device: Mapping[str, Any], live: LiveSettings, say: Callable[[str], None], opened: ExitStack
+) -> Watched:
+    """Return an exported network and a skin at a port.
 
     Args:
-        of: the run.
-        above: threshold of its alarm; None: 0.5.
+        path: of the ONNX file.
+        device: settings of ``device=serial``.
+        live: settings of the live view.
+        say: called with each message for the user.
+        opened: closes the port in the end.
 
     Raises:
-        InputError: the device of the run has no streams on which a contact threshold could be tuned.
+        InputError: the file cannot be used, or the device is no skin at a port, or cannot be opened.
     """
-    return EngineSettings(
-        window_classifier(of.learner, of.positions, of.rate),
-        of.device.task,
-        len(of.positions),
-        of.window,
-        of.rate,
-        _detection(of, None),
-        DebounceSettings(above=above),
-        press_readings(of),
-    )
+    if "port" not in device:
+        raise InputError(
+            f"run={path} watches a skin at a port: add device=serial device.port=/dev/ttyACM0, or give the "
+            "run itself for a recording or the simulator"
+        )
+    model = ExportedModel(path)
+    source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
+    opened.enter_context(source.skin)
+    say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
+    return watch(model, source, live, say, lambda: source)
 
 
-def make_engine(
-    of: Trained, patience: DebounceSettings, touch: float | None = None, drift: float = 600 * DRIFT
-) -> Engine:
-    """Return the engine of a run with its own threshold.
+def watch_run(
+    config: DictConfig,
+    live: LiveSettings,
+    say: Callable[[str], None],
+    overrides: Sequence[str],
+    opened: ExitStack,
+    own_mechanics: bool = False,
+) -> Watched:
+    """Return a finished run and the device of a configuration.
 
     Args:
-        of: the run.
-        patience: settings of debouncing.
-        touch: contact threshold, N above the baseline; None: tuned on simulated streams of its device, and
-            the learned label ``touch`` is used too.
+        config: of the command.
+        live: settings of the live view.
+        say: called with each message for the user.
+        overrides: settings that replace those of the run; ``config`` has their values.
+        opened: closes the device in the end.
+        own_mechanics: the device has the mechanics of the run, though it is at a port.
+
+    Raises:
+        InputError: there is no such run, it cannot be loaded, or the device cannot be opened.
+    """
+    import torch
+
+    from skin.build import build_device
+    from skin.finished_run import FinishedRun
+    from skin.hardware.wired import open_source
+    from skin.model_of_run import equation10_warning, load_model
+
+    torch.set_num_threads(config.tracking.threads or 1)
+    run = FinishedRun.named(config)
+    watched = run.configured(config, overrides)
+    device = build_device(watched)
+    # A port is opened first: that it is missing must not take as long to say as a run takes to load.
+    port = open_source(device) if device.real else None
+    if port is not None:
+        opened.enter_context(port.skin)
+    # The training data stay those of the run, for any watched device.
+    trained = run.configured(
+        config, [word for word in overrides if not word.startswith(("device=", "device."))]
+    )
+    say(f"loading {run.title} ({run.identity[:8]})")
+    if not own_mechanics and (advice := equation10_warning(run.stored, device)):
+        say(advice)
+    # Without a simulator nothing could tune a contact threshold.
+    touch = None if "simulator" in run.stored.device else live.touch
+    model = load_model(run, trained, watched, touch=touch, alarm=False)
+
+    def begin() -> Source:
+        source = open_source(device)
+        opened.enter_context(source.skin)
+        return source
+
+    return watch(model, port, live, say, begin)
+
+
+def engine_settings(
+    model: TrainedModel,
+    patience: DebounceSettings,
+    touch: float | None = None,
+    drift: float = 600 * DRIFT,
+) -> EngineSettings:
+    """Return the settings of the engine of a model.
+
+    Args:
+        model: that predicts.
+        patience: settings of debouncing; without a threshold of the alarm, that of the model for windows.
+        touch: contact threshold, N above the baseline; None: that of the model, and the learned label
+            ``touch`` counts as touch, too.
         drift: N in ten minutes that the baseline may follow without touch.
 
     Raises:
-        InputError: ``touch`` is neither given nor learned and the device has no streams; or the run cannot
-            raise an alarm.
+        InputError: ``touch`` is neither given nor known, or the threshold raises no alarm.
     """
-    if patience.above is None and of.point is not None:
-        if of.point.silent:
-            raise InputError(f"{of.point.warning()}: give live.patience.above=0.5, or train another run")
-        patience = replace(patience, above=of.point.threshold)
-    shape = len(of.positions), of.window, of.rate
-    classify = window_classifier(of.learner, of.positions, of.rate)
-    detection = _detection(of, touch, drift)
-    return Engine(classify, of.device.task, *shape, detection, patience, press_readings(of))
+    contact = model.contact if touch is None else touch
+    if patience.above is None and model.threshold is not None:
+        if model.threshold >= 1:
+            raise InputError(
+                f"{model.title} has no threshold that raises an alarm: give live.patience.above=0.5, or "
+                "train another run"
+            )
+        patience = replace(patience, above=model.threshold)
+    return EngineSettings(
+        model.probabilities,
+        model.task,
+        len(model.positions),
+        model.window,
+        model.rate,
+        Detection(contact, drift / 600, model.learned and touch is None, model.longest),
+        patience,
+        model.presses,
+    )
 
 
-def press_readings(of: Trained) -> np.ndarray | None:
-    """Return the readings (S, S), N, of a press at the limit on each sensor; None: nothing is simulated."""
-    return None if of.device.reference is None else of.device.reference.press_readings().double().numpy()
-
-
-def window_classifier(learner: Predictor, positions: Tensor, rate: float) -> Classify:
-    """Return a function of the readings and validity of windows that asks a learner.
+def watch(
+    model: TrainedModel,
+    port: Source | None,
+    live: LiveSettings,
+    say: Callable[[str], None],
+    begin: Callable[[], Source],
+) -> Watched:
+    """Return a model and a skin with the settings of a live view.
 
     Args:
-        learner: trained.
-        positions: (S, 3), m.
-        rate: Hz.
-    """
-
-    @torch.inference_mode()
-    def classify(readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        windows = torch.from_numpy(readings), torch.from_numpy(valid)
-        return learner.probabilities(Touches(*windows, positions, None, rate)).numpy()
-
-    return classify
-
-
-def describe(
-    of: Trained,
-    run: str,
-    title: str,
-    touch: float | None = None,
-    thresholds: Mapping[float, float] | None = None,
-) -> ModelMetadata:
-    """Return the description of a run for an exported file.
-
-    Args:
-        of: the run.
-        run: its id.
-        title: its name.
-        touch: as in :func:`make_engine`.
-        thresholds: rate of a device, Hz -> threshold of the alarm; None: that of ``of`` only.
+        model: that predicts.
+        port: open source of a skin at a port; None: the skin is simulated or recorded.
+        live: settings of the live view.
+        say: called with each message for the user.
+        begin: opens the source of a skin that is simulated or recorded.
 
     Raises:
-        InputError: as in :func:`make_engine`.
+        InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
     """
-    task, detection, presses = of.device.task, _detection(of, touch), press_readings(of)
-    return ModelMetadata(
-        run=run,
-        title=title,
-        version=__version__,
-        labels=list(task.names),
-        kind=task.kind,
-        gate=task.gate,
-        direction=task.direction,
-        rate=of.rate,
-        window=of.window,
-        positions=of.positions.tolist(),
-        size=of.device.size,
-        saturation=None if of.device.reference is None else of.device.reference.imperfection.clip,
-        threshold=None if of.point is None else of.point.threshold,
-        contact=detection.threshold,
-        learned=detection.learned,
-        longest=detection.longest,
-        thresholds={f"{rate:g}": value for rate, value in thresholds.items()} if thresholds else None,
-        presses=None if presses is None else presses.round(4).tolist(),
+    above = live.patience.above
+    if above is not None:
+        say(f"alarm above {above:g}")
+        # A threshold of the command line is tested against the usual one.
+        usual = model.threshold
+    elif model.alarms:
+        rate = model.rate if port is None else measured_rate(port.skin)
+        above = usual = model.threshold_at(rate, live.patience.alarm, port is None, say)
+    else:
+        usual = None
+    nominal = engine_settings(model, DebounceSettings(above=usual))
+    detection = replace(
+        nominal.detection,
+        threshold=nominal.detection.threshold if live.touch is None else live.touch,
+        drift=live.drift / 600,
+        learned=nominal.detection.learned and live.touch is None,
     )
+    used = replace(nominal, detection=detection, patience=replace(live.patience, above=above))
+    return Watched(model, port or begin(), used, nominal)
 
 
-def _detection(of: Trained, touch: float | None, drift: float = 600 * DRIFT) -> Detection:
-    learned = touch is None and of.device.task.gate is not None
-    least = _tuned(of.device, learned) if touch is None else touch
-    return Detection(least, drift / 600, learned, longest_touch(of))
+def measured_rate(skin: Skin) -> float:
+    """Return the rate of a device, Hz: measured, else that of its header, else the usual one.
 
-
-def longest_touch(of: Trained) -> float:
-    """Return the longest touch that a run was trained on, s; two thirds of its window if unknown."""
-    if of.device.reference is not None:
-        return of.device.reference.sampler.settings.press[1]
-    return of.window * 2 / 3 / of.rate
-
-
-def _tuned(device: AbstractDevice, learned: bool) -> float:
-    if device.reference is None:
-        if learned:
-            return _FAINT
-        raise InputError("this run has no contact threshold: give live.touch=0.3 (N), or train on streams")
-    known = device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY).touches(
-        "validation"
-    )
-    assert known.labels is not None
-    return ContactThreshold.tuned(rise(known), known.labels[:, -1] > 0.5).least
-
-
-def simulator_warning(stored: DictConfig, device: AbstractDevice | None = None) -> str | None:
-    """Return a warning if a run trained with equation 10 is used on a real skin; else None.
-
-    Args:
-        stored: the run's configuration.
-        device: the watched device; None: a real skin.
+    Waits some seconds for its first frames, which are discarded.
     """
-    reading = OmegaConf.select(stored, "device.simulator.reading")
-    if reading != "equation10" or not (device is None or isinstance(device, AbstractWired)):
-        return None
-    return (
-        "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "
-        "mechanics (docs/results.md): train one with simulator=solid for a real skin"
-    )
+    deadline = monotonic() + _PATIENCE
+    while skin.stats.frames < _ENOUGH and monotonic() < deadline:
+        try:
+            skin.read(1, _PATIENCE / 10)
+        except SkinTimeout:
+            continue
+    declared = skin.header.rate if skin.header is not None else None
+    return skin.stats.rate_hz or declared or USUAL_RATE

@@ -4,7 +4,7 @@ import pytest
 
 from skin.build import build_device
 from skin.config import validate_config
-from skin.hardware.live.engine_builder import simulator_warning
+from skin.model_of_run import equation10_warning
 
 PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 
@@ -15,12 +15,12 @@ PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 )
 def test_a_run_on_equation_10_is_announced_at_a_port_only(configured, trained, warned):
     stored = configured(f"simulator={trained}")
-    said = simulator_warning(stored, build_device(validate_config(configured(*PORT))))
+    said = equation10_warning(stored, build_device(validate_config(configured(*PORT))))
     assert (said is not None) == warned
     assert said is None or "simulator=solid" in said
-    assert simulator_warning(stored, build_device(validate_config(configured("simulator=naive")))) is None
+    assert equation10_warning(stored, build_device(validate_config(configured("simulator=naive")))) is None
 
 
 def test_another_reading_of_plates_is_not(configured):
     stored = configured("simulator=fem", "simulator.reading=interface")
-    assert simulator_warning(stored, build_device(validate_config(configured(*PORT)))) is None
+    assert equation10_warning(stored, build_device(validate_config(configured(*PORT)))) is None

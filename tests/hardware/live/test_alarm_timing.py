@@ -5,10 +5,10 @@ import pytest
 
 from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
-from skin.hardware.live import engine_builder
 from skin.hardware.live.engine import DebounceSettings
+from skin.hardware.live.engine_builder import engine_settings
 from skin.hardware.live.selftest import COURSES, dangerous_touches, play_touch
-from skin.trained import Trained
+from skin.model_of_run import RunModel
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
 LEARNERS = {
@@ -30,15 +30,14 @@ def trained(request, configured):
     device, learner = build_device(config), build_learner(config)
     data = build_data(config, device)
     learner.fit(data)
-    of = Trained(device, learner, device.window, data.touches("train").positions, device.model_rate)
-    return of, device.replace(stream=False)
+    return RunModel(device, learner, data.example), device.replace(stream=False)
 
 
 @pytest.fixture(scope="module", params=[None, 0.3], ids=["learned", "threshold"])
 def engine(request, trained):
     """Return a live engine with each gate, and the device."""
     of, device = trained
-    return engine_builder.make_engine(of, DebounceSettings(), request.param), device
+    return engine_settings(of, DebounceSettings(), request.param).build(), device
 
 
 @pytest.mark.slow

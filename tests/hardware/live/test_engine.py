@@ -6,8 +6,8 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.live.engine import Debounce, DebounceSettings, Detection, Engine
-from skin.hardware.live.engine_builder import window_classifier
 from skin.labels import TOUCH, Task
+from skin.model_of_run import window_classifier
 from skin.recording import Touches
 from skin.signal.frame import Frame
 from skin.wire.channels import UnitConversion

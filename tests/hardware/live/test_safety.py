@@ -11,10 +11,10 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
-from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.live.selftest import SelfTest
 from skin.labels import TOUCH
+from skin.model_of_run import window_classifier
 from skin.wire.channels import RawRange, UnitConversion
 from skin.wire.protocol import Header, encode_header, encode_line
 from skin.wire.reader import PortSettings

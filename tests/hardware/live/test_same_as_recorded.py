@@ -10,12 +10,12 @@ import torch
 from skin.body.sheet import Sheet
 from skin.build import build_data, build_device, build_learner
 from skin.hardware.live.engine import Detection, Engine
-from skin.hardware.live.engine_builder import window_classifier
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.record.recorder import convert_session, record_session
 from skin.hardware.serial import Serial
 from skin.labels import TOUCH
 from skin.layout.grid import Grid
+from skin.model_of_run import window_classifier
 from skin.recording_file import read_recording
 from skin.wire.protocol import (
     Announcement,

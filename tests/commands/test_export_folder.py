@@ -1,4 +1,4 @@
-"""`skin publish` as a person runs it, and `run=NAME` of what it wrote."""
+"""`skin export format=folder` as a person runs it, and `run=NAME` of what it wrote."""
 
 import shutil
 
@@ -17,7 +17,7 @@ def folder(run, tmp_path_factory):
     done = run(folder, "train", "experiment=rules", *SKIN, *SMALL)
     assert done.returncode == 0, done.stderr
     (folder / "said").write_text(done.stdout)
-    done = run(folder, "publish", *GOOD)
+    done = run(folder, "export", "format=folder", *GOOD)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "models/small\n"
     return folder
@@ -70,10 +70,13 @@ def test_an_altered_file_ends_a_command_with_a_sentence(model, run):
         (["name=small", "licence=MIT"], "models/small exists"),
         (["name=new", "licence=MIT", "run=none"], "no finished training run none"),
         (["name=new", "licence=MIT", "run=small"], "has no predictions.parquet"),
+        (["name=new", "licence=MIT", "out=x"], "not to out=x: add name=my_skin"),
+        (["name=new", "licence=MIT", "format=onnx"], "add format=folder"),
+        (["name=new", "licence=MIT", "format=zip"], "format must be one of onnx, folder"),
     ],
 )
 def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):
-    done = run(folder, "publish", *overrides)
+    done = run(folder, "export", "format=folder", *overrides)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
@@ -81,7 +84,8 @@ def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):
 
 
 def test_weights_that_are_too_large_are_refused(folder, run):
-    code = "import skin.commands.publish as p; p._LARGEST = 100; p.main(['name=new', 'licence=MIT'{own}])"
+    code = "import skin.model_folder as m; from skin.commands.export import main; m._LARGEST = 100\n"
+    code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
     own = f", 'tracking.uri=sqlite:///{folder}/m.db'"
     (folder / "limited.py").write_text(code.format(own=own))
     done = run(folder, folder / "limited.py", store=False)

@@ -15,9 +15,8 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.exported.writer import write_model
 from skin.hardware.live.engine import DebounceSettings
-from skin.hardware.live.engine_builder import describe
+from skin.hardware.live.engine_builder import watch_exported
 from skin.hardware.live.live_settings import LiveSettings
-from skin.hardware.live.watched import watch_model
 from skin.learner.network import Network
 from skin.paths import ROOT
 from skin.wire.protocol import Header, encode_header, encode_line
@@ -40,7 +39,7 @@ finally:
 def trained(configured):
     """Return a small untrained network with six sensors, whose alarm is above 0.25, and some touches."""
     from skin.build import build_data, build_device, build_learner
-    from skin.trained import Trained
+    from skin.model_of_run import RunModel
 
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
     config = configured("simulator=naive", *sizes, "representation=readings", "model=mlp", "fusion=early")
@@ -50,7 +49,7 @@ def trained(configured):
     learner.build(data)
     known = data.touches("train")
     point = OperatingPoint(0.25, 0.02, 5000, 100, 0)
-    return Trained(device, learner, device.window, known.positions, device.model_rate, point), known
+    return RunModel(device, learner, data.example, point, 0.3), known
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +57,7 @@ def model(trained, tmp_path_factory):
     """Return the file of the network."""
     of, known = trained
     path = tmp_path_factory.mktemp("model") / "skin.onnx"
-    write_model(of.learner.pipeline(of.positions), describe(of, "abc", "small", 0.3), known, path)
+    write_model(of.learner.pipeline(of.places), of.describe(), known, path)
     return path
 
 
@@ -114,19 +113,18 @@ def test_it_runs_without_torch_and_writes_json_lines(model, skin, tmp_path):
 
 def test_only_a_skin_at_a_port_is_watched(model):
     with pytest.raises(InputError, match="add device=serial"), ExitStack() as opened:
-        watch_model(str(model), {"seed": 0}, LIVE, print, opened)
+        watch_exported(str(model), {"seed": 0}, LIVE, print, opened)
 
 
-@pytest.mark.parametrize(("rates", "threshold"), [(None, 0.25), ({20.0: 0.3, 100.0: 0.35, 500.0: 0.4}, 0.35)])
+@pytest.mark.parametrize(("rates", "threshold"), [(None, 0.25), ({"20": 0.3, "100": 0.35, "500": 0.4}, 0.35)])
 def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, rates, threshold):
     """The threshold is the one for the rate of the device, which sends 100 frames a second."""
     of, touches = trained
     path, said = tmp_path / "skin.onnx", []
-    described = describe(of, "abc", "small", 0.3, rates)
-    write_model(of.learner.pipeline(of.positions), described, touches, path)
+    write_model(of.learner.pipeline(of.places), of.describe(rates), touches, path)
     with ExitStack() as opened:
-        watched = watch_model(str(path), {"port": skin, "labels": "announced"}, LIVE, said.append, opened)
-    assert (watched.title, watched.span, len(watched.positions)) == ("small", 3.0, 6)
+        watched = watch_exported(str(path), {"port": skin, "labels": "announced"}, LIVE, said.append, opened)
+    assert (watched.model.title, watched.span, len(watched.model.positions)) == ("untrained", 3.0, 6)
     assert said[-1] == f"alarm above {threshold:.4f}"
     assert ("single windows" in said[-2]) == (rates is None)
     assert watched.nominal.presses.shape == (6, 6)
@@ -136,8 +134,8 @@ def test_the_settings_of_the_file_and_of_the_command(trained, skin, tmp_path, ra
 def test_the_command_replaces_settings_of_the_file(model, skin):
     said, other = [], replace(LIVE, touch=0.5, patience=DebounceSettings(above=0.75))
     with ExitStack() as opened:
-        watched = watch_model(str(model), {"port": skin}, other, said.append, opened)
-    assert said[-1] == "alarm above 0.7500"
+        watched = watch_exported(str(model), {"port": skin}, other, said.append, opened)
+    assert said[-1] == "alarm above 0.75"
     assert (watched.settings.detection.threshold, watched.nominal.detection.threshold) == (0.5, 0.3)
 
 

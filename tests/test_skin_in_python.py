@@ -11,7 +11,7 @@ from skin.layout.file import File
 from skin.layout.grid import Grid
 from skin.layout.random import Random
 from skin.material import Material, Relaxation
-from skin.skin_settings import with_skin
+from skin.run_overrides import with_skin
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.01},

@@ -1,15 +1,20 @@
 """The device on which the alarm's threshold is chosen, for a skin and for the imperfections of a device."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from skin.alarm_threshold import alarm_point, threshold_device
 from skin.config import plain, validate_config
 from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
+from skin.finished_run import TAG, FinishedRun
 from skin.paths import CONF
 from skin.run_overrides import profile_settings
-from skin.trained import choose_for_skin, threshold_device
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
 
@@ -54,10 +59,40 @@ def test_a_profile_holds_on_a_run_of_drawn_skins(hydra):
         assert device.noise == profile_settings(profile)["noise"]
 
 
+def run_of(config, point):
+    """Return as much of a run as its operating point is read from."""
+    data = SimpleNamespace(tags={TAG: point.text()})
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
+    run.__dict__["stored"] = kept(config)
+    return run
+
+
+class Quiet:
+    """Finds every touch a little dangerous."""
+
+    def probabilities(self, touches):
+        return torch.full((len(touches), 4), 0.25)
+
+
+STORED = OperatingPoint(0.875, 0.02, 5000, 99, 0)
+
+
 def test_the_stored_threshold_holds_without_another_profile(hydra):
-    assert choose_for_skin(None, kept(hydra()), hydra()) is None
+    assert alarm_point(run_of(hydra(), STORED), None, hydra()) == STORED
     rough = hydra("evaluation.profile=rough")
-    assert choose_for_skin(None, kept(rough), rough) is None
+    assert alarm_point(run_of(rough, STORED), None, rough) == STORED
+
+
+def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hydra):
+    skins = hydra("device=skins", "device.count=1")
+    assert alarm_point(run_of(skins, STORED), None, skins) == STORED
+    for run, config, one_skin in (
+        (hydra(), hydra("evaluation.profile=rough"), False),
+        (skins, hydra(), False),
+        (skins, skins, True),
+    ):
+        point = alarm_point(run_of(run, STORED), Quiet(), config, one_skin)
+        assert 0.25 < point.threshold < 0.2501
 
 
 def test_more_noise_means_higher_readings_at_rest(hydra):

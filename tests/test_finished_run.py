@@ -7,16 +7,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import skops.io as sio
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostingRegressor
+from sklearn.linear_model import LinearRegression
 
+from skin.alarm_threshold import stored_point
 from skin.build import build_data, build_device, build_learner
 from skin.config import Tracking, validate_config
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import Evaluation
+from skin.finished_run import TAG, FinishedRun, find_run
 from skin.paths import CONF
-from skin.stored_run import TAG, find_run, load_configuration, load_learner, load_operating_point
 from skin.tracking import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -47,12 +51,12 @@ def store(tmp_path_factory):
 
 
 def test_latest_is_the_last_training_that_finished(store):
-    assert find_run(store, "latest").info.run_name == "newer"
+    assert find_run(store, "latest").title == "newer"
 
 
 def test_the_beginning_of_an_id_is_enough(store):
     run = find_run(store, "latest")
-    assert find_run(store, run.info.run_id[:12]).info.run_id == run.info.run_id
+    assert find_run(store, run.identity[:12]).identity == run.identity
 
 
 @pytest.mark.parametrize(("name", "reason"), [("no such id", "no finished training run"), ("", "2 runs")])
@@ -67,7 +71,9 @@ RECORDED = OmegaConf.create({"device": {"_target_": "skin.device.recording.Recor
 def tagged(text=None):
     """Return as much of a run as its operating point is read from."""
     data = SimpleNamespace(tags={} if text is None else {TAG: text})
-    return SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc"))
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
+    run.__dict__["stored"] = RECORDED
+    return run
 
 
 def settings(rate=0.02):
@@ -76,13 +82,13 @@ def settings(rate=0.02):
 
 def test_an_operating_point_comes_back_as_it_was_stored(caplog):
     point = OperatingPoint(0.8782987594604492, 0.02, 5000, 99, 0)
-    assert load_operating_point(tagged(point.text()), None, RECORDED, settings()) == point
-    assert load_operating_point(tagged("null"), None, RECORDED, settings()) is None
+    assert stored_point(tagged(point.text()), None, settings()) == point
+    assert stored_point(tagged("null"), None, settings()) is None
     assert caplog.text == ""
 
 
 def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(caplog):
-    point = load_operating_point(tagged(), None, RECORDED, settings())
+    point = stored_point(tagged(), None, settings())
     assert (point.threshold, point.safe) == (0.5, 0)
     said = caplog.text
     assert "run abc stores no alarm threshold for 2 % false alarms" in said
@@ -91,7 +97,7 @@ def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(caplog):
 
 def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(caplog):
     point = OperatingPoint(0.875, 0.02, 300, 5, None)
-    assert load_operating_point(tagged(point.text()), None, RECORDED, settings(0.1)) == point
+    assert stored_point(tagged(point.text()), None, settings(0.1)) == point
     said = caplog.text
     assert "no alarm threshold for 10 % false alarms" in said
     assert "chosen on 300 safe validation gestures for 2 % false alarms" in said
@@ -105,7 +111,7 @@ def whole(tmp_path_factory):
     """What learners save: the name of the file -> its content."""
     found = {}
     for name, learner in (
-        ("features.npz", ["learner=boosted_trees", "learner.rounds=2"]),
+        ("trees.skops", ["learner=boosted_trees", "learner.rounds=2", "data.gestures=200"]),
         ("rules.json", ["learner=rules"]),
     ):
         config = validate_config(composed(*SKIN, *learner))
@@ -117,46 +123,65 @@ def whole(tmp_path_factory):
     return found | {"weights.pt": b"PK\3\4" + bytes(100)}
 
 
+def stored(change):
+    """Return a function of a file of trees that gives one of the same models, changed."""
+
+    def damage(content):
+        models = sio.loads(content, trusted=sio.get_untrusted_types(data=content))
+        return sio.dumps(change(models) or models)
+
+    return damage
+
+
+def nodes(**values):
+    """Return a function that changes the first node of the first tree of models."""
+
+    def change(models):
+        for name, value in values.items():
+            models[0]._predictors[0][0].nodes[name][0] = value
+
+    return change
+
+
 def claimed(shape):
-    """Return an .npz file whose arrays claim a shape that they do not have."""
+    """Return a function of a file of trees whose arrays claim a shape that they do not have."""
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": shape})
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name in ("train", "train_labels", "validation", "validation_labels"):
-            archive.writestr(f"{name}.npy", header.getvalue() + bytes(64))
-    return buffer.getvalue()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+
+    def damage(content):
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(content)) as before, zipfile.ZipFile(buffer, "w") as after:
+            for name in before.namelist():
+                text = before.read(name)
+                after.writestr(name, header.getvalue() + bytes(64) if name.endswith(".npy") else text)
+        return buffer.getvalue()
+
+    return damage
 
 
-def foreign(**arrays):
-    """Return an .npz file of arrays."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
-
-
-def tables(rows, columns, labels):
-    """Return an .npz file as learner=boosted_trees saves it, of random numbers."""
-    random = np.random.default_rng(0)
-    parts = {}
-    for split in ("train", "validation"):
-        parts[split] = random.normal(size=(rows, columns)).astype(np.float32)
-        parts[f"{split}_labels"] = random.integers(0, 2, (rows, labels)).astype(np.float32)
-    return foreign(**parts)
+class Stranger:
+    """A class that no file may choose."""
 
 
 DAMAGED = {
-    "cut": ("features.npz", lambda content: content[:-100]),
-    "almost empty": ("features.npz", lambda content: content[:3]),
-    "a byte": ("features.npz", lambda content: content[:200] + b"\0\1\2\3" + content[204:]),
-    "text": ("features.npz", lambda content: b"no archive"),
-    "larger than memory": ("features.npz", lambda content: claimed((250_000_000, 240))),
-    "an endless shape": ("features.npz", lambda content: claimed((10**400,))),
-    "other arrays": ("features.npz", lambda content: foreign(a=np.ones(3))),
-    "texts": ("features.npz", lambda content: foreign(**dict.fromkeys(
-        ("train", "train_labels", "validation", "validation_labels"), np.array([["x"] * 4] * 9)))),
-    "other features": ("features.npz", lambda content: tables(20, 5, 4)),
-    "other labels": ("features.npz", lambda content: tables(20, 5, 2)),
+    "cut": ("trees.skops", lambda content: content[:-100]),
+    "almost empty": ("trees.skops", lambda content: content[:3]),
+    "a byte": ("trees.skops", lambda content: content[:200] + b"\0\1\2\3" + content[204:]),
+    "text": ("trees.skops", lambda content: b"no archive"),
+    "larger than memory": ("trees.skops", claimed((250_000_000, 240))),
+    "an endless shape": ("trees.skops", claimed((10**400,))),
+    "other content": ("trees.skops", stored(lambda models: {"a": 1})),
+    "a stranger": ("trees.skops", stored(lambda models: [Stranger()] * 4)),
+    "another estimator": ("trees.skops", stored(lambda models: [LinearRegression()] * 4)),
+    "regressors": ("trees.skops", stored(lambda models: [
+        HistGradientBoostingRegressor(max_iter=1).fit(np.eye(60), np.arange(60))] * 4)),
+    "other features": ("trees.skops", stored(lambda models: [
+        HistGradientBoostingClassifier(max_iter=1).fit(np.eye(60), np.arange(60) % 2)] * 4)),
+    "other labels": ("trees.skops", stored(lambda models: models[:2])),
+    "a loop": ("trees.skops", stored(nodes(left=0))),
+    "a missing child": ("trees.skops", stored(nodes(right=10_000))),
+    "a missing feature": ("trees.skops", stored(nodes(feature_idx=-7))),
+    "a category": ("trees.skops", stored(nodes(is_categorical=1))),
     "a list": ("rules.json", lambda content: b"[]"),
     "other rules": ("rules.json", lambda content: b"{}"),
     "cut rules": ("rules.json", lambda content: content[:40]),
@@ -172,7 +197,7 @@ DAMAGED = {
 @pytest.mark.parametrize("case", DAMAGED)
 def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store, whole, tmp_path):
     name, damage = DAMAGED[case]
-    kind = {"features.npz": "boosted_trees", "rules.json": "rules", "weights.pt": "network"}[name]
+    kind = {"trees.skops": "boosted_trees", "rules.json": "rules", "weights.pt": "network"}[name]
     config = validate_config(composed(*SKIN, f"learner={kind}"))
     path = tmp_path / name
     path.write_bytes(damage(whole[name]))
@@ -180,7 +205,7 @@ def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store,
         store.client.log_artifact(run.info.run_id, str(path))
     data, learner = build_data(config, build_device(config)), build_learner(config)
     with pytest.raises(InputError, match=rf"{name} of run .* is damaged or does not fit") as refused:
-        load_learner(store, store.client.get_run(run.info.run_id), learner, data)
+        FinishedRun(store, store.client.get_run(run.info.run_id)).load_weights(learner, data)
     assert "\n" not in str(refused.value)
 
 
@@ -189,11 +214,11 @@ def test_a_run_without_its_files_is_refused(store):
         pass
     config = validate_config(composed(*SKIN, "learner=rules"))
     with pytest.raises(InputError, match=r"has no rules\.json in "):
-        load_learner(store, store.client.get_run(run.info.run_id), build_learner(config), None)
+        FinishedRun(store, store.client.get_run(run.info.run_id)).load_weights(build_learner(config), None)
 
 
 def test_a_run_of_another_version_is_refused(store):
     with store.run("other", {"learned": "rules.json"}) as run:
         store.client.log_text(run.info.run_id, "evaluation: {gestures: 5}", "config.yaml")
     with pytest.raises(InputError, match=r"does not fit this version: .*gestures.*: train it again$"):
-        load_configuration(store, run)
+        _ = FinishedRun(store, run).stored

@@ -101,9 +101,7 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
     # Neither the shell nor Hydra expands ~ in device.path=~/x.csv.
     options = parser.parse_args([word.replace("=~/", f"={Path.home()}/", 1) for word in words])
     if options.help:
-        if hasattr(signal, "SIGPIPE"):  # for `skin VERB --help | head`
-            signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-        print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
+        _print(_help(sys.modules[job.__module__].__doc__ or "", options.config_name or name, options))
         return
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     # Makes Hydra raise errors instead of printing them.
@@ -113,6 +111,16 @@ def _run(job: Callable[[DictConfig], Any], name: str, words: Sequence[str]) -> N
     finally:
         if full_error is None:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _print(text: str) -> None:
+    """Print a text; end quietly where nobody reads it to the end, as in ``skin VERB --help | head``."""
+    if not hasattr(signal, "SIGPIPE"):
+        print(text)
+        return
+    handler = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    print(text, flush=True)
+    signal.signal(signal.SIGPIPE, handler)
 
 
 def _help(about: str, name: str, options_given: Any) -> str:

@@ -260,6 +260,8 @@ def simulator(config: DictConfig) -> str:
 
 def _option(part: DictConfig, name: str) -> str:
     """Return the name of the option that a part of a configuration builds."""
+    if "_target_" not in part:
+        raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
     return option_name(import_target(part["_target_"], name))
 
 

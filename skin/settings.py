@@ -167,6 +167,8 @@ def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
         for key, one in value.items():
             yield from _parts(one, f"{name}.{key}" if name else str(key))
         target = value.get("_target_")
+        if target is None and (option := name.rpartition(".")[2]) in _INNER:
+            raise InputError(f"{option} chooses no option: leave it out, or give one that --help lists")
         if target is not None and not str(target).startswith(_LIBRARIES):
             yield name, value
 

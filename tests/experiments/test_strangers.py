@@ -152,7 +152,7 @@ def test_a_stored_configuration_cannot_say_that_it_is_trusted(run, folder, put, 
 )
 def test_yaml_makes_no_objects_and_does_not_grow(text, store, put, marker):
     found = find_run(store, put(text=text.replace("MARKER", str(marker))))
-    with pytest.raises(InputError, match=found.info.run_id):
+    with pytest.raises(InputError, match=found.identity):
         found.stored  # noqa: B018 - raises
     assert not marker.exists()
 

@@ -84,7 +84,7 @@ def measured(configured, tmp_path, monkeypatch):
                 pass
             run = store.client.get_run(run.info.run_id)
         own = RestoredRun(store, run, config)
-        own.stored = config
+        own.finished.__dict__["stored"] = config
 
         def trial(line="device.dead=1"):
             assert own.measure(study(**settings), "a, b", "1", [], [line])["metrics"] == ROW["metrics"]

@@ -18,9 +18,9 @@ TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist load
 # Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
-NUMERICAL := $(addprefix tests/,body contact design evaluation fusion hardware/calibration hardware/record layout learner model \
-	representation signal simulator studies/test_embeddings.py studies/test_embedding_probe.py test_classifier.py test_labels.py test_material.py touch \
-	validation wire/test_segmentation.py wire/test_tare.py)
+NUMERICAL := $(addprefix tests/,body design evaluation hardware/calibration hardware/record hardware/wire/test_segmentation.py \
+	hardware/wire/test_tare.py learning mechanics studies/test_embeddings.py studies/test_embedding_probe.py touch validation \
+	$(addprefix device/test_,calibration.py imperfection.py resampling.py device_sampling.py))
 
 # Hundreds of tests start a command of this project; without bytecode each of them would compile the modules again.
 unexport PYTHONDONTWRITEBYTECODE
@@ -81,7 +81,7 @@ demo: $(READY)  ## show the predictions of a pretrained model for an emulated sk
 	@$(BIN)/skin live demo=true
 
 ui: $(READY)  ## compare runs in the MLflow UI on 127.0.0.1:5000
-	@$(BIN)/python -c "from skin.tracking import print_table_link; print_table_link()"
+	@$(BIN)/python -c "from skin.runs.store import print_table_link; print_table_link()"
 	MLFLOW_DISABLE_TELEMETRY=true MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
 		--backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port 5000 --workers 1
 

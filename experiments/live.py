@@ -2,7 +2,7 @@
 
 import sys
 
-from skin.cli import main
+from skin.__main__ import main
 
 if __name__ == "__main__":
     main(["live", *sys.argv[1:]])

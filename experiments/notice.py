@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from importlib.metadata import PackageMetadata, PackageNotFoundError, metadata
 from pathlib import Path
 
+from skin.core.files import ROOT, write
 from skin.errors import InputError
-from skin.files import write
-from skin.paths import ROOT
 
 _HEAD = """\
 Tactile skin

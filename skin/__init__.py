@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skin.body.arm import Arm as Arm
+    from skin.body.layout.file import File as LayoutFile
+    from skin.body.layout.grid import Grid as Grid
     from skin.body.sheet import Sheet as Sheet
+    from skin.device.files import read_recording as read_recording
     from skin.errors import InputError as InputError
-    from skin.layout.file import File as LayoutFile
-    from skin.layout.grid import Grid as Grid
-    from skin.model_of_run import load_run as load_run
-    from skin.recording_file import read_recording as read_recording
-    from skin.simulator.fem import PlatesAndBeams as PlatesAndBeams
-    from skin.simulator.solid import Solid as Solid
-    from skin.wire.skin import open_skin as open_skin
+    from skin.hardware.wire.skin import open_skin as open_skin
+    from skin.mechanics.simulator.fem import PlatesAndBeams as PlatesAndBeams
+    from skin.mechanics.simulator.solid import Solid as Solid
+    from skin.runs.model_of_run import load_run as load_run
 
 __version__ = "0.1.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
@@ -24,15 +24,15 @@ __all__ += ["load_run", "open_skin", "read_recording"]
 
 _PLACES = {
     "Arm": "skin.body.arm",
-    "Grid": "skin.layout.grid",
+    "Grid": "skin.body.layout.grid",
     "InputError": "skin.errors",
-    "LayoutFile": "skin.layout.file:File",
-    "PlatesAndBeams": "skin.simulator.fem",
+    "LayoutFile": "skin.body.layout.file:File",
+    "PlatesAndBeams": "skin.mechanics.simulator.fem",
     "Sheet": "skin.body.sheet",
-    "Solid": "skin.simulator.solid",
-    "load_run": "skin.model_of_run",
-    "open_skin": "skin.wire.skin",
-    "read_recording": "skin.recording_file",
+    "Solid": "skin.mechanics.simulator.solid",
+    "load_run": "skin.runs.model_of_run",
+    "open_skin": "skin.hardware.wire.skin",
+    "read_recording": "skin.device.files",
 }
 
 

@@ -36,10 +36,10 @@ from filelock import FileLock
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from skin.core.files import ROOT
 from skin.device.base import AbstractDevice
-from skin.labels import TOUCH
-from skin.paths import ROOT
-from skin.recording import Touches
+from skin.device.touches import Touches
+from skin.touch.labels import TOUCH
 from tests.starter import copying
 
 CONF = ROOT / "conf"
@@ -87,7 +87,7 @@ def empty_database(shared) -> Callable[[], Path]:
 def stores_are_copied(empty_database):
     """Let new stores begin as copies of an empty database."""
     with pytest.MonkeyPatch.context() as patch:
-        if tracking := sys.modules.get("skin.tracking"):  # else no test opens a store
+        if tracking := sys.modules.get("skin.runs.store"):  # else no test opens a store
             patch.setattr(tracking.Store, "open", copying(empty_database))
         yield
 
@@ -333,7 +333,7 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
 
-    from skin.cli import main
+    from skin.__main__ import main
 
     state, environment, here = Singleton.get_state(), dict(os.environ), Path.cwd()
     threads, handlers = (

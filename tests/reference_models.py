@@ -2,7 +2,7 @@
 
 Same networks, same numbers; but a PyTorch Geometric ``Data`` object per graph, and a dense image of three
 equal channels per frame, convolved frame by frame. Weights are interchangeable with
-``skin.classifier.TouchClassifier`` by ``take_weights``.
+``skin.learning.classifier.TouchClassifier`` by ``take_weights``.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,9 +13,9 @@ from torch.nn import functional as F
 from torch_geometric.data import Batch, Data
 from torch_geometric.nn import AttentionalAggregation, GCNConv, global_max_pool
 
-from skin.recording import Touches
-from skin.representation._pixels import pixel_of
-from skin.representation.graph import adjacency, neighbours
+from skin.device.touches import Touches
+from skin.learning.representation.graph import adjacency, neighbours
+from skin.learning.representation.image import pixel_of
 
 PIXELS, SCALE, WINDOW, LABELS = 64, 10.0, 30, 4
 

@@ -29,10 +29,10 @@ WARM = (
     "mlflow.store.tracking.sqlalchemy_store",
     "pytorch_lightning.callbacks",
     "skfem",
-    "skin.learner.boosted_trees",
-    "skin.learner.network",
+    "skin.learning.learner.boosted_trees",
+    "skin.learning.learner.network",
     "skin.evaluation.report",
-    "skin.run",
+    "skin.runs.train",
 )
 
 
@@ -40,7 +40,7 @@ def main() -> None:
     """Run jobs until nobody is connected; returns in every fork, too, which then runs its script."""
     folder = Path(sys.argv[1])
     made = _warm()
-    from skin.tracking import Store
+    from skin.runs.store import Store
 
     Store.open = copying(lambda: Path(sys.argv[2]))  # type: ignore[method-assign, assignment]
     assert threading.active_count() == 1, "a fork keeps one thread"
@@ -92,7 +92,7 @@ def _warm() -> dict[str, str]:
 
 def copying(empty: Callable[[], Path]) -> Callable[[Any], Any]:
     """Return ``Store.open``, but a store that does not exist yet begins as a copy of an empty database."""
-    from skin.tracking import Store
+    from skin.runs.store import Store
 
     as_it_is = Store.open
 

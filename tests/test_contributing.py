@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from skin.paths import ROOT
+from skin.core.files import ROOT
 
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S)
 FILES = {text.split("\n")[0].removeprefix("# "): text for kind, text in BLOCKS if kind in ("python", "yaml")}

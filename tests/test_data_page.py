@@ -6,11 +6,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
-from skin.build import build_device
-from skin.config import validate_config
-from skin.data_set import DataSet, Manifest
-from skin.generation import generate_data_set
-from skin.paths import CONF, ROOT
+from skin.core.files import CONF, ROOT
+from skin.device.files import DataSet, Manifest
+from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
+from skin.runs.generation import generate_data_set
 
 PAGE = (ROOT / "docs" / "data.md").read_text()
 LINES = {
@@ -24,7 +24,7 @@ def place(tmp_path_factory):
     place = tmp_path_factory.mktemp("data")
     with initialize_config_dir(str(CONF), version_base="1.3"), pytest.MonkeyPatch.context() as patch:
         patch.setattr("skin.device.simulated._BATCH", 16)
-        patch.setattr("skin.device._threads._PART", 1)
+        patch.setattr("skin.device.base._PART", 1)
         config = validate_config(compose("generate", ["simulator=naive", "n=48", "device.dead=1"]))
         generate_data_set(build_device(config), config, place / "touches")
     return place

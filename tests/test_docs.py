@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import skin
-from skin.paths import ROOT
+from skin.core.files import ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skin.paths import ROOT
+from skin.core.files import ROOT
 
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 WRITTEN = re.compile(r"^(?:skin \w+|python (?:experiments/)?\w+\.py) .*?\b(?:out|link|session)=(\S+)", re.M)

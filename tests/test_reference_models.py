@@ -8,11 +8,11 @@ import torch
 from hydra.utils import instantiate
 from torch.nn import functional as F
 
-from skin.datamodule import TouchData
+from skin.body.layout.file import File
+from skin.core.files import ROOT
 from skin.device.base import AbstractDevice
-from skin.layout.file import File
-from skin.paths import ROOT
-from skin.recording import Touches
+from skin.device.touches import Touches
+from skin.learning.data import TouchData
 
 
 @pytest.fixture(scope="module")

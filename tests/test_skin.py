@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import skin
-from skin.paths import ROOT
-from skin.recording import Touches
+from skin.core.files import ROOT
+from skin.device.touches import Touches
 
 SMALL = ["simulator=naive", "data.gestures=200", "device.test_gestures=32", "evaluation.devices=0"]
 SMALL += ["evaluation.layouts=0", "evaluation.safe_gestures=64"]

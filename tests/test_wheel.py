@@ -8,8 +8,8 @@ import zipfile
 
 import pytest
 
-from skin.cli import verbs
-from skin.paths import ROOT
+from skin.__main__ import verbs
+from skin.core.files import ROOT
 
 SMALL = ["data.gestures=48", "device.test_gestures=48", "evaluation.safe_gestures=64"]
 SMALL += ["evaluation.devices=0", "evaluation.layouts=0"]
@@ -46,7 +46,7 @@ def installed(unpacked, tmp_path):
 def test_the_wheel_has_the_package_and_its_files(unpacked):
     package, metadata = sorted(unpacked.iterdir())
     assert (package.name, metadata.suffix) == ("skin", ".dist-info")
-    assert "skin = skin.cli:main" in (metadata / "entry_points.txt").read_text()
+    assert "skin = skin.__main__:main" in (metadata / "entry_points.txt").read_text()
     for folder, inside in [
         ("skin", ""),
         ("conf",) * 2,
@@ -64,7 +64,9 @@ def test_the_wheel_has_the_package_and_its_files(unpacked):
 
 
 def test_the_repository_is_not_on_the_path(installed, unpacked):
-    code = "import sys, skin, skin.paths; print(skin.__file__, skin.paths.CONF, *sys.path, sep='\\n')"
+    code = (
+        "import sys, skin, skin.core.files; print(skin.__file__, skin.core.files.CONF, *sys.path, sep='\\n')"
+    )
     file, conf, *path = installed("-c", code).splitlines()
     assert file == str(unpacked / "skin" / "__init__.py")
     assert conf == str(unpacked / "skin" / "conf")

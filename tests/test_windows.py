@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skin.cli import verbs
+from skin.__main__ import verbs
 
 SCRIPT = Path(__file__).with_name("windows.py")
 

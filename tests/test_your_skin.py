@@ -62,8 +62,10 @@ def test_the_configuration_that_the_page_prints_is_the_users(home):
     body = instantiate(shown.body)
     assert (body.size, body.cells, len(body.layers)) == ((0.15, 0.10), (30, 20), 3)
     assert [layer.material.young for layer in body.layers] == [560e3, 40e3, 69e3]
-    assert shown.simulator._target_ == shown.device.simulator._target_ == "skin.simulator.solid.Solid"
-    assert shown.layout._target_ == "skin.layout.file.File"
+    assert (
+        shown.simulator._target_ == shown.device.simulator._target_ == "skin.mechanics.simulator.solid.Solid"
+    )
+    assert shown.layout._target_ == "skin.body.layout.file.File"
     depths = instantiate(OmegaConf.merge(shown.layout, {"path": str(home / "my-skin/sensors.csv")}))
     # Inside a layer, where only the solid has sensors.
     assert set(depths.sensors(body).positions[:, 2]) == {0.006}
@@ -85,7 +87,7 @@ def test_the_commands_of_the_page_put_sensors_on_an_arm(home, line):
     shown = OmegaConf.create(started(f"{line.partition('  #')[0]} --cfg job", home))
     body = instantiate(shown.body)
     assert not body.flat
-    assert shown.simulator._target_ == "skin.simulator.solid.Solid"
+    assert shown.simulator._target_ == "skin.mechanics.simulator.solid.Solid"
     leaning = instantiate(shown.layout).sensors(body).tilted
     assert leaning.all() == leaning.any() == ("tilted" in line)
 

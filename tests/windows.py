@@ -54,18 +54,18 @@ def _without(name: str, hidden: list[str]) -> ModuleType:
 def main() -> None:
     """Run the verb of the command line; without one, import every module and show every verb's help."""
     hide()
-    import skin.cli
+    import skin.__main__
 
     if sys.argv[1:]:
-        skin.cli.main()
+        skin.__main__.main()
         return
     folder = Path(skin.__file__).parent
     for path in sorted(folder.rglob("*.py")):
         parts = path.relative_to(folder.parent).with_suffix("").parts
         if parts[-1] not in ("__init__", "__main__"):
             import_module(".".join(parts))
-    for verb in skin.cli.verbs():
-        skin.cli.main([verb, "--help"])
+    for verb in skin.__main__.verbs():
+        skin.__main__.main([verb, "--help"])
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ from dataclasses import fields
 from pathlib import Path
 from tempfile import mkdtemp
 
+from skin.core.files import ROOT
 from skin.design.drawing import draw_sweep
 from skin.design.precision import Findings
 from skin.design.sweep import Step
-from skin.paths import ROOT
 
 # %%
 # ``skin design design=sweep simulator=solid simulator.divisions=6`` computed the numbers.

@@ -13,7 +13,7 @@ from tempfile import mkdtemp
 import numpy as np
 
 import skin
-from skin.cli import main
+from skin.__main__ import main
 from skin.plot import figures
 
 folder = mkdtemp()

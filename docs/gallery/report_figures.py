@@ -13,13 +13,13 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from experiments.studies.report_figures import draw_skin
-from skin.build import build_device
-from skin.paths import CONF
+from skin.core.files import CONF
+from skin.learning.representation.fourier import Fourier
+from skin.learning.representation.image import Image
+from skin.learning.representation.interp import Interpolation
 from skin.plot import figures
-from skin.plot.surface import deflection, surface
-from skin.representation.fourier import Fourier
-from skin.representation.image import Image
-from skin.representation.interp import Interpolation
+from skin.plot.plot3d import deflection, surface
+from skin.runs.build import build_device
 
 with initialize_config_dir(str(CONF), version_base="1.3"):
     config = compose("train", ["simulator=fem", "device.test_gestures=160"])

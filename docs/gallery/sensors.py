@@ -13,7 +13,7 @@ from csv import DictReader
 import matplotlib.pyplot as plt
 import numpy as np
 
-from skin.paths import ROOT
+from skin.core.files import ROOT
 
 
 def accuracies(study: str, column: str, name: str) -> dict[int, float]:

@@ -9,7 +9,7 @@ from contextlib import chdir
 from pathlib import Path
 from tempfile import mkdtemp
 
-from skin.cli import main
+from skin.__main__ import main
 
 folder = Path(mkdtemp())
 

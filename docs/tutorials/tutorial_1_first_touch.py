@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import torch
 
 import skin
-from skin.cli import main
+from skin.__main__ import main
 
 folder = mkdtemp()  # commands store runs in the current folder, which is this one below
 

@@ -12,7 +12,7 @@ from contextlib import chdir
 from pathlib import Path
 from tempfile import mkdtemp
 
-from skin.cli import main
+from skin.__main__ import main
 
 folder = Path(mkdtemp())
 
@@ -30,7 +30,7 @@ from typing import Annotated
 from annotated_types import Ge
 from torch import Tensor, nn
 
-from skin.model.base import AbstractModel, Kind
+from skin.learning.model.base import AbstractModel, Kind
 
 
 class Squared(AbstractModel):

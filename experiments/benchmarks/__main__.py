@@ -16,9 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from skin.core.files import ROOT, results, write
 from skin.errors import InputError
-from skin.files import results, write
-from skin.paths import ROOT
 
 Figures = dict[str, float]
 Benchmark = tuple[str, str, tuple[object, ...]]

@@ -19,8 +19,8 @@ from statistics import median
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from skin.config import validate_config
-from skin.paths import CONF
+from skin.core.files import CONF
+from skin.runs.configuration import validate_config
 
 
 def training_config(*overrides: str) -> DictConfig:

@@ -9,18 +9,18 @@ import psutil
 import torch
 
 from experiments.benchmarks.harness import training_config
-from skin.build import build_data, build_device, build_learner
-from skin.datamodule import TouchData
 from skin.device.base import AbstractSimulated
-from skin.exported.model import ExportedModel
-from skin.exported.writer import write_model
+from skin.device.resampling import Frame
 from skin.hardware.live.engine import Detection, Engine
-from skin.learner.network import Network
-from skin.model_of_run import RunModel, window_classifier
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
-from skin.wire.decoder import Decoder
-from skin.wire.protocol import encode_line
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.decoder import Decoder
+from skin.hardware.wire.protocol import encode_line
+from skin.learning.data import TouchData
+from skin.learning.learner.network import Network
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.exported.model import ExportedModel
+from skin.runs.exported.writer import write_model
+from skin.runs.model_of_run import RunModel, window_classifier
 
 RATE = 100.0  # Hz, of the device
 _SENSORS = 25

@@ -9,10 +9,10 @@ import numpy as np
 from hydra.utils import instantiate
 
 from experiments.benchmarks.harness import median_seconds, peak_memory, training_config
-from skin.build import build_data, build_device, build_learner
-from skin.console import quiet
-from skin.layout.random import Random
-from skin.learner.network import Network
+from skin.body.layout.random import Random
+from skin.core.messages import quiet
+from skin.learning.learner.network import Network
+from skin.runs.build import build_data, build_device, build_learner
 
 GESTURES = 4038
 _SKINS = 20  # of the 200 of any_skin: a batch mixes skins in the same way

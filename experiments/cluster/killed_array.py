@@ -21,9 +21,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from skin.config import Tracking
-from skin.paths import ROOT
-from skin.tracking import PROCESS, Store
+from skin.core.files import ROOT
+from skin.runs.configuration import Tracking
+from skin.runs.store import PROCESS, Store
 
 HERE = ROOT / "experiments" / "cluster"
 STUDY = ["study", "--config-dir", str(HERE / "conf"), "study=short_runs"]

@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from multiprocessing.queues import Queue
 
-from skin.config import Tracking
-from skin.tracking import Store
+from skin.runs.configuration import Tracking
+from skin.runs.store import Store
 
 EXPERIMENT = "writers"
 STEPS = 20

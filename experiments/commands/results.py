@@ -19,10 +19,10 @@ from annotated_types import Ge, Gt
 from omegaconf import DictConfig
 
 from experiments import peers
-from skin.command import command
-from skin.config import overrides, plain
+from skin.commands._command import command
+from skin.core.settings import check_settings, configured
 from skin.errors import InputError
-from skin.settings import check_settings, configured
+from skin.runs.configuration import overrides, plain
 
 _PEERS = "experiments/peers/conf"
 _FRESH = {"uri": "sqlite:///results/fresh.db", "artifacts": "results/fresh"}  # of tracking
@@ -79,7 +79,7 @@ def main(config: DictConfig) -> None:
     settings = plain(config)["results"]
     chosen = configured(Results, settings, "results")
 
-    from skin.console import quiet
+    from skin.core.messages import quiet
 
     quiet()
     sys.exit(_publish(chosen, config))
@@ -87,7 +87,7 @@ def main(config: DictConfig) -> None:
 
 def _publish(chosen: Results, config: DictConfig) -> int:
     """Run the commands of a part; return 1 if one failed."""
-    from skin.progress import SweepProgress, format_duration
+    from skin.runs.progress import SweepProgress, format_duration
 
     full, failed = chosen.budget == "full", []
     lines = list(_lines(chosen, config))
@@ -110,7 +110,7 @@ def _publish(chosen: Results, config: DictConfig) -> int:
 def _fails(line: Sequence[str]) -> bool:
     """Run a command and return whether it failed; a crash is reported, and must not stop the others."""
     from experiments.studies.runs import run_command
-    from skin import cli
+    from skin import __main__ as cli
 
     try:
         return run_command(cli.main, line) != 0
@@ -155,6 +155,6 @@ def _within(folder: Path, words: Sequence[str]) -> list[str]:
 
 def _folder(chosen: Results, config: DictConfig) -> Path:
     """Return the folder of the published files; smoke budgets are published in a folder in it."""
-    from skin.files import results
+    from skin.core.files import results
 
     return results(config.out or ("docs/results" if chosen.budget == "full" else "results"))

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from experiments.studies.study import Study, as_overrides, chosen_studies, passed_overrides
-from skin.command import command
-from skin.config import validate_config
+from skin.commands._command import command
+from skin.core.files import results
 from skin.errors import InputError
-from skin.files import results
+from skin.runs.configuration import validate_config
 
 if TYPE_CHECKING:
     from experiments.studies.trials import Trial
-    from skin.tracking import Store
+    from skin.runs.store import Store
 
 
 @command("study")
@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
     studies = chosen_studies(config)
     folder = results(config.out) / ("smoke" if config.smoke else "")
 
-    from skin.console import quiet
+    from skin.core.messages import quiet
 
     quiet()
     missing = False
@@ -59,9 +59,9 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
 
     from experiments.studies.runs import find_runs, train_study
     from experiments.studies.trials import run_trials, votes
-    from skin.files import whole
-    from skin.shard import Shard
-    from skin.tracking import Store
+    from skin.core.files import whole
+    from skin.runs.store import Store
+    from skin.runs.sweep import Shard
 
     shard = Shard.parse(config.shard) if config.shard is not None else None
     if study.trainings:
@@ -136,7 +136,7 @@ def _measure_skin(study: Study, folder: Path) -> None:
 
     from experiments.studies.measures import Subject
     from experiments.studies.tables import publish_page
-    from skin.build import build_device
+    from skin.runs.build import build_device
 
     if study.measure is None:
         raise InputError(f"study={study.name} has nothing to measure: set study.rows=all or study.trainings")

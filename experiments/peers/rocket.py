@@ -13,17 +13,17 @@ from annotated_types import Ge
 from torch import Tensor
 
 from experiments.peers import python
+from skin.core.files import ROOT
+from skin.core.safe_loading import load_npz
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learner.base import AbstractLearner
-from skin.paths import ROOT
-from skin.recording import Touches
-from skin.safe_loading import load_npz
-from skin.signal.features import above_idle
+from skin.learning.features import above_idle
+from skin.learning.learner.base import AbstractLearner
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
-    from skin.datamodule import TouchData
+    from skin.learning.data import TouchData
 
 WORKER = "experiments.peers.worker"
 _PART = 8192  # touches

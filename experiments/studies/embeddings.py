@@ -15,12 +15,12 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from experiments.studies.measures import ProbeSettings
+from skin.body.layout.scattered import Scattered
 from skin.device.base import AbstractDevice
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.layout.scattered import Scattered
-from skin.learner.base import AbstractLearner
-from skin.recording import Touches
-from skin.representation.graph import adjacency, neighbours
+from skin.learning.learner.base import AbstractLearner
+from skin.learning.representation.graph import adjacency, neighbours
 
 _POWERS = 5
 _EIGENVALUES = 10

@@ -12,7 +12,7 @@ from experiments.studies.figures import Panel, draw_panels
 from experiments.studies.tables import Page
 from skin.evaluation.margins import ALARM_NAME, Faint, MarginReport, Span
 from skin.evaluation.streams import WindowReport
-from skin.labels import OPPOSITE, TOUCH
+from skin.touch.labels import OPPOSITE, TOUCH
 
 _MEASURES = {
     "big": "area",

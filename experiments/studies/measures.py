@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from experiments.studies.tables import Page
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
-    from skin.learner.base import AbstractLearner
-    from skin.model_of_run import RunModel
-    from skin.tracking import Store
+    from skin.learning.learner.base import AbstractLearner
+    from skin.runs.model_of_run import RunModel
+    from skin.runs.store import Store
 
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
 
@@ -84,8 +84,8 @@ class Subject:
 
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm on this device."""
-        from skin.alarm_threshold import alarm_point
         from skin.evaluation.operating_point import OperatingPoint
+        from skin.runs.alarm_threshold import alarm_point
 
         run = self.of.trained.run
         point = self.of.trained.point if run is None else alarm_point(run, self.learner, self.config)
@@ -138,11 +138,12 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class SelfShare:
-    """How much of its own row a node of the run's graph is (:func:`skin.representation.graph.self_share`)."""
+    """How much of its own row a node of the run's graph is
+    (:func:`skin.learning.representation.graph.self_share`)."""
 
     def __call__(self, subject: Subject) -> Measurement:
-        from skin.build import build_data
-        from skin.representation.graph import self_share
+        from skin.learning.representation.graph import self_share
+        from skin.runs.build import build_data
 
         data = build_data(subject.config, subject.device)
         graph = data.representation_for(data.example.positions)
@@ -212,7 +213,7 @@ class Holds:
         from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
         from skin.hardware.live.selftest import FIELDS, time_courses
-        from skin.model_of_run import load_model
+        from skin.runs.model_of_run import load_model
 
         run = subject.of.trained.run
         assert run is not None  # it was loaded
@@ -245,6 +246,7 @@ class TouchAlarms:
         import numpy as np
 
         from experiments.studies.tables import Page
+        from skin.core.rng import Stream, generator
         from skin.evaluation.operating_point import (
             LABEL,
             SAFE_TOUCHES,
@@ -254,8 +256,7 @@ class TouchAlarms:
             touch_scores,
         )
         from skin.hardware.live.engine import DebounceSettings
-        from skin.labels import TOUCH
-        from skin.rng import Stream, generator
+        from skin.touch.labels import TOUCH
         from skin.touch.sampler import balanced
 
         trained, settings = subject.of.trained, subject.config.evaluation
@@ -320,7 +321,7 @@ class Embeddings(ProbeSettings):
 
         from experiments.studies.embedding_page import build_embeddings_page
         from experiments.studies.embeddings import probe
-        from skin.class_balance import report_balance
+        from skin.device.balance import report_balance
 
         device, learner = subject.device, subject.learner if subject.finished else None
         report_balance(device)

@@ -19,7 +19,7 @@ from experiments.studies.comparison import (
 from experiments.studies.study import Statement, Study
 from experiments.studies.trials import Trial
 from skin.evaluation.metrics import decodable, decode
-from skin.labels import TOUCH
+from skin.touch.labels import TOUCH
 
 UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
 """Metrics that are no shares -> their unit."""

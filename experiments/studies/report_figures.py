@@ -11,13 +11,13 @@ from experiments.studies.comparison import paired
 from experiments.studies.runs import row_and_simulator
 from experiments.studies.tables import csv_text
 from experiments.studies.trials import Trial
-from skin.build import build_device
+from skin.core.files import write
 from skin.device.base import AbstractSimulated
 from skin.evaluation.metrics import decode
-from skin.files import write
-from skin.labels import TOUCH
+from skin.mechanics.simulator.naive import Naive
 from skin.plot import figures
-from skin.simulator.naive import Naive
+from skin.runs.build import build_device
+from skin.touch.labels import TOUCH
 
 _SHOWN = ("best_fresh", "features", "temporal_graph", "sequence_graph", "sequence_image")
 _SIMULATED = "the figures of the report are of a simulated skin"

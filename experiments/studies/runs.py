@@ -17,13 +17,14 @@ from omegaconf import DictConfig
 
 from experiments.studies.study import Study, Variant, sweeps, variants
 from skin.commands import train
-from skin.config import PARENT, fingerprint
+from skin.core.messages import PARENT
 from skin.errors import InputError
 from skin.evaluation.metrics import OUTCOMES
-from skin.finished_run import find_run
-from skin.run import SWEPT, simulator
-from skin.shard import LEFT_OUT, Shard
-from skin.tracking import Store, note_reuse
+from skin.runs.configuration import fingerprint
+from skin.runs.finished_run import find_run
+from skin.runs.store import Store, note_reuse
+from skin.runs.sweep import LEFT_OUT, Shard
+from skin.runs.train import SWEPT, simulator
 
 
 @dataclass(frozen=True)

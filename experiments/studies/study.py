@@ -12,11 +12,11 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from experiments import peers
-from skin.config import overrides, plain, validate_config
+from skin.core.files import CONF
+from skin.core.settings import check_settings, configured
 from skin.errors import InputError
-from skin.paths import CONF
-from skin.settings import check_settings, configured
-from skin.sweep import sweep_jobs
+from skin.runs.configuration import overrides, plain, validate_config
+from skin.runs.sweep import sweep_jobs
 
 _OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")

@@ -26,9 +26,8 @@ from experiments.studies.runs import row_and_simulator
 from experiments.studies.study import Study
 from experiments.studies.tables import Page, csv_text, print_table, publish_page
 from experiments.studies.trials import Trial
+from skin.core.files import candidates, write
 from skin.errors import InputError
-from skin.files import write
-from skin.paths import candidates
 
 Reference = Mapping[tuple[str, str, str], float]
 """Row, simulator and label -> value."""

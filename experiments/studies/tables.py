@@ -11,7 +11,7 @@ from rich import table as terminal
 from rich.console import Console
 from rich.markup import escape
 
-from skin.files import write
+from skin.core.files import write
 from skin.plot.figures import save_figure
 
 Table = Sequence[Sequence[str]]

@@ -26,17 +26,16 @@ from experiments.studies.measures import Accuracy, Finished, Measure, Subject
 from experiments.studies.runs import Planned, load_outcomes, row_and_simulator
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
 from experiments.studies.tables import publish_page
-from skin.build import build_device
-from skin.checksum import check_seal, write_parquet
-from skin.config import fingerprint
+from skin.core.files import whole
+from skin.core.safe_loading import check_seal, write_parquet
 from skin.errors import InputError
 from skin.evaluation.metrics import decode, disagreement, vote
-from skin.files import whole
-from skin.fingerprint import source_tags
-from skin.finished_run import TAG, FinishedRun
-from skin.labels import TOUCH
-from skin.model_of_run import RunModel, load_model
-from skin.tracking import Store, note_source
+from skin.runs.build import build_device
+from skin.runs.configuration import fingerprint, source_tags
+from skin.runs.finished_run import TAG, FinishedRun
+from skin.runs.model_of_run import RunModel, load_model
+from skin.runs.store import Store, note_source
+from skin.touch.labels import TOUCH
 
 FOLDER = Path("results/trials")
 """Of all trials, in the current folder; those of a study are in a folder of its name."""

@@ -17,9 +17,8 @@ from rich.progress import track
 
 from experiments.validation import select_laws
 from experiments.validation.finding import CheckResult, Law, publish_physics
+from skin.core.files import ROOT, results
 from skin.errors import InputError
-from skin.files import results
-from skin.paths import ROOT
 
 
 def main(words: Sequence[str]) -> bool:

@@ -21,8 +21,8 @@ from skfem import (
 from skfem.helpers import ddot, div, sym_grad, trace
 
 from skin.body.sheet import Sheet
-from skin.simulator._factors import factorised
-from skin.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator.base import factorised
 
 # Faces of a block, as indices into its nodes (depth, y, x).
 FACES: dict[str, tuple[int | slice, ...]] = {

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from skin.files import whole, write
+from skin.core.files import whole, write
 from skin.plot.figures import MARKS
 
 

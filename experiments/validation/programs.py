@@ -19,19 +19,17 @@ from scipy.sparse.linalg import spsolve
 from experiments.validation.blocks import solve_frame
 from experiments.validation.finding import CheckResult, Finding, relative_finding
 from experiments.validation.solid import skin
+from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
-from skin.contact._checkerboard import stabilise_checkerboard
-from skin.contact._unilateral import solve_contact
+from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.paths import ROOT
-from skin.sensors import Sensors
-from skin.simulator import _pynite
-from skin.simulator._assembly import Structure
-from skin.simulator._elastic import Elastic
-from skin.simulator._relaxation import Relaxing
-from skin.simulator.fem import PlatesAndBeams
-from skin.simulator.naive import Naive
-from skin.simulator.solid import Solid, hexahedra, reading_rows
+from skin.mechanics.contact.rigid import solve_contact, stabilise_checkerboard
+from skin.mechanics.relaxation import Relaxing
+from skin.mechanics.simulator import _pynite
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.solid import Elastic, Solid, hexahedra, reading_rows
 
 _DRAGON: Any = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
 _ECOFLEX: Any = {"material": "EcoFlex 00-30", "thickness": 0.005}

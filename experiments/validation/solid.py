@@ -22,13 +22,12 @@ from experiments.validation.references import (
 )
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody
+from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
-from skin.contact._checkerboard import stabilise_checkerboard
-from skin.contact._unilateral import solve_contact as press
-from skin.sensors import Sensors
-from skin.simulator._elastic import Elastic
-from skin.simulator._hexahedra import Hexahedra
-from skin.simulator.solid import hexahedra, reading_rows
+from skin.mechanics.contact.rigid import solve_contact as press
+from skin.mechanics.contact.rigid import stabilise_checkerboard
+from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator.solid import Elastic, hexahedra, reading_rows
 
 # The default skin, from the surface down.
 SLABS = (Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49))

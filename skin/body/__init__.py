@@ -1,1 +1,1 @@
-"""The soft body: each module is one choice of ``body=``."""
+"""The soft body with its materials and sensors: ``body=`` and ``layout=``."""

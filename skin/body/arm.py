@@ -9,8 +9,8 @@ from annotated_types import Gt, Lt
 from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody
+from skin.core.settings import checked
 from skin.errors import InputError
-from skin.settings import checked
 
 
 @checked("body")

@@ -1,24 +1,86 @@
 """The interface of a body: layers of silicone on a rigid support, and a chart of their surface."""
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
+import psutil
 from annotated_types import Ge
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
-from skin.body._memory import require_memory
-from skin.body._variation import along, factors
+from skin.body.material import Material
+from skin.body.sensors import Sensors
+from skin.core.rng import Stream, generator
+from skin.core.settings import checked, configured
 from skin.errors import InputError
-from skin.material import Material
-from skin.settings import checked, configured
 
 if TYPE_CHECKING:
-    from skin.sensors import Sensors
+    from skin.body.sensors import Sensors
+
+
+# Check that arrays fit into memory before they are allocated.
+
+
+def require_memory(needed: float, what: str, mend: str) -> None:
+    """Raise InputError unless ``needed`` bytes of memory are available.
+
+    Args:
+        needed: estimate, bytes.
+        what: subject of the error message.
+        mend: end of the error message: what to set instead.
+
+    Raises:
+        InputError: the estimate exceeds the available memory.
+    """
+    available = psutil.virtual_memory().available
+    if needed > available:
+        raise InputError(
+            f"{what} needs about {needed / 1e9:.3g} GB of memory, {available / 1e9:.3g} GB are free: {mend}"
+        )
+
+
+# A modulus that varies from cell to cell.
+
+
+def factors(variation: float, seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return independent log-normal numbers with mean 1 and standard deviation ``variation``.
+
+    Without variation they are exactly 1.
+    """
+    spread = math.sqrt(math.log1p(variation**2))
+    values = np.exp(spread * generator(Stream.MODULUS, seed).standard_normal(shape) - spread**2 / 2)
+    values.setflags(write=False)
+    return values
+
+
+def along(field: np.ndarray, cell: tuple[float, float], first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the exact means (n,) of a field, constant in each cell, along straight lines.
+
+    Args:
+        field: (H, W).
+        cell: extent (x, y) of a cell, m.
+        first: start points of the lines, (n, 2), m.
+        second: end points, (n, 2), m, different from the start points.
+    """
+    rows, columns = field.shape
+    crossings = []
+    for axis, count in ((0, columns), (1, rows)):
+        start, way = first[:, axis, None], (second - first)[:, axis, None]
+        level = way == 0
+        share = (cell[axis] * np.arange(count + 1) - start) / np.where(level, 1, way)
+        crossings.append(np.where(level, 0, share))
+    ends = np.broadcast_to([0.0, 1.0], (len(first), 2))
+    cuts = np.sort(np.clip(np.hstack([*crossings, ends]), 0, 1), axis=1)
+    middle = (cuts[:, 1:] + cuts[:, :-1])[..., None] / 2
+    place = (first[:, None] + middle * (second - first)[:, None]) / np.array(cell)
+    column, row = np.clip(place, 0, [columns - 1, rows - 1]).astype(np.int64).transpose(2, 0, 1)
+    return (np.diff(cuts, axis=1) * field[row, column]).sum(axis=1)
+
 
 # What any simulator holds per cell at least: 25 sensors' float64 weights and a gesture of 30 float32 frames.
 _BYTES_PER_CELL = 25 * 8 + 30 * 4
@@ -51,7 +113,7 @@ class AbstractBody(ABC):
         cells: number of cells (along x, along y); a pressure on the body is (..., H, W) with H = cells[1]
             and W = cells[0].
         layers: from the base up. A configuration gives each as ``{material, thickness}``, with the material
-            as in :meth:`skin.material.Material.of` and the thickness in m.
+            as in :meth:`skin.body.material.Material.of` and the thickness in m.
         variation: standard deviation of Young's modulus between the cells of a layer, relative to the mean
             (independent, log-normal); 0: uniform. Another mesh gives another draw.
         variation_seed: of the moduli.
@@ -208,3 +270,97 @@ def _layers(given: Sequence[Layer | Mapping[str, Any]]) -> tuple[Layer, ...]:
 
 def _layer(material: Any, thickness: PositiveFloat) -> Layer:
     return Layer(Material.of(material), float(thickness))
+
+
+# Refuse values with the wrong unit; warn of skins whose mechanics have no effect.
+#
+# Classes take any value that has a meaning, however large a sheet or stiff a layer a proof needs; a
+# configuration describes a skin that somebody could hold, and 12 in place of 0.012 m is a mistake there.
+
+
+class _Range(NamedTuple):
+    low: float
+    high: float
+    unit: str
+
+
+_LENGTH = _Range(0.005, 3, "m")
+_PRESSURE = _Range(100, 1e8, "Pa")
+# As configurations are nested; a list is each of its entries.
+_RANGES: Mapping[str, Any] = {
+    "body": {
+        "size": _LENGTH,
+        "length": _LENGTH,
+        "radius": _LENGTH,
+        "layers": {
+            "thickness": _Range(1e-5, 0.2, "m"),
+            "material": {"young": _Range(1e3, 1e12, "Pa"), "relaxation": {"time": _Range(1e-3, 1e5, "s")}},
+        },
+    },
+    "layout": {"footprint": _Range(1e-4, 0.5, "m")},
+    "contact": {"relief": _Range(0, 0.1, "m"), "fillet": _Range(0, 0.1, "m")},
+    "device": {"position_error": _Range(0, 0.1, "m")},
+    "touch": {
+        "rate": _Range(0.1, 1e4, "Hz"),
+        "window": _Range(0, 20, "s"),
+        "tap": _Range(0, 15, "s"),
+        "press": _Range(0, 15, "s"),
+        "safe_peak": _PRESSURE,
+        "dangerous_peak": _PRESSURE,
+        "speed": _Range(0, 10, "m/s"),
+        "path": _Range(0, 1, "m"),
+        "spare": _Range(0, 1, "m"),
+        "thresholds": {"pressure": _PRESSURE, "travel": _Range(1e-6, 0.5, "m")},
+    },
+}
+
+
+def check_plausibility(groups: Mapping[str, Any]) -> None:
+    """Refuse a configuration with a value that no skin has in the unit that is asked for.
+
+    Args:
+        groups: the configuration, in plain containers. What is no number is left to the classes.
+
+    Raises:
+        InputError: a value is out of its range.
+    """
+    for name, ranges in _RANGES.items():
+        _within(name, groups.get(name), ranges)
+
+
+def _within(name: str, group: Any, ranges: Mapping[str, Any]) -> None:
+    if isinstance(group, list):
+        for number, one in enumerate(group):
+            _within(f"{name}.{number}", one, ranges)
+    if not isinstance(group, Mapping):
+        return
+    for key, within in ranges.items():
+        given = group.get(key)
+        if isinstance(within, Mapping):
+            _within(f"{name}.{key}", given, within)
+            continue
+        low, high, unit = within
+        for value in given if isinstance(given, list) else [given]:
+            # What is no number, or not above 0, the classes refuse with a sentence of their own.
+            if _positive(value) and not low <= value <= high:
+                raise InputError(
+                    f"{name}.{key}={value:g} {unit} is not plausible: it is given in {unit}, from {low:g} to "
+                    f"{high:g} {unit}; was another unit meant?"
+                )
+
+
+def _positive(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+
+
+def warn_of_surface(body: AbstractBody, sensors: Sensors) -> None:
+    """Warn where sensors lie on the surface: there they read the pressure itself, whatever is below."""
+    count = int((sensors.positions[:, 2] <= 1e-3 * body.thickness).sum())
+    if count:
+        warnings.warn(
+            f"{count} of {len(sensors)} sensors lie on the surface, where they read the pressure itself: the "
+            "layers' thickness and stiffness change nothing; put them at a depth, as in "
+            f"layout.depth={body.thickness / 3:.2g} simulator=solid, or with a column depth_m in layout.path",
+            UserWarning,
+            stacklevel=3,
+        )

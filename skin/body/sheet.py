@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from skin.body.base import AbstractBody
-from skin.settings import checked
+from skin.core.settings import checked
 
 
 @checked("body")

@@ -1,1 +1,1 @@
-"""The verbs of the command line: one module each, whose documentation is their help."""
+"""The verbs of ``skin``, one file each."""

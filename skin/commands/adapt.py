@@ -9,15 +9,15 @@ the run. Logs a new run, which keeps the weights if fine-tuning is not better on
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import overrides
+from skin.commands._command import command
+from skin.runs.configuration import overrides
 
 
 @command("adapt")
 def main(config: DictConfig) -> None:
     """Fine-tune a run, log the result, and print the figures before and after."""
-    from skin.adaptation import adapt
-    from skin.console import quiet
+    from skin.core.messages import quiet
+    from skin.runs.adaptation import adapt
 
     quiet()
     adapt(config, overrides())

@@ -8,7 +8,7 @@ Without device= the touch is simulated.
 
 from omegaconf import DictConfig
 
-from skin.command import command
+from skin.commands._command import command
 from skin.errors import InputError
 
 
@@ -22,9 +22,8 @@ def main(config: DictConfig) -> None:
 
     from pathlib import Path
 
-    from skin.build import build_device
-    from skin.plot.animation import still, write_animation
-    from skin.plot.touches import recorded, simulated
+    from skin.plot.animation import recorded, simulated, still, write_animation
+    from skin.runs.build import build_device
 
     device = build_device(config)
     if device.simulation is None:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import plain
+from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import plain
 
 _CONFIRMED = ("places", "channels", "broken")
 
@@ -31,7 +31,8 @@ def main(config: DictConfig) -> None:
 
     from rich.console import Console
 
-    from skin.build import build_device
+    from skin.core.settings import configured
+    from skin.device.calibration import write_calibration
     from skin.hardware.calibration.bench import read_bench_session, read_gauge
     from skin.hardware.calibration.fit import (
         evaluate_held_out,
@@ -41,8 +42,7 @@ def main(config: DictConfig) -> None:
     )
     from skin.hardware.calibration.presses import write_demo_session
     from skin.hardware.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
-    from skin.settings import configured
-    from skin.signal.calibration import write_calibration
+    from skin.runs.build import build_device
 
     settings = plain(config)["calibrate"]
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import plain
+from skin.commands._command import command
+from skin.core.files import results
 from skin.errors import InputError
-from skin.files import results
+from skin.runs.configuration import plain
 
 if TYPE_CHECKING:
     from skin.device.base import AbstractSimulated
@@ -27,9 +27,9 @@ def main(config: DictConfig) -> None:
     if config.session is None:
         raise InputError("which session? add session=session.csv, of skin record or a bench")
 
-    from skin.build import build_device
-    from skin.console import quiet
+    from skin.core.messages import quiet
     from skin.hardware.comparison import compare_session, publish_comparison
+    from skin.runs.build import build_device
 
     quiet()
     settings = plain(config)["compare"]
@@ -50,10 +50,10 @@ def _compare_predictions(
     """Return the predictions of a run for both sides."""
     import numpy as np
 
-    from skin.device._blank import Blank
-    from skin.finished_run import FinishedRun
+    from skin.device.base import Blank
     from skin.hardware.comparison import Agreement
-    from skin.model_of_run import load_model
+    from skin.runs.finished_run import FinishedRun
+    from skin.runs.model_of_run import load_model
 
     blank = Blank.of(device.task, device.size, comparison.touches[0])
     model = load_model(FinishedRun.named(config), device=blank, alarm=False)

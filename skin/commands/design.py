@@ -8,10 +8,10 @@ Writes tables, pictures and JSON into out=.
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import plain
-from skin.files import results
-from skin.settings import configured, import_target
+from skin.commands._command import command
+from skin.core.files import results
+from skin.core.settings import configured, import_target
+from skin.runs.configuration import plain
 
 
 @command("design")

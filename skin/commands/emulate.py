@@ -11,9 +11,9 @@ from types import FrameType
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import plain
+from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import plain
 
 _FORMATS = ("text", "binary")
 
@@ -24,9 +24,9 @@ def main(config: DictConfig) -> None:
     if config.format not in _FORMATS:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
 
-    from skin.build import build_device
+    from skin.core.settings import configured
     from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
-    from skin.settings import configured
+    from skin.runs.build import build_device
 
     groups = plain(config)
     settings = configured(EmulatorSettings, groups["emulate"], "emulate")

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import overrides
+from skin.commands._command import command
+from skin.core.files import results
 from skin.errors import InputError
-from skin.files import results
+from skin.runs.configuration import overrides
 
 if TYPE_CHECKING:
-    from skin.progress import Steps
+    from skin.runs.progress import Steps
 
 
 # Expected seconds of each step, for the share in the progress.
@@ -31,20 +31,20 @@ _STEPS = {
 @command("evaluate")
 def main(config: DictConfig) -> None:
     """Restore a finished run, evaluate it, and print and log the metrics."""
-    from skin.progress import Steps
+    from skin.runs.progress import Steps
 
     with Steps(_STEPS) as steps:
         _evaluate(config, steps)
 
 
 def _evaluate(config: DictConfig, steps: "Steps") -> None:
-    from skin.console import quiet
+    from skin.core.messages import quiet
+    from skin.core.settings import option_name
     from skin.evaluation.report import evaluate, print_report, publish_evaluation, write_chances
-    from skin.finished_run import FinishedRun
-    from skin.model_of_run import load_model
-    from skin.option import option_name
-    from skin.run import log_report
-    from skin.tracking import Store
+    from skin.runs.finished_run import FinishedRun
+    from skin.runs.model_of_run import load_model
+    from skin.runs.store import Store
+    from skin.runs.train import log_report
 
     quiet()
     run, folder, given = FinishedRun.named(config), results(config.out), overrides()

@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Annotated
 from annotated_types import Ge, Gt, MinLen
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import overrides, plain
+from skin.commands._command import command
+from skin.core.files import results
 from skin.errors import InputError
-from skin.files import results
+from skin.runs.configuration import overrides, plain
 
 if TYPE_CHECKING:
-    from skin.model_of_run import RunModel
-    from skin.progress import Steps
-    from skin.recording import Touches
+    from skin.device.touches import Touches
+    from skin.runs.model_of_run import RunModel
+    from skin.runs.progress import Steps
 
 _FORMATS = ("onnx", "folder")
 
@@ -65,7 +65,7 @@ def main(config: DictConfig) -> None:
         _export_folder(config)
         return
 
-    from skin.progress import Steps
+    from skin.runs.progress import Steps
 
     if config.name is not None or config.licence is not None:
         raise InputError("name and licence are those of a folder: add format=folder, or leave them out")
@@ -75,8 +75,8 @@ def main(config: DictConfig) -> None:
 
 def _export_folder(config: DictConfig) -> None:
     """Write the files of a pretrained model, all or none."""
-    from skin.finished_run import FinishedRun
-    from skin.model_folder import check_folder, write_folder
+    from skin.runs.finished_run import FinishedRun
+    from skin.runs.model_folder import check_folder, write_folder
 
     if config.out is not None:
         raise InputError(f"a folder is written to models/NAME, not to out={config.out}: add name=my_skin")
@@ -87,19 +87,19 @@ def _export_folder(config: DictConfig) -> None:
 
 def _export_file(config: DictConfig, steps: "Steps") -> None:
     """Write the network of a run for one skin, with the thresholds of its alarm."""
-    from skin.settings import configured
+    from skin.core.settings import configured
 
     settings = configured(ExportSettings, plain(config)["export"], "export")
     path = None if config.out is None else Path(config.out).expanduser()
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={config.out} must end in .onnx: as in out=skin.onnx")
 
-    from skin.console import quiet
-    from skin.exported.model import describe_skin
-    from skin.exported.writer import write_model
-    from skin.finished_run import FinishedRun
+    from skin.core.messages import quiet
     from skin.hardware.live.engine import DebounceSettings
-    from skin.model_of_run import equation10_warning, load_model
+    from skin.runs.exported.model import describe_skin
+    from skin.runs.exported.writer import write_model
+    from skin.runs.finished_run import FinishedRun
+    from skin.runs.model_of_run import equation10_warning, load_model
 
     quiet()
     run = FinishedRun.named(config)

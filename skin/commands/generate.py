@@ -12,7 +12,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from skin.command import command
+from skin.commands._command import command
 from skin.errors import InputError
 
 
@@ -32,8 +32,8 @@ def main(config: DictConfig) -> None:
 
     from omegaconf import OmegaConf
 
-    from skin.build import build_device
-    from skin.generation import generate_data_set, generate_file
+    from skin.runs.build import build_device
+    from skin.runs.generation import generate_data_set, generate_file
 
     device = build_device(config)
     # The path of the file does not change the touches.

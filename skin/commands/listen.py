@@ -10,9 +10,9 @@ from contextlib import suppress
 
 from omegaconf import DictConfig
 
-from skin.command import command
-from skin.config import plain
+from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import plain
 
 
 @command("listen")
@@ -24,8 +24,8 @@ def main(config: DictConfig) -> None:
             "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"
         )
 
-    from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
-    from skin.wire.skin import PortMonitor, open_skin
+    from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+    from skin.hardware.wire.skin import PortMonitor, open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sensors = None if config.n is None else range(config.n)

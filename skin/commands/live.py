@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
-from skin.command import command
-from skin.config import overrides, plain, validate_config
+from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import overrides, plain, validate_config
 
 if TYPE_CHECKING:
-    from skin.hardware.live.live_settings import LiveSettings
+    from skin.hardware.live.engine_builder import LiveSettings
     from skin.hardware.live.loop import Display
 
 
@@ -59,10 +59,10 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]
 
     from hydra import compose
 
-    from skin.build import build_device
-    from skin.console import quiet
-    from skin.finished_run import FinishedRun
+    from skin.core.messages import quiet
     from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
+    from skin.runs.build import build_device
+    from skin.runs.finished_run import FinishedRun
 
     quiet()
     if given := [word for word in words if word.startswith("device=")]:
@@ -94,7 +94,7 @@ def show(config: DictConfig, given: Sequence[str], own_mechanics: bool = False) 
         given: settings that replace those of the run, as overrides; ``config`` has their values.
         own_mechanics: the skin at the port is emulated with the simulator of the run.
     """
-    from skin.hardware.live.live_settings import LiveSettings
+    from skin.hardware.live.engine_builder import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
     try:
@@ -106,19 +106,19 @@ def show(config: DictConfig, given: Sequence[str], own_mechanics: bool = False) 
 def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_mechanics: bool) -> None:
     from rich.console import Console
 
+    from skin.core.interrupt import ends_on_signal
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
-    from skin.interrupt import ends_on_signal
 
     messages = Console(stderr=True, highlight=False)
     if str(config.run).endswith(".onnx"):
-        from skin.exported.model import check_overrides
         from skin.hardware.live.engine_builder import watch_exported
+        from skin.runs.exported.model import check_overrides
 
         check_overrides(config.run, config, given)
         device = plain(config)["device"]
         watch = partial(watch_exported, config.run, device, live, messages.print)
     else:
-        from skin.console import quiet
+        from skin.core.messages import quiet
         from skin.hardware.live.engine_builder import watch_run
 
         quiet()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from skin.command import command
+from skin.commands._command import command
 from skin.errors import InputError
 
 
@@ -25,9 +25,9 @@ def main(config: DictConfig) -> None:
     if unknown := sorted(set(settings) - {"free", "finish"}):
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
-    from skin.build import build_device
     from skin.hardware.record.recorder import convert_session, record_session
-    from skin.hardware.wired import AbstractWired
+    from skin.hardware.serial import AbstractWired
+    from skin.runs.build import build_device
 
     device = build_device(config)
     if not isinstance(device, AbstractWired):

@@ -8,12 +8,12 @@ A run that finished with the same configuration is skipped; tracking.resume=fals
 
 from omegaconf import DictConfig
 
-from skin.command import command
+from skin.commands._command import command
 
 
 @command()
 def main(config: DictConfig) -> bool:
     """Train and evaluate one configuration; return False if a finished run has the results."""
-    from skin.run import train
+    from skin.runs.train import train
 
     return train(config)

@@ -1,1 +1,1 @@
-"""How precisely a skin measures a touch, and where to put its sensors."""
+"""What a skin can know, and where its sensors belong."""

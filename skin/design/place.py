@@ -1,30 +1,99 @@
 """Place sensors where their readings tell most about touches."""
 
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import torch
 from annotated_types import Ge, Gt
 from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from skin.build import build_device
-from skin.design.candidates import Zones, keep_out
-from skin.design.placement_problem import PlacementProblem
-from skin.design.readings import reading_covariance
+from skin.body.sensors import Sensors
+from skin.core.files import json_text, write
+from skin.core.rng import Stream, generator
+from skin.core.settings import checked
+from skin.design.drawing import placement
+from skin.design.placement import PlacementProblem, Zones, keep_out
 from skin.device.base import AbstractSimulated
+from skin.device.simulated import modelled
 from skin.errors import InputError
-from skin.files import json_text, write
 from skin.plot.figures import save_figure
-from skin.plot.placement import placement
-from skin.sensors import Sensors
-from skin.settings import checked
+from skin.runs.build import build_device
+from skin.touch.movie import Movie
+from skin.touch.sampler import balanced
+
+# The readings that sampled touches give at any sites of a skin, and their covariance.
+
+
+_BATCH = 256
+
+
+def reading_covariance(
+    device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
+) -> tuple[np.ndarray, int]:
+    """Return the covariance of the readings of sampled touches, and from how many frames it is.
+
+    Args:
+        device, sensors, touches, seed, clip: as of :func:`sampled_readings`.
+
+    Returns:
+        covariance (C, C), N^2, and the number of frames.
+    """
+    total, squares, frames = np.zeros(len(sensors)), np.zeros((len(sensors), len(sensors))), 0
+    for readings in sampled_readings(device, sensors, touches, seed, clip):
+        total, squares = total + readings.sum(axis=0), squares + readings.T @ readings
+        frames += len(readings)
+    mean = total / frames
+    return squares / frames - np.outer(mean, mean), frames
+
+
+@torch.no_grad()
+def sampled_readings(
+    device: AbstractSimulated, sensors: Sensors, touches: int, seed: int, clip: float
+) -> Iterator[np.ndarray]:
+    """Sample touches and yield their true readings in parts, (F, C), N.
+
+    Only frames with contact count. Labels are balanced. The touches belong to no split of the device.
+
+    Args:
+        device: samples and simulates the touches.
+        sensors: C sites.
+        touches: their number.
+        seed: of the touches.
+        clip: largest reading, N.
+    """
+    read = _reader(device, sensors)
+    wanted = balanced(touches, generator(Stream.PLACEMENT, seed, 0))
+    parts = range(0, touches, _BATCH)
+    console, shown = Console(stderr=True), sys.stderr.isatty()
+    for number, first in enumerate(track(parts, "sampling touches", console=console, disable=not shown)):
+        labels = wanted[first : first + _BATCH]
+        movie = device.sampler.sample(len(labels), generator(Stream.PLACEMENT, seed, 1 + number), labels)
+        yield read(movie).clamp(-clip, clip).double().numpy()
+
+
+def _reader(device: AbstractSimulated, sensors: Sensors) -> Callable[[Movie], Tensor]:
+    """Return a function that gives the readings (F, C), N, of all frames with contact of a movie."""
+    rows = None if device.sampler.settings.shear else device.model.pressure_rows(sensors)
+    if rows is None:
+        model = modelled(device.simulator, device.body, sensors, device.model_rate)
+        return lambda movie: model.respond(movie, displacement=False).readings[movie.scale > 0]
+    operator = torch.from_numpy(rows.T.copy()).float()
+
+    def read(movie: Movie) -> Tensor:
+        touched = movie.scale > 0
+        return (movie.frames.flatten(1) @ operator)[movie.index[touched]] * movie.scale[touched, None]
+
+    return read
 
 
 @checked("design")
@@ -44,7 +113,7 @@ class Place:
         noise: standard deviation of a reading, N; None: the median of the device's sensors.
         distance: least distance of a new sensor from all others, m.
         raster: pitch of the sites, or pitches along x and y, m; None: the cells of the body.
-        keep_out: polygons (x, y), m, or the path of a picture (:func:`skin.design.candidates.keep_out`).
+        keep_out: polygons (x, y), m, or the path of a picture (:func:`skin.design.placement.keep_out`).
         keep: sensors of the layout that stay, numbered from 1, or ``all``.
 
     Raises:

@@ -5,11 +5,23 @@ The information of the sites S is that between noisy Gaussian readings and true 
 in nats.
 """
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve
+from matplotlib.path import Path as Polygon
+from PIL import Image
+from scipy.linalg import cho_factor, cho_solve, eigh, eigvalsh, solve
 
+from skin.body.base import AbstractBody, overlaps
+from skin.body.layout.base import place
+from skin.body.layout.grid import Grid
+from skin.body.sensors import Sensors
+from skin.core.files import candidates
+from skin.core.rng import Stream, generator
+from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 
 Sites = Sequence[int] | np.ndarray
@@ -137,3 +149,418 @@ def _solved(rows: np.ndarray, sites: Sites) -> np.ndarray:
     if not len(sites):
         return rows
     return solve(np.eye(len(sites)) + rows[:, np.asarray(sites)], rows, assume_a="pos")
+
+
+# An upper bound of the information of sensors at any sites.
+
+
+_ITERATIONS = 200
+_INSIDE = 0.95  # share of the way to the nearest constraint that a step may take
+_SHORTEST = 1e-9  # share of a step
+
+
+def upper_bound(signal: np.ndarray, count: int, fixed: Sites = (), gap: float = 5e-3) -> float:
+    """Return an upper bound of the information of any ``count`` sites, nats.
+
+    A concave relaxation gives each site a weight from 0 to 1, of the sum ``count`` (:class:`_Relaxation`).
+    A Newton method with logarithmic barriers searches the best weights. Every step gives a bound that is
+    valid however far the weights are from the best ones. The bound ignores the distance between sensors.
+
+    Args:
+        signal: A, (C, C).
+        count: number of sites, with the fixed ones.
+        fixed: sites that every choice has.
+        gap: between the bound and the value of the relaxation, relative, at which the search stops.
+    """
+    known, rest = mutual_information(signal, fixed), given(signal, fixed)
+    number = count - len(fixed)
+    if number in (0, len(rest)):
+        return known + mutual_information(rest, range(len(rest))[:number])
+    relaxation = _Relaxation(rest, number)
+    weights = np.full(len(rest), number / len(rest))
+    state = relaxation.at(weights)
+    barrier, bound = 0.1 * state.value / len(rest), state.bound
+    for _ in range(_ITERATIONS):
+        if bound - state.value <= gap * (known + state.value):
+            break
+        weights, centred = _step(relaxation, weights, state, barrier)
+        state = relaxation.at(weights)
+        bound = min(bound, state.bound)
+        barrier *= 0.2 if centred else 1.0
+    return known + bound
+
+
+class _State(NamedTuple):
+    """The relaxation at weights z.
+
+    Attributes:
+        value: f(z), nats.
+        bound: of the information of any sites, nats.
+        gradient: of f, (C,).
+        curvature: (C, C), at least the negative Hessian of f.
+    """
+
+    value: float
+    bound: float
+    gradient: np.ndarray
+    curvature: np.ndarray
+
+
+class _Relaxation:
+    """The augmented factorisation bound (Li, arXiv 2410.10078) of the information of k sites, with A = B B'.
+
+    For the weights 1 of k sites and 0 of all others, X = B' Z B has at most the rank k, and the information
+    is f(z) = 1/2 log det(I + X). For other weights f replaces the smallest eigenvalues of X by fewer equal
+    ones of the same sum, so that only k remain. Without this (Joshi and Boyd, 2009) the relaxation spreads
+    the weights over more sites and gains far more information than k sensors can have.
+
+    The bound does not depend on the concavity of f. For a positive matrix T with the eigenvalues t in
+    ascending order, log(1 + x) <= t x + h(t) with h(t) = t - 1 - log t (0 above t = 1) gives
+    log det(I + X) <= tr(T X) + h(t_1) + ... + h(t_k) for every X of at most the rank k, and tr(T X) =
+    z . diag(B T B') is at most the sum of the k largest entries of this diagonal. T is the gradient of
+    2 f with respect to X.
+    """
+
+    def __init__(self, signal: np.ndarray, count: int) -> None:
+        values, vectors = eigh(signal)
+        self._rows = vectors * np.sqrt(np.clip(values, 0, None))
+        self._count = count
+
+    def at(self, weights: np.ndarray) -> _State:
+        """Return value, bound and derivatives at weights (C,)."""
+        values, vectors = eigh((self._rows.T * weights) @ self._rows)
+        level, large = self._split(values)
+        merged = len(values) - large
+        slopes = 1 / (1 + np.maximum(values, level))
+        turned = self._rows @ vectors
+        inner = (turned * slopes) @ turned.T
+        gradient = np.diag(inner) / 2
+        least = slopes[::-1][: self._count]
+        above = float((least - 1 - np.log(least)).sum() / 2)
+        bound = float(np.sort(gradient)[-self._count :].sum()) + above
+        small = (turned[:, :merged] ** 2).sum(axis=1)
+        curvature = inner**2 + np.outer(small, small) / ((1 + level) ** 2 * (self._count - large))
+        return _State(self._value(values), bound, gradient, curvature / 2)
+
+    def value(self, weights: np.ndarray) -> float:
+        """Return f(z), nats, of weights (C,)."""
+        return self._value(eigvalsh((self._rows.T * weights) @ self._rows))
+
+    def _value(self, values: np.ndarray) -> float:
+        level, _ = self._split(values)
+        return float(np.log1p(np.maximum(values, level)[-self._count :]).sum() / 2)
+
+    def _split(self, values: np.ndarray) -> tuple[float, int]:
+        """Return the level that replaces the small eigenvalues (C,), ascending, and how many are large."""
+        small = np.clip(values, 0, None)
+        for large in range(self._count):
+            level = float(small.sum()) / (self._count - large)
+            if small[-1] <= level:  # at the latest when one level takes the place of all small ones
+                break
+            small = small[:-1]
+        return level, large
+
+
+def _step(
+    relaxation: _Relaxation,
+    weights: np.ndarray,
+    state: _State,
+    barrier: float,
+) -> tuple[np.ndarray, bool]:
+    """Return the weights after a Newton step with constant sum, and whether they hardly changed.
+
+    The function is f(z) + barrier * sum(log z + log(1 - z)).
+    """
+    slope = state.gradient + barrier * (1 / weights - 1 / (1 - weights))
+    curved = state.curvature + np.diag(barrier * (1 / weights**2 + 1 / (1 - weights) ** 2))
+    solved = cho_solve(cho_factor(curved), np.column_stack([slope, np.ones_like(slope)]))
+    step = solved[:, 0] - solved[:, 1] * (solved[:, 0].sum() / solved[:, 1].sum())
+    rise = float(step @ slope)
+    room = np.where(
+        step > 0, (1 - weights) / np.where(step > 0, step, 1), -weights / np.where(step < 0, step, -1)
+    )
+    length = min(1.0, _INSIDE * float(room[step != 0].min(initial=np.inf)))
+
+    def total(z: np.ndarray) -> float:
+        return relaxation.value(z) + barrier * float(np.log(z).sum() + np.log1p(-z).sum())
+
+    start = total(weights)
+    while total(weights + length * step) < start + 0.01 * length * rise and length > _SHORTEST:
+        length /= 2
+    return weights + length * step, rise < barrier
+
+
+# Candidate sites of sensors on a skin.
+
+
+Zones = Sequence[Sequence[tuple[float, float]]]
+"""Polygons, each of at least three corners (x, y), m."""
+
+_COVERED = 0.02  # share of a footprint that a zone may cover, because pixels approximate its outline
+_PIXELS = 512
+_ASPECT = 0.03
+_DARK = 128
+_ROUNDING = 1e-9  # m
+
+
+def candidate_sites(
+    body: AbstractBody,
+    footprint: tuple[float, float],
+    depth: float,
+    raster: float | tuple[float, float] | None = None,
+    forbidden: np.ndarray | None = None,
+) -> Sensors:
+    """Return sensors at all sites, row by row, whose footprint lies on the surface and in no keep-out zone.
+
+    Args:
+        body: the body.
+        footprint: extent (x, y) of a sensor, m.
+        depth: of the sensors, m.
+        raster: pitch of the sites, or pitches along x and y, m. The raster is centred on the surface. None:
+            the cells of the body.
+        forbidden: as of :func:`keep_out`, (h, w), bool.
+
+    Raises:
+        InputError: no site is left.
+    """
+    pitches = body.cell if raster is None else raster if isinstance(raster, Sequence) else (raster, raster)
+    x, y = (_along(*one) for one in zip(body.size, pitches, footprint, strict=True))
+    free = np.ones((len(y), len(x)), dtype=bool)
+    if forbidden is not None:
+        free = _covered(forbidden, body.size, (x, y), footprint) <= _COVERED
+    rows, columns = np.nonzero(free)
+    if not len(rows):
+        raise InputError(
+            f"no site is left for a sensor of {footprint[0]:g} x {footprint[1]:g} m on {body.size[0]:g} x "
+            f"{body.size[1]:g} m: shrink the zones of design.keep_out, or lower design.raster or "
+            "layout.footprint"
+        )
+    return place(body, x[columns], y[rows], depth, footprint)
+
+
+def keep_out(zones: Zones | str | None, size: tuple[float, float]) -> np.ndarray | None:
+    """Return where no sensor may be, (h, w), bool, over the whole surface, row by row from the upper left.
+
+    Args:
+        zones: polygons; or the path of a picture of the whole surface, in which dark pixels are forbidden; or
+            None.
+        size: extent (x, y) of the surface, m.
+
+    Raises:
+        InputError: a polygon with fewer than three corners, or a picture that cannot be read or has another
+            aspect ratio than the surface.
+    """
+    if isinstance(zones, str):
+        return _picture(zones, size)
+    if not zones:
+        return None
+    scale = max(size) / _PIXELS
+    width, height = (max(1, round(extent / scale)) for extent in size)
+    x, y = (
+        (np.arange(count) + 0.5) / count * extent for count, extent in ((width, size[0]), (height, size[1]))
+    )
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    inside = np.zeros(len(points), dtype=bool)
+    for number, zone in enumerate(zones):
+        if len(zone) < 3:
+            raise InputError(
+                f"polygon {number + 1} of design.keep_out has {len(zone)} corners and needs three: as in "
+                "design.keep_out=[[[0,0],[0.04,0],[0.04,0.02]]]"
+            )
+        inside |= Polygon(zone).contains_points(points)
+    return inside.reshape(height, width)
+
+
+def _picture(given: str, size: tuple[float, float]) -> np.ndarray:
+    """Return the dark pixels of a picture; transparent ones are not dark."""
+    path = next((one for one in candidates(given) if one.is_file()), None)
+    if path is None:
+        raise InputError(f"no picture {given}: give design.keep_out=FILE.png, or polygons")
+    try:
+        with Image.open(path) as file:
+            cover = file.convert("RGBA")
+        pixels = np.asarray(Image.alpha_composite(Image.new("RGBA", cover.size, "white"), cover).convert("L"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"cannot read design.keep_out={given}: {error}; give a PNG of the whole surface, dark where no "
+            "sensor may be"
+        ) from error
+    height, width = pixels.shape
+    if abs(math.log(width / height * size[1] / size[0])) > _ASPECT:
+        raise InputError(
+            f"design.keep_out={given} has {width} x {height} pixels, but the surface has {size[0]:g} x "
+            f"{size[1]:g} m: give a picture of the whole surface with its aspect ratio"
+        )
+    return pixels < _DARK
+
+
+def _along(extent: float, pitch: float, footprint: float) -> np.ndarray:
+    """Return the sites along one side, m: centres of equal tiles about its middle."""
+    count = int(extent / pitch + 1e-6)
+    centres = extent / 2 + pitch * (np.arange(count) - (count - 1) / 2)
+    return centres[np.minimum(centres, extent - centres) >= footprint / 2 - _ROUNDING]
+
+
+def _covered(
+    forbidden: np.ndarray,
+    size: tuple[float, float],
+    sites: tuple[np.ndarray, np.ndarray],
+    footprint: tuple[float, float],
+) -> np.ndarray:
+    """Return the share of the footprint that is forbidden, at each y and x of the sites, (n_y, n_x)."""
+    shares = [
+        overlaps(np.linspace(0, extent, count + 1), centres, length) / length
+        for extent, count, centres, length in zip(size, forbidden.shape[::-1], sites, footprint, strict=True)
+    ]
+    return shares[1] @ forbidden @ shares[0].T
+
+
+# The sites of a skin, the sensors that stay, and other layouts for comparison.
+
+
+_RANDOM = 100  # layouts
+_TILE = 4.0  # largest aspect ratio of the tiles of a grid
+
+
+@dataclass(frozen=True)
+class PlacementProblem:
+    """Sites, then the sensors of the configured layout, then those of a regular grid.
+
+    Attributes:
+        body: the body.
+        sensors: all of these.
+        sites: number of sites.
+        kept: (K,), indices of the sensors that stay.
+        layout: those of the configured layout.
+        count: number of sensors to place, with those that stay.
+        distance: least distance of a new sensor from all others, m.
+    """
+
+    body: AbstractBody
+    sensors: Sensors
+    sites: int
+    kept: np.ndarray
+    layout: np.ndarray
+    count: int
+    distance: float
+
+    @classmethod
+    def of(
+        cls,
+        device: AbstractSimulated,
+        forbidden: np.ndarray | None,
+        count: int | None,
+        keep: str | Sequence[int],
+        distance: float,
+        raster: float | tuple[float, float] | None,
+    ) -> "PlacementProblem":
+        """Return the problem for the skin of a device.
+
+        Args:
+            device: of the body and of the configured layout.
+            forbidden: the keep-out zones (:func:`skin.design.placement.keep_out`), (h, w), bool; or None.
+            count, keep, distance, raster: as in :class:`skin.design.place.Place`.
+
+        Raises:
+            InputError: numbers that do not fit the layout or the sites.
+        """
+        body, old = device.body, device.sensors
+        count = len(old) if count is None else count
+        kept = _kept(keep, len(old), count)
+        depths, numbers = np.unique(old.positions[:, 2], return_counts=True)
+        depth = float(depths[numbers.argmax()])
+        sites = candidate_sites(body, old.footprint, depth, raster, forbidden)
+        if count - len(kept) > len(sites):
+            raise InputError(
+                f"design.count={count} needs {count - len(kept)} sites, and there are {len(sites)}: lower "
+                "design.count, set a finer design.raster, or shrink the zones of design.keep_out"
+            )
+        every = [sites, old, *_grid(body, count, old.footprint, depth)]
+        positions, normals = (
+            np.concatenate([getattr(one, name) for one in every]) for name in ("positions", "normals")
+        )
+        sensors = Sensors(positions, old.footprint, normals)
+        layout = len(sites) + np.arange(len(old))
+        return cls(body, sensors, len(sites), layout[kept], layout, count, distance)
+
+    def solve(self, signal: np.ndarray, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the chosen sensors, in the order of the layout, and what is known of them.
+
+        Args:
+            signal: covariance of the readings of all sensors divided by the variance of the noise.
+            seed: of the random layouts.
+        """
+        eligible = np.concatenate([np.arange(self.sites), self.kept])
+        fixed = self.sites + np.arange(len(self.kept))
+        near = too_near(self.sensors.positions[eligible, :2], self.distance)
+        inner = signal[np.ix_(eligible, eligible)]
+        found = exchange(inner, greedy(inner, self.count, near, fixed), near, len(fixed))
+        value, bound = mutual_information(inner, found), upper_bound(inner, self.count, fixed)
+        fresh = eligible[found[len(fixed) :]]
+        x, y = self.sensors.positions[fresh, :2].T.round(6)
+        chosen = np.concatenate([self.kept, fresh[np.lexsort((x, y))]])
+        others = {"configured": self.layout, "grid": np.arange(self.layout[-1] + 1, len(signal))}
+        layouts = {
+            name: {"sensors": len(rows), "information_nats": mutual_information(signal, rows)}
+            for name, rows in others.items()
+            if len(rows)
+        }
+        if drawn := best_of_random(inner, self.count, near, fixed, seed):
+            information = mutual_information(inner, drawn)
+            layouts["best_of_random"] = {"sensors": self.count, "information_nats": information}
+        known = {"sensors": self.count, "information_nats": value, "bound_nats": bound}
+        return chosen, known | {"share_of_bound": value / bound, "layouts": layouts}
+
+
+def best_of_random(
+    signal: np.ndarray, count: int, near: np.ndarray, fixed: Sites = (), seed: int = 0
+) -> list[int]:
+    """Return the most informative of 100 random choices of sites; none if the sites do not fit in any.
+
+    Args:
+        signal, count, near, fixed: as of :func:`skin.design.placement.greedy`.
+        seed: of the choices.
+    """
+    draws = (_drawn(near, count, fixed, generator(Stream.PLACEMENT, seed, 0, n)) for n in range(_RANDOM))
+    whole = (sites for sites in draws if len(sites) == count)
+    return max(whole, key=lambda sites: mutual_information(signal, sites), default=[])
+
+
+def _kept(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:
+    """Return the indices of the sensors of a layout that stay, in its order; less than ``count``."""
+    numbers = range(1, sensors + 1) if isinstance(keep, str) else sorted(set(keep))
+    if beyond := [number for number in numbers if number > sensors]:
+        raise InputError(
+            f"design.keep names sensor {beyond[0]}, but the layout has {sensors}: give numbers from 1 to "
+            f"{sensors}, or all"
+        )
+    if numbers and count <= len(numbers):
+        raise InputError(
+            f"design.keep keeps {len(numbers)} sensors, and design.count={count} leaves none to place: set "
+            f"design.count={len(numbers) + 1} or more, or keep fewer"
+        )
+    return np.array(numbers, dtype=int) - 1
+
+
+def _grid(body: AbstractBody, count: int, footprint: tuple[float, float], depth: float) -> list[Sensors]:
+    """Return a grid of as many sensors, the one whose tiles are nearest to squares, if one exists."""
+
+    def aspect(rows: int) -> tuple[float, int]:
+        sides = body.size[0] * rows / count, body.size[1] / rows
+        return round(max(sides) / min(sides), 6), abs(rows - count // rows)
+
+    rows = min((rows for rows in range(1, count + 1) if count % rows == 0), key=aspect)
+    if aspect(rows)[0] > _TILE:
+        return []
+    return [Grid(rows, count // rows, footprint, depth=depth).sensors(body)]
+
+
+def _drawn(near: np.ndarray, count: int, fixed: Sites, draw: np.random.Generator) -> list[int]:
+    """Return sites that are drawn at random, or fewer if no more fit."""
+    sites = [int(site) for site in fixed]
+    taken = np.asarray(near[sites].any(axis=0))
+    for site in map(int, draw.permutation(len(near))):
+        if len(sites) < count and not taken[site]:
+            sites.append(site)
+            taken |= near[site]
+    return sites

@@ -14,14 +14,14 @@ from rich.console import Console
 from rich.progress import track
 
 from skin.body.base import Layer
-from skin.build import Skin, build_skin
+from skin.body.layout.base import Footprint
+from skin.body.layout.grid import Grid
+from skin.body.material import Material
+from skin.core.files import whole
+from skin.core.settings import checked
 from skin.design.precision import Findings, LocalPrecision
 from skin.errors import InputError
-from skin.files import whole
-from skin.layout.base import Footprint
-from skin.layout.grid import Grid
-from skin.material import Material
-from skin.settings import checked
+from skin.runs.build import Skin, build_skin
 
 Pair = tuple[PositiveInt, PositiveInt]
 

@@ -1,1 +1,1 @@
-"""Sources of touches: each module is one option of ``device=``."""
+"""Sources of touches, simulated and recorded: imperfections, resampling, units, files."""

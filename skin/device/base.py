@@ -2,22 +2,27 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import torch
 from torch import Tensor
 
 from skin.body.base import AbstractBody
+from skin.body.sensors import Sensors
+from skin.core.rng import Stream, generator
+from skin.device.touches import Part, Recording, Touches, concatenate
 from skin.errors import InputError
-from skin.labels import Task
-from skin.recording import Part, Recording, Touches
-from skin.sensors import Sensors
+from skin.touch.labels import Task
 
-if TYPE_CHECKING:  # only their names are needed here
-    from skin.signal.constants import Constants
-    from skin.signal.imperfection import Imperfection
-    from skin.simulator.base import AbstractSimulator
+if TYPE_CHECKING:
+    from skin.device.imperfection import Constants, Imperfection
+    from skin.device.stream import TouchStream
+    from skin.mechanics.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
-    from skin.touch.stream import TouchStream
+
 
 Split = Literal["train", "validation", "holdout", "test"]
 
@@ -197,3 +202,117 @@ class AbstractSimulated(AbstractDevice):
             gap: [least, most] idle frames between two touches; None: ``touch.gap``.
             number: of the stream; each number gives other gestures.
         """
+
+
+# A device that yields placeholder touches of the right shapes.
+
+
+@dataclass
+class Blank(AbstractDevice):
+    """Yields the same example for every split: enough to restore a trained run, not to train one."""
+
+    task: Task
+    size: tuple[float, float]
+    example: Touches
+
+    @classmethod
+    def of(cls, task: Task, size: tuple[float, float], touches: Touches) -> "Blank":
+        """Return a device whose example is the first of the touches, with labels 0."""
+        return cls(task, size, replace(touches[:1], labels=torch.zeros(1, len(task))))
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
+        """Return the example."""
+        return self.example
+
+
+# The split of touches, 80/10/10 by gesture.
+
+
+MOST_HELD_OUT = 32768
+"""Gestures of a data set that a validation or a holdout has: more take memory and time, and tell no more."""
+
+
+def split_slices(count: int) -> dict[Split, slice]:
+    """Return the slice of ``count`` shuffled gestures that belongs to each split."""
+    training = round(0.8 * count)
+    middle = training + (count - training) // 2
+    return {"train": slice(training), "validation": slice(training, middle), "holdout": slice(middle, count)}
+
+
+def split_rows(split: Split, count: int, seed: int) -> Tensor:
+    """Return the shuffled indices of the gestures of a split; the order depends on ``seed`` alone."""
+    order = generator(Stream.SPLIT, seed).permutation(count)
+    return torch.from_numpy(order[split_slices(count)[split]])
+
+
+def split_shards(split: Split, counts: Sequence[int], seed: int) -> Iterator[tuple[int, Tensor]]:
+    """Yield the shards of a split and the rows that it has of each, both in random order.
+
+    Validation and holdout have at most ``MOST_HELD_OUT`` gestures each, and ``train`` has the rest.
+
+    Args:
+        split: train, validation or holdout.
+        counts: number of gestures of each shard.
+        seed: the order depends on it alone.
+    """
+    count = sum(counts)
+    slices = split_slices(count)
+    validation, holdout = (
+        min(MOST_HELD_OUT, len(range(count)[slices[name]])) for name in ("validation", "holdout")
+    )
+    ends = {"train": count - validation - holdout, "validation": count - holdout, "holdout": count}
+    begin, end = {"train": 0, "validation": ends["train"], "holdout": ends["validation"]}[split], ends[split]
+    before = 0
+    for number in generator(Stream.SPLIT, seed, 0).permutation(len(counts)).tolist():
+        first, last = max(begin - before, 0), min(end - before, counts[number])
+        if first < last:
+            rows = generator(Stream.SPLIT, seed, 1, number).permutation(counts[number])
+            yield number, torch.from_numpy(rows[first:last])
+        before += counts[number]
+
+
+# Draw batches on as many threads as torch has.
+
+
+_T = TypeVar("_T")
+_PART = 8  # batches: enough for few files, and little enough for memory
+
+
+def in_threads(work: Callable[[int], _T], count: int) -> list[_T]:
+    """Return ``work(0), ..., work(count - 1)``, computed on as many threads as torch has.
+
+    Each call runs on one thread: splitting its many small products costs more time than it saves. The result
+    is therefore the same to the last bit on any number of threads.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    pool, ended = ThreadPoolExecutor(threads), False
+    try:
+        return list(pool.map(work, range(count)))
+    except (SystemExit, KeyboardInterrupt):
+        ended = True  # who ends a command need not wait for the batches that are being drawn
+        raise
+    finally:
+        pool.shutdown(wait=not ended, cancel_futures=True)
+        torch.set_num_threads(threads)
+
+
+def joined(batches: Sequence[Part]) -> Recording:
+    """Return the recording of all batches."""
+    return concatenate(in_threads(lambda n: batches[n].make(), len(batches)))
+
+
+def grouped(batches: Sequence[Part], metadata: Callable[[Recording], dict[str, Any]]) -> list[Part]:
+    """Return batches as parts of eight, each of which is drawn on the thread that asks for it.
+
+    Args:
+        batches: to group.
+        metadata: gives that of a part.
+    """
+
+    def make(group: Sequence[Part]) -> Recording:
+        recording = concatenate([batch.make() for batch in group])
+        return replace(recording, metadata=metadata(recording))
+
+    groups = [batches[first : first + _PART] for first in range(0, len(batches), _PART)]
+    return [Part(sum(batch.count for batch in group), partial(make, group)) for group in groups]

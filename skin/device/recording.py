@@ -10,16 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body._memory import require_memory
-from skin.body.base import AbstractBody
-from skin.data_set import DataSet
-from skin.device._blank import Blank
-from skin.device._split import split_rows, split_shards
-from skin.device.base import AbstractDevice, Split
+from skin.body.base import AbstractBody, require_memory
+from skin.body.layout.base import AbstractLayout
+from skin.device.base import AbstractDevice, Blank, Split, split_rows, split_shards
+from skin.device.files import DataSet, read_recording
+from skin.device.touches import Part, Recording, Touches, concatenate
 from skin.errors import InputError
-from skin.layout.base import AbstractLayout
-from skin.recording import Part, Recording, Touches, concatenate
-from skin.recording_file import read_recording
 
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
 _BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated
@@ -32,7 +28,7 @@ class Recorded(AbstractDevice):
     touches need not fit into memory; its validation and holdout have at most 32,768 gestures each.
 
     Args:
-        path: ``x.parquet``, ``x.csv`` or the folder of a data set (:mod:`skin.data_set`).
+        path: ``x.parquet``, ``x.csv`` or the folder of a data set (:mod:`skin.device.files`).
         body: the sheet; it is compared with the file's.
         layout: positions of the sensors; they are compared with the file's.
         split_seed: seed of the split.

@@ -11,30 +11,116 @@ import torch
 from annotated_types import Ge
 from torch import Tensor
 
+from skin import __version__
 from skin.body.base import AbstractBody
-from skin.contact.base import AbstractContact
-from skin.contact.prescribed import Prescribed
-from skin.device._metadata import describe
-from skin.device._split import split_rows, split_slices
-from skin.device._threads import grouped, joined
-from skin.device._truth import everywhere, misplaced, modelled, refuse_relaxation
-from skin.device.base import AbstractSimulated, Split
+from skin.body.layout.base import AbstractLayout
+from skin.body.sensors import Sensors
+from skin.core.rng import Stream, generator
+from skin.core.settings import check_settings
+from skin.device.balance import summarise
+from skin.device.base import AbstractSimulated, Split, grouped, joined, split_rows, split_slices
+from skin.device.imperfection import Imperfection, ImperfectionSettings, draw_constants, idle_excess, measure
+from skin.device.resampling import check_rate
+from skin.device.stream import TouchStream, draw_timeline, only_touches
+from skin.device.touches import Part, Recording, Touches
 from skin.errors import InputError
-from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
-from skin.layout.base import AbstractLayout
-from skin.recording import Part, Recording, Touches
-from skin.rng import Stream, generator
-from skin.sensor_geometry import sensor_geometry
-from skin.sensors import Sensors
-from skin.settings import check_settings
-from skin.signal.device_sampling import draw_constants, idle_excess, measure
-from skin.signal.imperfection import Imperfection, ImperfectionSettings
-from skin.signal.resampling import check_rate
-from skin.simulator.base import AbstractSimulator
+from skin.mechanics.contact.base import AbstractContact
+from skin.mechanics.contact.prescribed import Prescribed
+from skin.mechanics.geometry import sensor_geometry
+from skin.mechanics.relaxation import Relaxing, relaxes
+from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gesture import GestureSettings
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
 from skin.touch.sampler import TouchSampler, balanced
-from skin.touch.stream import TouchStream, draw_timeline
+
+# Metadata of simulated recordings.
+
+
+_VERSIONS = {"skin": __version__, "torch": torch.__version__, "numpy": np.__version__}
+
+
+def describe(
+    device: AbstractSimulated, recording: Recording, split: Split | None, epoch: int
+) -> dict[str, Any]:
+    """Return how a recording was made, and a summary of its touches.
+
+    Args:
+        device: that made it.
+        recording: the touches.
+        split: None: the whole budget.
+        epoch: of ``train``.
+    """
+    return {
+        "source": "simulated",
+        "simulator": type(device.model).__name__,
+        "split": split or "budget",
+        "epoch": epoch,
+        "device_seed": device.seed,
+        "data_seed": device.data_seed,
+        "shapes": list(device.sampler.shapes.names),
+        "summary": summarise(only_touches(recording), device.body),
+        "versions": _VERSIONS,
+    }
+
+
+# The true sensors of a simulated device and its model of them.
+
+
+_ROUNDING = 1e-9  # m
+
+
+def misplaced(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
+    """Return sensors beside their places.
+
+    Args:
+        sensors: as touches report them.
+        size: extent (x, y) of the sheet, m, on which they stay.
+        error: standard deviation along x and along y, m.
+        seed: of the device.
+    """
+    moves = generator(Stream.POSITION, seed).standard_normal((len(sensors), 2))
+    positions = sensors.positions.copy()
+    positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
+    return replace(sensors, positions=positions)
+
+
+def everywhere(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
+    """Return a sensor at each cell of a body whose footprint lies wholly on it.
+
+    Their footprints are the areas over which a pressure can be dangerous anywhere.
+    """
+    margins = [max(extent, cell) / 2 for extent, cell in zip(footprint, body.cell, strict=True)]
+    x, y = (
+        centres[(centres >= margin - _ROUNDING) & (centres <= size - margin + _ROUNDING)]
+        for centres, size, margin in zip(_centres(body), body.size, margins, strict=True)
+    )
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Sensors(np.column_stack([places, np.zeros(len(places))]), footprint)
+
+
+def _centres(body: AbstractBody) -> list[np.ndarray]:
+    return [(np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True)]
+
+
+def modelled(
+    simulator: Callable[[AbstractBody, Sensors], AbstractSimulator],
+    body: AbstractBody,
+    sensors: Sensors,
+    rate: float,
+) -> AbstractSimulator:
+    """Return the simulator of a body with sensors; in time, at ``rate`` in Hz, where a material relaxes."""
+    return Relaxing(simulator, body, sensors, rate) if relaxes(body) else simulator(body, sensors)
+
+
+def refuse_relaxation(body: AbstractBody, setting: str) -> None:
+    """Raise an InputError that names a setting with which no material of a body may relax."""
+    if relaxes(body):
+        raise InputError(
+            f"a skin that relaxes is simulated touch by touch from rest, where it stays, got {setting}: "
+            "leave that out, or the materials' relaxation"
+        )
+
 
 _BATCH = 1024
 _STRIP = 600.0  # s of simulated touches in one piece
@@ -60,10 +146,10 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         stream: touches are windows of streams of gestures with idle gaps between them: a window contains part
             of a gesture, a whole one or none, and also has the label ``touch``. Splits share no stream.
         direction: the direction of sliding is a label too, as its cosines
-            (``skin.gesture_measures.sliding``).
+            (``skin.touch.movie.sliding``).
         data_seed: seed of the budget.
         seed: seed of the device's constants and noise; each seed is another device.
-        gain_spread, offset, noise, ... rate: :class:`skin.signal.imperfection.ImperfectionSettings`. The rate
+        gain_spread, offset, noise, ... rate: :class:`skin.device.imperfection.ImperfectionSettings`. The rate
             is that of the sensors; touches are resampled to ``touch.rate``.
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
@@ -123,7 +209,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     @cached_property
     def geometry(self) -> Tensor:
-        """Where the sensors are and what they respond to, (S, G), :data:`skin.recording.GEOMETRY`."""
+        """Where the sensors are and what they respond to, (S, G), :data:`skin.device.touches.GEOMETRY`."""
         same = self.position_error == 0
         model = self.model if same else modelled(self.simulator, self.body, self.sensors, self.model_rate)
         return sensor_geometry(self.body, self.sensors, model)

@@ -14,21 +14,18 @@ from rich.progress import track
 from torch import Tensor
 
 from skin.body.base import AbstractBody
-from skin.device._blank import Blank
-from skin.device._split import split_slices
-from skin.device._threads import in_threads
-from skin.device.base import AbstractDevice, Split
+from skin.body.layout.base import AbstractLayout
+from skin.body.sensors import GEOMETRY, Sensors
+from skin.core.rng import Stream, generator
+from skin.core.settings import check_settings, configured
+from skin.device.base import AbstractDevice, Blank, Split, in_threads, split_slices
+from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.simulated import Simulated
-from skin.labels import TOUCH
-from skin.layout.base import AbstractLayout
-from skin.recording import GEOMETRY, Touches
-from skin.rng import Stream, generator
-from skin.sensors import Sensors
-from skin.settings import check_settings, configured
-from skin.signal.imperfection import Imperfection, ImperfectionSettings
-from skin.simulator.base import AbstractSimulator
-from skin.skin_distribution import DrawnSkin, SkinDistribution
+from skin.device.skin_distribution import DrawnSkin, SkinDistribution
+from skin.device.touches import Touches
+from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gesture import GestureSettings
+from skin.touch.labels import TOUCH
 
 _GROUP = 128  # largest number of gestures on one skin at a time; fewer take longer
 _DEAD = 4  # at most one of so many sensors is dead
@@ -47,7 +44,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     Args:
         body, layout, simulator: of the skin to use the run on (:attr:`reference`); the drawn skins have their
             own.
-        skins: the distribution (:class:`skin.skin_distribution.SkinDistribution`).
+        skins: the distribution (:class:`skin.device.skin_distribution.SkinDistribution`).
         count: number of skins to train on.
         test_skins: number of skins to test on.
         skin_seed: of the skins.

@@ -1,1 +1,1 @@
-"""Evaluation of trained learners: metrics, operating point, devices, layouts, streams."""
+"""What a trained model is worth: metrics, the threshold of the alarm, margins, streams."""

@@ -11,9 +11,9 @@ from torch import Tensor
 from skin.device.base import AbstractDevice
 from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor, Reached
-from skin.gesture_measures import Measures
-from skin.labels import TOUCH, Thresholds
-from skin.signal.features import above_idle
+from skin.learning.features import above_idle
+from skin.touch.labels import TOUCH, Thresholds
+from skin.touch.movie import Measures
 
 ALARM_NAME = "alarm"
 """Name of the prediction "dangerous" at the operating point; the label itself uses a threshold of 0.5."""

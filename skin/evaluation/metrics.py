@@ -14,7 +14,7 @@ from torchmetrics.functional.classification import (
 )
 
 from skin.evaluation.operating_point import LABEL, OperatingPoint
-from skin.labels import Task
+from skin.touch.labels import Task
 
 OUTCOMES = "outcomes.npy"
 """Name of the file of a run that holds the outcomes of its test gestures."""

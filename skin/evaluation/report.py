@@ -15,16 +15,16 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from skin.body.layout.scattered import Scattered
+from skin.core.files import whole, write
 from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics, count_confusions, encode
 from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor, Reached
 from skin.evaluation.settings import Evaluation
-from skin.files import whole, write
-from skin.labels import Task
-from skin.layout.scattered import Scattered
 from skin.plot.figures import confusions, save_figure
-from skin.recording import Touches
+from skin.touch.labels import Task
 
 # Neither the default device (0) nor any layout of data/layouts is among them.
 _FIRST_DEVICE, _FIRST_LAYOUT = 1, 101

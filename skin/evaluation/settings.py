@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import PositiveFloat
 
+from skin.core.settings import RISING, checked
 from skin.errors import InputError
-from skin.settings import RISING, checked
 
 ENOUGH = 2000
 """Safe gestures; where 2 % are wanted, the true rate is then 1.4 to 2.7 % (95 %). 5000: 1.6 to 2.4 %."""

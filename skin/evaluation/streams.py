@@ -14,10 +14,17 @@ from torchmetrics.functional.classification import binary_confusion_matrix
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics
-from skin.evaluation.operating_point import LABEL, OperatingPoint, Predictor
+from skin.evaluation.operating_point import (
+    LABEL,
+    ContactThreshold,
+    Gate,
+    OperatingPoint,
+    Predictor,
+    gates,
+    rise,
+)
 from skin.evaluation.settings import StreamSettings
-from skin.labels import TOUCH_OR_NOT, Task
-from skin.signal.contact_threshold import ContactThreshold, Gate, gates, rise
+from skin.touch.labels import TOUCH_OR_NOT, Task
 
 _CHUNK = 1024
 _EDGES = (0.2, 0.4, 0.6, 0.8)

@@ -1,1 +1,1 @@
-"""Working with a real skin: recording, calibration, the emulator, the live view."""
+"""Real skins: reading, recording, calibrating, emulating and watching them."""

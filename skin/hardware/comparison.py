@@ -15,20 +15,20 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from skin.core.files import write
+from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
+from skin.device.resampling import resample
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.files import write
 from skin.hardware.calibration.bench import read_bench_session, read_gauge
 from skin.hardware.calibration.presses import BenchData, build_bench_data
 from skin.hardware.emulator.gestures import Gesture, emulated_gestures, gestures_with_labels
 from skin.hardware.record.recorder import check_session
 from skin.hardware.record.session import read_session
-from skin.labels import TOUCH
+from skin.hardware.wire.segmentation import label_text
 from skin.plot.figures import COLOURS, save_figure
-from skin.recording import Touches
-from skin.rng import Stream, generator
-from skin.signal.resampling import resample
-from skin.wire.segmentation import label_text
+from skin.touch.labels import TOUCH
 
 _IDLE = 30  # frames before a simulated gesture, which give its baseline
 _BEFORE, _AFTER = 20, 40  # frames of a session that the figure shows around a press

@@ -1,8 +1,10 @@
 """Touches from a real or emulated skin, gesture by gesture."""
 
 import sys
+from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,19 +12,15 @@ import torch
 from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody
-from skin.device._blank import Blank
-from skin.device.base import AbstractDevice, Split
+from skin.body.layout.base import AbstractLayout
+from skin.body.sensors import Sensors
+from skin.device.base import AbstractDevice, Blank, Split
+from skin.device.resampling import Frame, Resampled, Window
+from skin.device.touches import Recording, Touches
 from skin.errors import InputError
-from skin.hardware.wired import AbstractWired
-from skin.labels import TOUCH, TOUCH_OR_NOT
-from skin.layout.base import AbstractLayout
-from skin.recording import Recording, Touches
-from skin.signal.frame import Frame
-from skin.signal.resampling import Resampled, Window
-from skin.touch.gesture import GestureSettings, model_window
-from skin.wire.channels import UnitConversion
-from skin.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
-from skin.wire.segmentation import (
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
+from skin.hardware.wire.segmentation import (
     AbstractSegmenter,
     AnnouncedSegmenter,
     AnnouncementListener,
@@ -32,8 +30,70 @@ from skin.wire.segmentation import (
     label_plan,
     label_text,
 )
-from skin.wire.skin import Skin
-from skin.wire.source import SerialSource
+from skin.hardware.wire.skin import Skin, play
+from skin.hardware.wire.source import SerialSource, Source
+from skin.touch.gesture import GestureSettings, model_window
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT
+
+# Devices at a port, and any device as a stream of frames.
+
+
+class AbstractWired(AbstractDevice):
+    """Base class of devices that read a skin at a port, frame by frame.
+
+    Attributes:
+        wire: opens the port.
+        sensors: S sensors, one per value of a frame.
+        window: frames per touch.
+        model_rate: frames per second that touches are resampled to, Hz.
+        labels: source of the labels.
+        gestures: number of touches of ``test``.
+        calibration: calibration file of the device; or None.
+    """
+
+    real = True
+    wire: SerialSource
+    sensors: Sensors
+    window: int
+    model_rate: float
+    labels: str
+    gestures: int
+    calibration: str | None
+
+    @abstractmethod
+    def segmenter(
+        self,
+        listener: AnnouncementListener,
+        conversion: UnitConversion,
+        first: Sequence[Frame],
+        done: Collection[int] = (),
+    ) -> AbstractSegmenter:
+        """Return the segmenter of a stream.
+
+        Args:
+            listener: collects announcements.
+            conversion: of the values to N.
+            first: frames read before.
+            done: numbers of gestures that are already recorded.
+        """
+
+    @abstractmethod
+    def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
+        """Return gestures as a recording."""
+
+
+def open_source(device: AbstractDevice) -> Source:
+    """Open the stream of frames that ``skin live`` watches: of a port, or touches in real time.
+
+    Raises:
+        InputError: the stream cannot be opened, or the device has none.
+    """
+    if isinstance(device, AbstractWired):
+        return device.wire.open_source()
+    strips = iter(device.strips())
+    first = next(strips)
+    return Source.in_newtons(device.name, play(chain([first], strips)), first.readings.shape[2])
+
 
 _LABELS = ("announced", "prompted", "none")
 
@@ -48,7 +108,7 @@ class Serial(PortSettings, AbstractWired):
     Args:
         body: the sheet of the model.
         layout: positions of its sensors; the device must send as many values.
-        port, baudrate, tare, ...: as in :class:`skin.wire.reader.PortSettings`.
+        port, baudrate, tare, ...: as in :class:`skin.hardware.wire.reader.PortSettings`.
         labels: ``announced``, ``prompted`` or ``none``.
         gestures: number of gestures.
         seed: of the order of prompts.

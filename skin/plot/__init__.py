@@ -1,1 +1,1 @@
-"""Pictures and pages of touches, skins, evaluations, and recordings beside their simulation."""
+"""Pictures and animations of skins, touches and results."""

@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
@@ -12,14 +14,29 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from PIL.Image import Dither, Image, fromarray, new
 
+from skin.body.base import AbstractBody
+from skin.core.files import whole
+from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.files import whole
+from skin.learning.representation.image import centres
+from skin.learning.representation.interp import weights
 from skin.plot.figures import save_figure
-from skin.plot.plot3d import sensors_in_space, skin_in_space
-from skin.plot.surface import draw_surface
-from skin.plot.view import FORCE, Draw, Scene, clear, draw_traces, norm, places, space_and_traces
-from skin.representation._interpolation import weights
-from skin.representation._pixels import centres
+from skin.plot.plot3d import (
+    FORCE,
+    Draw,
+    Scene,
+    clear,
+    draw_surface,
+    draw_traces,
+    norm,
+    places,
+    sensors_in_space,
+    skin_in_space,
+    space_and_traces,
+    surface_motion,
+)
+from skin.touch.labels import TOUCH
 
 _FASTEST, _LONGEST = 25.0, 100  # frames per second, frames
 _PIXELS = 48
@@ -185,3 +202,75 @@ def _between(scene: Scene) -> np.ndarray:
     except InputError:  # sensors on one line make no triangle
         matrix = weights(points, centres(scene.size, _PIXELS), "nearest")
     return np.maximum(scene.readings @ matrix.T, 0).reshape(-1, _PIXELS, _PIXELS)
+
+
+# The touches that animations show: drawn on request, or taken from a device.
+
+
+@torch.no_grad()
+def simulated(
+    device: AbstractSimulated, labels: Sequence[str], shape: str | None, seed: int, field: bool
+) -> Scene:
+    """Draw a touch as a simulated device feels it.
+
+    Args:
+        device: whose skin, sensors and imperfections are shown.
+        labels: those of ``skin.touch.labels.TOUCH`` that hold; the others do not.
+        shape: what presses, a name in ``data/shapes`` or the path of a picture; None: any of the device's.
+        seed: of the touch.
+        field: solve for the movement of the whole surface too (``skin.plot.plot3d.surface_motion``).
+
+    Raises:
+        InputError: an unknown label, or a shape of which no such touch can be made.
+    """
+    if unknown := sorted(set(labels) - set(TOUCH.names)):
+        raise InputError(f"no label {', '.join(unknown)}: labels may list {', '.join(TOUCH.names)}")
+    if shape is not None:
+        device = device.replace(touch=replace(device.sampler.settings, shapes=(shape,)))
+    generator = np.random.default_rng(seed)
+    wanted = np.array([[name in labels for name in TOUCH.names]])
+    movie = device.sampler.sample(1, generator, wanted)
+    true = device.model.respond(movie, displacement=False).readings
+    readings, *_ = device.imperfection.apply(true, device.constants, generator)
+    pressure = movie.pressure()[0]
+    moved = None
+    found = surface_motion(device.model, device.body, movie.frames) if field else None
+    if found is not None:
+        moved = found[movie.index[0]] * movie.scale[0, :, None, None].numpy()
+    name = device.sampler.shapes.names[int(movie.parameters["shape"][0])]
+    positions = np.broadcast_to(device.sensors.positions, (len(pressure), *device.sensors.positions.shape))
+    return Scene(
+        readings[0].numpy(), positions, device.size, device.model_rate, _title(name, wanted[0], TOUCH.names),
+        pressure.numpy(), moved, _round(device.body),
+    )  # fmt: skip
+
+
+def recorded(device: AbstractDevice, index: int) -> Scene:
+    """Return one touch of a device: of a whole recording, or of another device's test touches.
+
+    Raises:
+        InputError: there is no touch of that number.
+    """
+    touches = device.all_touches()
+    if not 0 <= index < len(touches):
+        raise InputError(
+            f"there are {len(touches)} touches, got index={index}: give index=0 to {len(touches) - 1}"
+        )
+    one: Touches = touches[index : index + 1]
+    readings = one.readings.where(one.valid, 0)[0].numpy()
+    positions = np.broadcast_to(one.positions.numpy(), (1, *readings.shape, 3))[0]
+    said = "" if one.labels is None else _title("", one.labels[0].bool().numpy(), device.task.names)
+    return Scene(
+        readings, positions, device.size, one.rate, f"touch {index}{said}", body=_round(device.surface)
+    )
+
+
+def _round(body: AbstractBody | None) -> AbstractBody | None:
+    """Return a body whose pictures need to know where it is in space."""
+    return None if body is None or body.flat else body
+
+
+def _title(name: str, holds: np.ndarray, names: Sequence[str]) -> str:
+    """Return what presses and which labels hold."""
+    said = ", ".join(label for label, on in zip(names, holds, strict=True) if on) or "no label holds"
+    return f"{name}: {said}"

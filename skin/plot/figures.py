@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from skin.files import whole
+from skin.core.files import whole
 
 Layout = tuple[tuple[float, float], float]
 

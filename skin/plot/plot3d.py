@@ -1,19 +1,201 @@
 """Touches on a curved body, drawn in three dimensions (report, figure 9)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
+from torch import Tensor
 
 from skin.body.base import AbstractBody
-from skin.plot.view import FORCE, Draw, Scene, clear, draw_traces, norm, space_and_traces
+from skin.errors import InputError
+from skin.mechanics.simulator.base import AbstractSimulator, factorised
+from skin.mechanics.simulator.plates import Constraint, Structure
+
+# The base of every animated view: the touch that is shown, and its readings over time.
+
+
+FORCE = "viridis"  # colours of forces
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One touch, with what is known of it.
+
+    Attributes:
+        readings: (T, S), N, 0 where not valid.
+        positions: (T, S, 3), m.
+        size: extent (x, y) of the sheet, m.
+        rate: frames per second, Hz.
+        title: of the picture.
+        pressure: (T, H, W), Pa; None where nobody knows it.
+        moved: (T, ny + 1, nx + 1), m, of the surface into the skin; None where nobody asked for it or knows.
+        body: what is touched, if it is not flat; None: a sheet.
+    """
+
+    readings: np.ndarray
+    positions: np.ndarray
+    size: tuple[float, float]
+    rate: float
+    title: str
+    pressure: np.ndarray | None = None
+    moved: np.ndarray | None = None
+    body: AbstractBody | None = None
+
+    @property
+    def strongest(self) -> float:
+        """The largest reading, N; 1 where there is none above 0."""
+        most = float(self.readings.max(initial=0))
+        return most if most > 0 else 1.0
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Where a picture of the sheet lies, mm, y downwards."""
+        return 0, 1e3 * self.size[0], 1e3 * self.size[1], 0
+
+    @staticmethod
+    def known(values: np.ndarray | None) -> np.ndarray:
+        """Return the movement of the surface, or its pressure.
+
+        Raises:
+            InputError: nobody knows them.
+        """
+        if values is None:
+            raise InputError(
+                "view=skin3d needs the pressure on the skin, which only device=simulated knows: "
+                "give view=flat or view=sensors3d"
+            )
+        return values
+
+
+Draw = Callable[[int], None]
+
+
+def space_and_traces(figure: Figure) -> tuple[Axes3D, Axes]:
+    grid = figure.add_gridspec(1, 2, width_ratios=(1.4, 1))
+    return figure.add_subplot(grid[0], projection="3d"), figure.add_subplot(grid[1])
+
+
+def clear(axis: Axes3D) -> None:
+    for shown in list(axis.collections):
+        shown.remove()
+
+
+def draw_traces(axis: Axes, scene: Scene) -> Draw:
+    """Draw all readings over time, with a line that says when the rest of the picture is."""
+    axis.plot(np.arange(len(scene.readings)) / scene.rate, scene.readings, linewidth=0.8)
+    line = axis.axvline(0, color="black", linewidth=0.8, linestyle=":")
+    axis.set(xlabel="time, s", ylabel="readings, N", xlim=(0, max(1, len(scene.readings) - 1) / scene.rate))
+
+    def draw(frame: int) -> None:
+        line.set_xdata([frame / scene.rate] * 2)
+
+    return draw
+
+
+def places(scene: Scene, frame: int) -> np.ndarray:
+    """Return where the sensors are, x and y, (2, S), mm."""
+    return 1e3 * scene.positions[frame, :, :2].T
+
+
+def norm(scene: Scene) -> Normalize:
+    return Normalize(0, scene.strongest)
+
+
+# Displacement of the whole skin under a pressure (report, figures 2 and 3).
+
+
+def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "vertical") -> np.ndarray:
+    """Return the inward displacement of each node, (F, layers, ny + 1, nx + 1), m, from the base up.
+
+    The plates and beams of :class:`skin.mechanics.simulator.fem.PlatesAndBeams`, solved for the frames
+    themselves and
+    not for the sensors: one factorisation, one solve per frame. The table, which does not move, is left out.
+
+    Args:
+        body: the sheet.
+        pressure: (F, H, W), Pa, on the cells of its surface.
+        constraint: as in :class:`skin.mechanics.simulator.plates.Structure`.
+    """
+    structure = Structure(body, constraint)
+    factors = factorised(structure.stiffness())
+    loads = structure.load() @ pressure.flatten(1).double().numpy().T
+    down = -factors.solve(loads).reshape(-1, len(structure.free), len(pressure))[:, structure.free.index(2)]
+    return np.moveaxis(down.reshape(*structure.grid, len(pressure)), -1, 0)
+
+
+def surface_motion(model: AbstractSimulator, body: AbstractBody, pressure: Tensor) -> np.ndarray | None:
+    """Return how far the surface moves into the skin, (F, ny + 1, nx + 1), m, or None where nobody knows.
+
+    By the simulator's own compliance if it has one, else by plates and beams if the body is flat.
+
+    Args:
+        model: the simulator.
+        body: what is pressed.
+        pressure: (F, H, W), Pa; friction is left out.
+    """
+    try:
+        compliance = model.compliance()
+    except InputError:
+        return deflection(body, pressure)[:, -1] if body.flat else None
+    cells = (pressure.flatten(1).to(compliance) @ compliance).reshape(pressure.shape).numpy()
+    around = np.pad(cells, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    return (around[:, 1:, 1:] + around[:, :-1, 1:] + around[:, 1:, :-1] + around[:, :-1, :-1]) / 4
+
+
+def draw_surface(
+    axis: Axes3D, moved: np.ndarray, depth: float, size: tuple[float, float], most: float
+) -> None:
+    """Draw a face of the deformed skin in space, its height stretched to be seen.
+
+    Args:
+        axis: what to draw on.
+        moved: (ny + 1, nx + 1), m, into the skin.
+        depth: of the face below the surface where nothing presses, m.
+        size: extent (x, y) of the sheet, m.
+        most: the movement that takes the last colour and the whole height, m.
+    """
+    most = max(most, 1e-9)
+    places = np.meshgrid(*(np.linspace(0, 1e3 * size[axis], moved.shape[1 - axis]) for axis in (0, 1)))
+    height = -1e3 * (moved + depth)
+    colours = colormaps["viridis"](moved / most)
+    axis.plot_surface(*places, height, facecolors=colours, rcount=50, ccount=50, shade=False)
+    axis.set(xlabel="x, mm", ylabel="y, mm", zlabel="height, mm", zlim=(-1e3 * (depth + most), -1e3 * depth))
+    axis.set(xlim=(0, 1e3 * size[0]), ylim=(1e3 * size[1], 0))
+    axis.zaxis.set_major_locator(MaxNLocator(4))
+    axis.set_box_aspect((size[0], size[1], 0.3 * max(size)))
+    axis.view_init(elev=48, azim=-65)
+
+
+def surface(moved: np.ndarray, depth: float, size: tuple[float, float], title: str) -> Figure:
+    """Draw one face of the deformed skin in space, and as a map (report, figures 2 and 3).
+
+    Args:
+        moved: (ny + 1, nx + 1), m, into the skin.
+        depth: of the face below the surface where nothing presses, m.
+        size: extent (x, y) of the sheet, m.
+        title: of the figure.
+    """
+    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
+    figure.suptitle(title)
+    space = figure.add_subplot(1, 2, 1, projection="3d")
+    draw_surface(space, moved, depth, size, float(moved.max()))
+    flat = figure.add_subplot(1, 2, 2)
+    extent = (0, 1e3 * size[0], 1e3 * size[1], 0)
+    shown = flat.imshow(1e3 * moved, cmap="viridis", extent=extent, interpolation="bilinear")
+    figure.colorbar(shown, ax=flat, label="into the skin, mm")
+    flat.set(xlabel="x, mm", ylabel="y, mm")
+    return figure
+
 
 _ELEVATION, _AZIMUTH = 38.0, -62.0  # degrees, of the eye
 # Towards the eye; y is drawn upside down, so that the chart is seen from outside as it is in flat pictures.

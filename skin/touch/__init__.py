@@ -1,1 +1,1 @@
-"""Touches: shapes, gestures drawn from a seed, and their pressure movies."""
+"""Touches: labels, shapes, gestures and movies of pressure."""

@@ -12,9 +12,9 @@ from annotated_types import Ge, Le, MinLen
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from skin.core.settings import RISING, check_settings, checked, configured
 from skin.errors import InputError
-from skin.labels import Thresholds
-from skin.settings import RISING, check_settings, checked, configured
+from skin.touch.labels import Thresholds
 from skin.touch.shapes import Fit, Shapes, draw_bodies
 
 Draws = dict[str, np.ndarray]
@@ -323,7 +323,7 @@ class Trajectories:
         index: (B, T), the frame at each time.
         profile: (B, T), its share of full force; 0 without contact.
         peak: (B,), the wanted highest cell pressure, Pa.
-        wanted: (B, 4), bool, the wanted labels in the order of ``skin.labels.TOUCH``.
+        wanted: (B, 4), bool, the wanted labels in the order of ``skin.touch.labels.TOUCH``.
         stretch: (U,), as ``Shapes.render`` takes it.
     """
 

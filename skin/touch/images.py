@@ -10,8 +10,8 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
+from skin.core.files import BUNDLED, candidates
 from skin.errors import InputError
-from skin.paths import BUNDLED, candidates
 
 _FOLDER = BUNDLED / "data" / "shapes"
 

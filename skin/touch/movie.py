@@ -2,12 +2,150 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from skin.gesture_measures import sliding
+from skin.touch.labels import Thresholds
+
+# Measures of gestures, from which their labels follow.
+
+
+_PART = 256
+_STRAIGHT = 0.5
+
+
+class Measures(NamedTuple):
+    """Measures of each gesture of a movie; every tensor is (B,).
+
+    Attributes:
+        area: largest share of the sheet in contact in one frame.
+        travel: furthest distance of the centre of pressure from its first place, m.
+        frames: longest run of consecutive frames in contact.
+        pressure: largest surface pressure over a sensor's footprint, Pa.
+    """
+
+    area: Tensor
+    travel: Tensor
+    frames: Tensor
+    pressure: Tensor
+
+    def labels(self, thresholds: Thresholds, rate: float) -> Tensor:
+        """Return the labels (B, 4), 0 or 1, float32, in the order of ``TOUCH``.
+
+        Args:
+            thresholds: of the labels.
+            rate: frames per second of the movie, Hz.
+        """
+        big = self.area > thresholds.area
+        dynamic = self.travel > thresholds.travel
+        press = self.frames > round(thresholds.duration * rate)
+        dangerous = self.pressure > thresholds.pressure
+        return torch.stack([big, dynamic, press, dangerous], dim=1).float()
+
+
+def measure_gestures(
+    frames: Tensor,
+    index: Tensor,
+    scale: Tensor,
+    footprints: Tensor,
+    cell: tuple[float, float],
+    contact: float = Thresholds.contact,
+) -> Measures:
+    """Measure gestures given as distinct frames, each processed once.
+
+    Args:
+        frames: (U, H, W), Pa; a frame belongs to one gesture.
+        index: (B, T), index of the frame.
+        scale: (B, T), factor of the frame, 0 without touch.
+        footprints: (S, H * W), area weights of each sensor that sum to 1.
+        cell: extent (x, y) of a cell, m.
+        contact: share of the gesture's peak cell above which a cell is in contact.
+    """
+    count, height, width = frames.shape
+    flat = frames.flatten(1)
+    highest = flat.amax(1)
+    peak = (highest[index] * scale).amax(1)
+    touched = highest[index] * scale > contact * peak[:, None]
+
+    sensors, centre = _means(frames, footprints, cell)
+    pressure = (sensors.amax(1)[index] * scale).amax(1)
+
+    # The lowest pressure that counts as contact, where a frame is shown at its strongest.
+    level = torch.full((count,), torch.inf).to(frames)
+    lowest = contact * peak[:, None] / scale
+    level.scatter_reduce_(0, index.flatten(), lowest.flatten(), "amin")
+    # In parts that stay in the cache: the comparison of all cells at once would be as large as the movie.
+    parts = zip(flat.split(_PART), level[:, None].split(_PART), strict=True)
+    cells = torch.cat([(part > limit).sum(1) for part, limit in parts])
+    area = cells[index].where(touched, 0).amax(1) / (height * width)
+
+    first = touched.int().argmax(1)
+    places = centre[index]
+    distance = torch.linalg.vector_norm(places - places[torch.arange(len(places)), first][:, None], dim=-1)
+    travel = distance.where(touched, 0).amax(1)
+    return Measures(area, travel, longest_run(touched), pressure)
+
+
+def _means(frames: Tensor, footprints: Tensor, cell: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Return the mean pressure over each footprint (U, S), Pa, and the centre of pressure (U, 2), m."""
+    height, width = frames.shape[1:]
+    y, x = torch.meshgrid(
+        (torch.arange(height) + 0.5) * cell[1], (torch.arange(width) + 0.5) * cell[0], indexing="ij"
+    )
+    moments = torch.stack([torch.ones_like(x), x, y]).flatten(1)
+    # One product reads the frames once for the footprints, the total and both first moments.
+    means = frames.flatten(1) @ torch.cat([footprints.to(frames), moments.to(frames)]).T
+    return means[:, :-3], means[:, -2:] / means[:, -3:-2].clamp(min=1e-30)
+
+
+def longest_run(active: Tensor) -> Tensor:
+    """Return the length of the longest run of true values over time, (B, ...), of active (B, T, ...)."""
+    passed = active.cumsum(dim=1, dtype=torch.int32)
+    before = torch.where(active, 0, passed).cummax(dim=1).values
+    return (passed - before).amax(dim=1)
+
+
+def movie_labels(
+    pressure: Tensor,
+    footprints: Tensor,
+    cell: tuple[float, float],
+    thresholds: Thresholds | None = None,
+    rate: float = 10.0,
+) -> Tensor:
+    """Return the labels (B, 4) that a dense pressure movie gives.
+
+    Args:
+        pressure: (B, T, H, W), Pa.
+        footprints: (S, H * W), area weights of each sensor that sum to 1.
+        cell: extent (x, y) of a cell, m.
+        thresholds: of the labels; None: those of the report.
+        rate: frames per second, Hz.
+    """
+    thresholds = thresholds or Thresholds()
+    batch, time = pressure.shape[:2]
+    index = torch.arange(batch * time, device=pressure.device).view(batch, time)
+    scale = torch.ones(batch, time).to(pressure)
+    measures = measure_gestures(pressure.flatten(0, 1), index, scale, footprints, cell, thresholds.contact)
+    return measures.labels(thresholds, rate)
+
+
+def sliding(net: Tensor, way: Tensor) -> Tensor:
+    """Return the cosines (B, 2) of the directions in which touches slide; 0, 0 where they have none.
+
+    It is the direction from where a touch begins to where it ends. A path that leads less than half its
+    length away, because it was turned at the edges, goes to and fro: it has no direction, like one that
+    stands still.
+
+    Args:
+        net: (B, 2), m, from the first place to the last.
+        way: (B,), m, the length of the path.
+    """
+    far = torch.linalg.vector_norm(net, dim=1)
+    straight = (far > 0) & (far >= _STRAIGHT * way)
+    return net / far.where(straight, 1)[:, None] * straight[:, None]
 
 
 @dataclass(frozen=True)
@@ -18,13 +156,13 @@ class Movie:
         frames: (U, H, W), Pa, the distinct frames at full force.
         index: (B, T), the frame at each time.
         scale: (B, T), its share of full force; 0 without contact.
-        labels: (B, 4), 0 or 1, float32, in the order of ``skin.labels.TOUCH``.
+        labels: (B, 4), 0 or 1, float32, in the order of ``skin.touch.labels.TOUCH``.
         parameters: (B,) each: shape (index), angle (rad), stretch (``Shapes.render``), misfits (bodies drawn
             that had no room on the sheet), duration and onset (frames), direction (rad), speed (m per frame),
             peak (highest cell pressure, Pa), force (N, all cells at full force), draws (how many paths were
             drawn until one had the wanted labels), net_x and net_y (m, from the first place of the path to
             its last), x and y (m, that first place); area, travel, frames and pressure
-            (``skin.gesture_measures.Measures``), which make the labels; and where pressure is solved for,
+            (``skin.touch.movie.Measures``), which make the labels; and where pressure is solved for,
             unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
@@ -61,7 +199,7 @@ class Movie:
 
     @property
     def slides(self) -> Tensor:
-        """Cosines of the sliding directions, (B, 2); see ``skin.gesture_measures.sliding``."""
+        """Cosines of the sliding directions, (B, 2); see ``skin.touch.movie.sliding``."""
         known = self.parameters
         net = torch.stack([known["net_x"], known["net_y"]], dim=1)
         return sliding(net, known["speed"] * (known["duration"] - 1))

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.gesture_measures import measure_gestures
-from skin.labels import TOUCH
 from skin.touch.gesture import (
     Draws,
     GestureSettings,
@@ -23,7 +21,8 @@ from skin.touch.gesture import (
     heading,
     sample_paths,
 )
-from skin.touch.movie import Movie, join_movies
+from skin.touch.labels import TOUCH
+from skin.touch.movie import Movie, join_movies, measure_gestures
 from skin.touch.shapes import Fit, Shapes
 
 _ATTEMPTS = 50
@@ -71,7 +70,8 @@ class ContactResult(NamedTuple):
 
 
 class ContactModel(Protocol):
-    """The interface of a contact for the sampler; see :class:`skin.contact.base.AbstractContact`."""
+    """The interface of a contact for the sampler; see
+    :class:`skin.mechanics.contact.base.AbstractContact`."""
 
     @property
     def proportional(self) -> bool: ...

@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from skin.body.arm import Arm
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.layout.grid import Grid
-from skin.simulator.fem import PlatesAndBeams
-from skin.simulator.naive import Naive
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.naive import Naive
 
 LAYERS = [
     {"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}, "thickness": 0.010},

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.sensors import Sensors
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from skin.paths import ROOT
+from skin.core.files import ROOT
 
 SCRIPTS = sorted((ROOT / "experiments" / "cluster").glob("*.sh"))
 

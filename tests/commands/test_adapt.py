@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.recording_file import read_recording, write_recording
+from skin.device.files import read_recording, write_recording
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 NETWORK = ["representation=features", "model=mlp", "model.widths=[]", "fusion.head=residual"]

@@ -3,8 +3,8 @@
 import pytest
 from PIL import Image
 
-from skin.build import build_device
-from skin.recording_file import write_recording
+from skin.device.files import write_recording
+from skin.runs.build import build_device
 
 NAIVE = ("animate", "simulator=naive")
 

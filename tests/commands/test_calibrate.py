@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.signal.calibration import read_calibration
+from skin.device.calibration import read_calibration
 
 SMALL = ["layout=grid", "layout.rows=2", "layout.columns=2", "calibrate.protocol.rest=1.5"]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from skin.commands.evaluate import describe_evaluation
-from skin.recording_file import read_recording, write_recording
+from skin.device.files import read_recording, write_recording
 
 SMALL = [
     "data.gestures=160",

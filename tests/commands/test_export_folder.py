@@ -35,7 +35,7 @@ def test_the_folder_has_weights_configuration_hashes_and_card(folder):
     written = {path.name for path in (folder / "models" / "small").iterdir()}
     assert written == {"README.md", "SHA256SUMS", "config.yaml", "rules.json", "run.json"}
     card = (folder / "models" / "small" / "README.md").read_text()
-    assert "`skin.learner.rules.Rules`" in card
+    assert "`skin.learning.learner.rules.Rules`" in card
     assert "Mlp" not in card
     assert "Of the first 96 test gestures" in card
 
@@ -84,7 +84,7 @@ def test_bad_input_ends_with_a_sentence(folder, run, overrides, message):
 
 
 def test_weights_that_are_too_large_are_refused(folder, run):
-    code = "import skin.model_folder as m; from skin.commands.export import main; m._LARGEST = 100\n"
+    code = "import skin.runs.model_folder as m; from skin.commands.export import main; m._LARGEST = 100\n"
     code += "main(['format=folder', 'name=new', 'licence=MIT'{own}])"
     own = f", 'tracking.uri=sqlite:///{folder}/m.db'"
     (folder / "limited.py").write_text(code.format(own=own))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from skin.recording_file import read_recording
+from skin.device.files import read_recording
 
 NAIVE = ("generate.py", "simulator=naive")
 

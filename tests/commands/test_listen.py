@@ -8,8 +8,8 @@ import tty
 
 import pytest
 
-from skin.paths import ROOT
-from skin.wire.protocol import Header, encode_header, encode_line
+from skin.core.files import ROOT
+from skin.hardware.wire.protocol import Header, encode_header, encode_line
 
 LISTEN = "-m", "skin", "listen"
 

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from skin.body.sheet import Sheet
-from skin.design.candidates import candidate_sites, keep_out
+from skin.design.placement import candidate_sites, keep_out
 from skin.errors import InputError
 
 LAYERS = [{"material": "EcoFlex 00-30", "thickness": 0.005}]

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
-from skin.design.information import Noise, Sensitivity, local_covariance, sensitivity
-from skin.layout.grid import Grid
-from skin.simulator.fem import PlatesAndBeams
-from skin.simulator.naive import Naive
-from skin.simulator.solid import Solid
-from skin.touch.fingertip import Fingertip
+from skin.design.precision import Noise, Sensitivity, local_covariance, sensitivity
+from skin.mechanics.geometry import Fingertip
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.solid import Solid
 
 LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},

@@ -7,11 +7,11 @@ import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
+from skin.body.layout.file import File
 from skin.body.sheet import Sheet
+from skin.core.files import CONF
 from skin.design.place import Place
 from skin.errors import InputError
-from skin.layout.file import File
-from skin.paths import CONF
 
 SIZE = (0.12, 0.08)
 SHEET = Sheet(SIZE, [12, 8], [{"material": "EcoFlex 00-30", "thickness": 0.005}] * 2)

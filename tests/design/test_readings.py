@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from skin.build import build_device
-from skin.design.readings import reading_covariance
-from skin.rng import Stream, generator
-from skin.sensors import Sensors
+from skin.body.sensors import Sensors
+from skin.core.rng import Stream, generator
+from skin.design.place import reading_covariance
+from skin.runs.build import build_device
 from skin.touch.sampler import balanced
 
 SMALL = ("body.cells=[12,12]", "layout=grid", "layout.rows=3", "layout.columns=3", "touch.over_sensors=false")

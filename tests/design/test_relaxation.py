@@ -5,8 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from skin.design.placement import given, mutual_information
-from skin.design.relaxation import upper_bound
+from skin.design.placement import given, mutual_information, upper_bound
 
 SEEDS = range(6)
 SITES = 12

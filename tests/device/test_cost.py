@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from skin.build import build_data, build_device, build_learner
-from skin.config import validate_config
 from skin.device.cost import GESTURES, VARIANTS, Cost
 from skin.errors import InputError
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.configuration import validate_config
 
 SUBJECTS = (1, 2, 3, 5, 8, 13, 21, 31)
 HEADER = "subject, variant, gesture, frame, " + ", ".join(f"ch{number}" for number in range(1, 65))

@@ -5,16 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from skin.body.layout.grid import Grid
+from skin.body.layout.scattered import Scattered
 from skin.body.sheet import Sheet
-from skin.data_set import Manifest
+from skin.device.files import Manifest, describe_recording, write_recording
 from skin.device.recording import Recorded
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.layout.grid import Grid
-from skin.layout.scattered import Scattered
-from skin.recording_file import write_recording
-from skin.recording_metadata import describe_recording
-from skin.simulator.naive import Naive
+from skin.mechanics.simulator.naive import Naive
 
 LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
 BODY = Sheet([0.16, 0.16], [16, 16], LAYER)
@@ -116,7 +114,7 @@ def test_another_split_seed_splits_a_data_set_otherwise(folder):
 
 
 def test_no_more_is_held_out_than_needed(folder, monkeypatch):
-    monkeypatch.setattr("skin.device._split.MOST_HELD_OUT", 2)
+    monkeypatch.setattr("skin.device.base.MOST_HELD_OUT", 2)
     device = Recorded(BODY, LAYOUT, folder)
     assert [len(device.touches(split)) for split in ("train", "validation", "holdout")] == [46, 2, 2]
 

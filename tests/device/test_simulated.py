@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.layout.grid import Grid
+from skin.body.layout.scattered import Scattered
 from skin.body.sheet import Sheet
+from skin.core.rng import Stream, generator
+from skin.device.imperfection import ImperfectionSettings
 from skin.device.simulated import Simulated
+from skin.device.touches import concatenate
 from skin.errors import InputError
-from skin.gesture_measures import movie_labels
-from skin.layout.grid import Grid
-from skin.layout.scattered import Scattered
-from skin.recording import concatenate
-from skin.rng import Stream, generator
-from skin.signal.imperfection import ImperfectionSettings
-from skin.simulator.fem import PlatesAndBeams
-from skin.simulator.naive import Naive
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.naive import Naive
+from skin.touch.movie import movie_labels
 from skin.touch.sampler import balanced
 
 LAYERS = [
@@ -61,7 +61,7 @@ def test_the_number_of_threads_does_not_matter(plain, monkeypatch):
 @pytest.mark.parametrize("stream", [False, True])
 def test_parts_are_the_budget(monkeypatch, stream):
     monkeypatch.setattr("skin.device.simulated._BATCH", 4)
-    monkeypatch.setattr("skin.device._threads._PART", 3)
+    monkeypatch.setattr("skin.device.base._PART", 3)
     one = device(stream=stream)
     whole, parts = one.recording(complete=False), one.parts()
     assert [part.count for part in parts] == ([12] * 5 if not stream else [12, 12, 12, 12, 10, 2])

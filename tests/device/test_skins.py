@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from skin.build import build_device
-from skin.config import validate_config
+from skin.body.sensors import GEOMETRY
+from skin.core.rng import generator
 from skin.device import skins
 from skin.errors import InputError
-from skin.recording import GEOMETRY
-from skin.rng import generator
+from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
 
 SMALL = (
     "device=skins", "device.count=2", "device.test_skins=1", "device.skins.length=[0.08,0.1]",

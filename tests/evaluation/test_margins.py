@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from skin.device.base import AbstractDevice
+from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.margins import ALARM_NAME, find_spans, measure_margins
 from skin.evaluation.operating_point import OperatingPoint
-from skin.labels import TOUCH
-from skin.recording import Touches
+from skin.touch.labels import TOUCH
 
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)
 
@@ -46,7 +46,7 @@ def test_ranges_are_exact():
 
 @pytest.fixture(scope="module")
 def device(configured) -> AbstractDevice:
-    from skin.build import build_device
+    from skin.runs.build import build_device
 
     return build_device(configured("simulator=naive", "layout=grid", "device.test_gestures=64"))
 

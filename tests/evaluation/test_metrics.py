@@ -18,7 +18,7 @@ from skin.evaluation.metrics import (
     vote,
 )
 from skin.evaluation.operating_point import OperatingPoint
-from skin.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
 POINT = OperatingPoint(0.7, 0.02, 64, 1, 0)
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 from scipy.stats import beta
 
-from skin.build import build_device
+from skin.core.rng import Stream, generator
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation import operating_point
 from skin.evaluation.metrics import compute_metrics
@@ -27,11 +28,10 @@ from skin.evaluation.operating_point import (
 from skin.evaluation.report import evaluate
 from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.hardware.live.engine import Detection, Engine
-from skin.labels import TOUCH, TOUCH_OR_NOT, Task
-from skin.rng import Stream, generator
-from skin.signal.frame import Frame
+from skin.hardware.wire.channels import UnitConversion
+from skin.runs.build import build_device
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT, Task
 from skin.touch.sampler import balanced
-from skin.wire.channels import UnitConversion
 
 SETTINGS = Evaluation(devices=0, layouts=0, false_alarm_rate=0.1, safe_gestures=64)
 POINT = OperatingPoint(0.25, 0.02, 2048, 40, 3)

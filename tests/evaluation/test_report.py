@@ -7,13 +7,13 @@ import pytest
 import torch
 from rich.console import Console
 
-from skin.build import build_device
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.report import evaluate, evaluation_markdown, touch_sets
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import Evaluation
-from skin.labels import TOUCH
+from skin.runs.build import build_device
+from skin.touch.labels import TOUCH
 
 SETTINGS = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)

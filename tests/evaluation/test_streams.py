@@ -7,12 +7,12 @@ import pytest
 import torch
 from scipy.stats import poisson
 
-from skin.build import build_device
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import StreamSettings
 from skin.evaluation.streams import Alarms, bin_by_share, count_alarms, evaluate_windows
-from skin.labels import TOUCH, TOUCH_OR_NOT
+from skin.runs.build import build_device
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 
 COURSE = StreamSettings(hours=0.05, gap=[2.0, 10.0], stride=0.3, windows=(2.0, 6.0))
 POINT = OperatingPoint(0.5, 0.02, 64, 1, 0)

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from skin.body.arm import Arm
-from skin.build import build_data, build_device
+from skin.device.files import read_recording, write_recording
 from skin.errors import InputError
-from skin.recording_file import read_recording, write_recording
+from skin.runs.build import build_data, build_device
 
 SOLID = (
     "simulator=solid",

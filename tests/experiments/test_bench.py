@@ -5,8 +5,8 @@ import json
 import pytest
 
 from experiments.benchmarks.__main__ import benchmarks, main, run_alone
+from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.paths import ROOT
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from importlib import import_module
 
 import pytest
 
-from skin.paths import ROOT
+from skin.core.files import ROOT
 
 HERE = ROOT / "experiments"
 FILES = sorted(path.relative_to(HERE) for path in HERE.rglob("*.py"))

@@ -3,8 +3,8 @@
 import pytest
 
 from experiments.notice import licence, names, notice
+from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.paths import ROOT
 
 CONSTRAINTS = ROOT / "constraints.txt"
 LISTED = dict(

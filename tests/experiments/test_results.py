@@ -11,9 +11,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from experiments.studies.study import chosen_studies
-from skin.config import validate_config
-from skin.paths import CONF, ROOT
-from skin.sweep import sweep_jobs
+from skin.core.files import CONF, ROOT
+from skin.runs.configuration import validate_config
+from skin.runs.sweep import sweep_jobs
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")

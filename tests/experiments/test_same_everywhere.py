@@ -8,10 +8,10 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
+from skin.device.files import read_recording
 from skin.hardware.serial import Serial
-from skin.layout.grid import Grid
-from skin.recording_file import read_recording
 
 SKIN = ["layout=grid", "layout.rows=3", "layout.columns=3", "simulator=naive"]
 SMALL = ["data.gestures=1000", "device.test_gestures=96", "evaluation.devices=1"]

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from skin.cli import verbs
+from skin.__main__ import verbs
 
 HEAVY = re.compile(r"\| +(torch|mlflow|pytorch_lightning|numpy|scipy)$", re.MULTILINE)
 

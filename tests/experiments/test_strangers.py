@@ -12,13 +12,12 @@ import torch
 from omegaconf import OmegaConf
 
 from skin.body.sheet import Sheet
-from skin.build import build_device, build_learner
-from skin.config import Tracking, plain, validate_config
 from skin.errors import InputError
-from skin.finished_run import FinishedRun, find_run
-from skin.simulator._elastic import Elastic
-from skin.simulator.solid import hexahedra
-from skin.tracking import Store
+from skin.mechanics.simulator.solid import Elastic, hexahedra
+from skin.runs.build import build_device, build_learner
+from skin.runs.configuration import Tracking, plain, validate_config
+from skin.runs.finished_run import FinishedRun, find_run
+from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -98,17 +97,17 @@ CASES = {
     "a function of the standard library": ("study study=embeddings study.run={}", lambda bait, marker: {
         "layout": {"_target_": "shutil.copyfile", "src": str(bait), "dst": str(marker)}}),
     "deep in a list, with arguments by place": ("study study=margins study.run={}", lambda bait, marker: {
-        "learner": {"_target_": "skin.learner.ensemble.Ensemble", "members": {"a": [
+        "learner": {"_target_": "skin.learning.learner.ensemble.Ensemble", "members": {"a": [
             [{"_target_": "os.mkdir", "_args_": [str(marker)]}]]}}}),
     "a module that torch.optim imports": ("study study=streams study.run={}", lambda bait, marker: {
         "layout": {"_target_": "torch.optim.optimizer.torch.load", "f": str(bait), "weights_only": False}}),
     "a module that a module of skin imports": ("evaluate run={}", lambda bait, marker: {
-        "layout": {"_target_": "skin.tracking.os.mkdir", "path": str(marker)}}),
+        "layout": {"_target_": "skin.runs.store.os.mkdir", "path": str(marker)}}),
     "a name made by interpolation": (None, lambda bait, marker: {
         "row": "os.mkdir", "body": {"_target_": "${row}", "_args_": [str(marker)]}}),
     "a method of a class": (None, lambda bait, marker: {
-        "body": {"_target_": "skin.files.Path.touch", "_args_": [
-            {"_target_": "skin.files.Path", "_args_": [str(marker)]}]}}),
+        "body": {"_target_": "skin.core.files.Path.touch", "_args_": [
+            {"_target_": "skin.core.files.Path", "_args_": [str(marker)]}]}}),
 }  # fmt: skip
 
 

@@ -9,9 +9,9 @@ from contextlib import closing
 import pytest
 from PIL import Image
 
-from skin.config import fingerprint, validate_config
-from skin.paths import ROOT
-from skin.tracking import Store
+from skin.core.files import ROOT
+from skin.runs.configuration import fingerprint, validate_config
+from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
@@ -76,7 +76,7 @@ def test_finished_runs_are_found_and_judged(run, folder):
 )
 def test_bad_input_ends_with_code_2_and_imports_nothing_heavy(arguments, named, tmp_path):
     code = (
-        f"import sys; from skin.cli import main; sys.path.insert(0, {str(ROOT)!r})\n"
+        f"import sys; from skin.__main__ import main; sys.path.insert(0, {str(ROOT)!r})\n"
         f"try: main(['study', *{[*arguments]}])\n"
         "finally: print(*sorted({'torch', 'mlflow', 'pytorch_lightning', 'scipy'} & set(sys.modules)))"
     )

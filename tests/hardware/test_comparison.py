@@ -7,7 +7,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
+from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench import write_bench_session
@@ -22,12 +24,10 @@ from skin.hardware.comparison import (
 )
 from skin.hardware.emulator.gestures import emulated_gestures, upsample
 from skin.hardware.record.recorder import SessionLog
-from skin.labels import TOUCH
-from skin.layout.grid import Grid
-from skin.signal.frame import Frame
-from skin.simulator.naive import Naive
-from skin.wire.channels import UnitConversion
-from skin.wire.segmentation import RecordedGesture
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.segmentation import RecordedGesture
+from skin.mechanics.simulator.naive import Naive
+from skin.touch.labels import TOUCH
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 RATE, COUNT, GAIN = 50.0, 6, 0.8

@@ -8,17 +8,17 @@ import torch
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
+from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
 from skin.hardware.emulator.gestures import emulated_gestures
 from skin.hardware.serial import Serial
-from skin.layout.grid import Grid
-from skin.signal.calibration import Calibration
-from skin.simulator.naive import Naive
-from skin.wire.channels import unit_conversion
-from skin.wire.protocol import Header
+from skin.hardware.wire.channels import unit_conversion
+from skin.hardware.wire.protocol import Header
+from skin.mechanics.simulator.naive import Naive
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)

@@ -9,10 +9,10 @@ from hydra.utils import instantiate
 
 from experiments.peers import PYTHON
 from experiments.peers.rocket import Rocket
-from skin.datamodule import TouchData
+from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.labels import TOUCH_SLIDING
-from skin.recording import Touches
+from skin.learning.data import TouchData
+from skin.touch.labels import TOUCH_SLIDING
 
 
 @pytest.fixture

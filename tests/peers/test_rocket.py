@@ -3,7 +3,7 @@
 import torch
 
 from experiments.peers.rocket import Rocket
-from skin.recording import Touches
+from skin.device.touches import Touches
 
 
 def touches(sensors=4):

@@ -7,12 +7,12 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from experiments import peers
-from skin.build import build_learner
-from skin.config import Tracking, fingerprint, plain, validate_config
-from skin.datamodule import TouchData
-from skin.paths import CONF
-from skin.tracking import Store
-from skin.trust import check_targets
+from skin.core.files import CONF
+from skin.core.settings import check_targets
+from skin.learning.data import TouchData
+from skin.runs.build import build_learner
+from skin.runs.configuration import Tracking, fingerprint, plain, validate_config
+from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")

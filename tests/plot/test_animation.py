@@ -5,12 +5,11 @@ import pytest
 import torch
 from PIL import Image
 
-from skin.build import build_device
+from skin.device.files import write_recording as store
 from skin.errors import InputError
-from skin.plot.animation import VIEWS, thinning, write_animation
-from skin.plot.touches import recorded, simulated
-from skin.plot.view import Scene
-from skin.recording_file import write_recording as store
+from skin.plot.animation import VIEWS, recorded, simulated, thinning, write_animation
+from skin.plot.plot3d import Scene
+from skin.runs.build import build_device
 
 
 def made(frames=6, sensors=7, rate=10.0, **more):

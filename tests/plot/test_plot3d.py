@@ -8,8 +8,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Path3DCollection, Poly3
 from skin.body.arm import Arm
 from skin.errors import InputError
 from skin.plot.animation import still, write_animation
-from skin.plot.plot3d import sensors_in_space, skin_in_space
-from skin.plot.view import Scene
+from skin.plot.plot3d import Scene, sensors_in_space, skin_in_space
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from skin.body.arm import Arm
+from skin.body.layout.grid import Grid
+from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
-from skin.layout.grid import Grid
-from skin.plot.surface import deflection, surface, surface_motion
-from skin.sensors import Sensors
-from skin.simulator._assembly import Structure
-from skin.simulator._operator import build
-from skin.simulator.naive import Naive
-from skin.simulator.solid import Solid
+from skin.mechanics.simulator.fem import build
+from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.plates import Structure
+from skin.mechanics.simulator.solid import Solid
+from skin.plot.plot3d import deflection, surface, surface_motion
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -6,8 +6,8 @@ import torch
 
 from experiments.studies.embeddings import FRAME, accuracy, explained, probe, strongest
 from experiments.studies.measures import ProbeSettings
-from skin.build import build_device
-from skin.recording import Touches
+from skin.device.touches import Touches
+from skin.runs.build import build_device
 
 SMALL = {"train": 160, "test": 80, "seeds": [4], "epochs": 60, "width": 32, "layouts": 2}
 

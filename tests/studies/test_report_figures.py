@@ -8,7 +8,7 @@ import torch
 
 from experiments.studies.report_figures import confusion_rows
 from skin.evaluation.metrics import encode
-from skin.labels import TOUCH
+from skin.touch.labels import TOUCH
 
 
 def outcomes(called, dangerous):

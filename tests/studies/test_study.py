@@ -9,9 +9,9 @@ from experiments import peers
 from experiments.studies.comparison import Paired, verdict
 from experiments.studies.study import chosen_studies, variants
 from experiments.studies.study_page import read_reference
-from skin.config import fingerprint, validate_config
+from skin.core.files import CONF
 from skin.errors import InputError
-from skin.paths import CONF
+from skin.runs.configuration import fingerprint, validate_config
 
 FILES = {path.stem: OmegaConf.load(path) for path in sorted((CONF / "study").glob("*.yaml"))}
 NAMES = [(name, part) for name, file in FILES.items() for part in file.get("parts", {"": {}})]

@@ -13,10 +13,10 @@ from experiments.studies import trials
 from experiments.studies.measures import Margins
 from experiments.studies.study import Study, Variant
 from experiments.studies.trials import RestoredRun, Trial, numbered_settings, read_row, votes, write_row
-from skin.config import fingerprint
 from skin.errors import InputError
-from skin.finished_run import find_pretrained
-from skin.tracking import Store
+from skin.runs.configuration import fingerprint
+from skin.runs.finished_run import find_pretrained
+from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
 pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")

@@ -8,11 +8,11 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.metrics import balanced_accuracy_score
 from sklearn.model_selection import cross_val_predict
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
-from skin.class_balance import accuracy_from_shape, check_label_leakage
-from skin.contact.prescribed import Prescribed
+from skin.device.balance import accuracy_from_shape, check_label_leakage
 from skin.errors import InputError
-from skin.layout.grid import Grid
+from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.gesture import GestureSettings
 from skin.touch.sampler import TouchSampler
 from skin.touch.shapes import Fit, Shapes, draw_bodies

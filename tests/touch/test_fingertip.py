@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.body.sheet import Sheet
-from skin.touch.fingertip import Fingertip
+from skin.mechanics.geometry import Fingertip
 
 SHEET = Sheet([0.12, 0.08], [24, 16], [{"material": "EcoFlex 00-30", "thickness": 0.01}])
 TOUCHES = torch.tensor([[0.05, 0.03, 0.010, 5.0], [0.1, 0.06, 0.004, 1.0]], dtype=torch.float64)

@@ -8,8 +8,8 @@ from omegaconf import OmegaConf
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.labels import Thresholds
 from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading, model_window
+from skin.touch.labels import Thresholds
 from skin.touch.shapes import Shapes
 
 CONF = Path(__file__).parents[2] / "conf" / "touch.yaml"

@@ -6,10 +6,10 @@ import torch
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.model_selection import cross_val_score
 
+from skin.body.layout.scattered import Scattered
 from skin.body.sheet import Sheet
-from skin.contact.prescribed import Prescribed
 from skin.errors import InputError
-from skin.layout.scattered import Scattered
+from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.movie import join_movies
 from skin.touch.sampler import TouchSampler, balanced
 

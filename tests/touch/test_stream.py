@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.layout.scattered import Scattered
 from skin.body.sheet import Sheet
+from skin.device.files import read_recording, write_recording
 from skin.device.simulated import Simulated
+from skin.device.stream import Timeline
 from skin.errors import InputError
-from skin.gesture_measures import movie_labels
-from skin.labels import TOUCH_OR_NOT
-from skin.layout.scattered import Scattered
-from skin.recording_file import read_recording, write_recording
-from skin.simulator.naive import Naive
+from skin.mechanics.simulator.naive import Naive
 from skin.touch.gesture import GestureSettings
-from skin.touch.stream import Timeline
+from skin.touch.labels import TOUCH_OR_NOT
+from skin.touch.movie import movie_labels
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -6,9 +6,9 @@ import pytest
 
 from experiments.validation import LAWS
 from experiments.validation.__main__ import main
+from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.paths import ROOT
-from skin.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator._hexahedra import Hexahedra
 
 SLOW = {
     "boussinesq",

@@ -18,8 +18,8 @@ from experiments.validation.finding import (
     publish_physics,
     relative_finding,
 )
+from skin.core.files import ROOT
 from skin.errors import InputError
-from skin.paths import ROOT
 
 MISS = CheckResult(
     [relative_finding("this", 1.2, 1.0, 0.1), relative_finding("that", 1.0, 1.0, 0.1)], ["a remark"]

@@ -15,12 +15,11 @@ import pyarrow.parquet
 import torch
 from annotated_types import Ge, Le
 
-from skin.body._memory import require_memory
-from skin.body.base import AbstractBody
+from skin.body.base import AbstractBody, require_memory
+from skin.core.files import tabular, whole, write
+from skin.core.settings import checked
 from skin.errors import InputError
-from skin.files import tabular, whole, write
-from skin.settings import checked
-from skin.simulator.base import AbstractSimulator
+from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.shapes import Shapes
 
 _KEY = b"skin_session"

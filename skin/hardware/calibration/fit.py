@@ -10,6 +10,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from skin.device.calibration import QUANTITIES, Calibration
+from skin.device.imperfection import Imperfection
 from skin.errors import InputError
 from skin.hardware.calibration.channels import (
     Idle,
@@ -21,9 +23,7 @@ from skin.hardware.calibration.channels import (
     measure_idle,
 )
 from skin.hardware.calibration.presses import BenchData
-from skin.sensor_dynamics import first_order_lag, running_peak
-from skin.signal.calibration import QUANTITIES, Calibration
-from skin.signal.imperfection import Imperfection
+from skin.mechanics.relaxation import first_order_lag, running_peak
 
 _PRESSED = 0.05  # of the largest true reading: less determines no gain
 _SURE = 6.0  # standard errors: a slope of noise alone exceeds them in 2 of 1e9 channels

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from pydantic import PositiveFloat
 
+from skin.core.settings import configured
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench import BenchSession, Gauge, per_newton, write_bench_session
-from skin.settings import configured
 
 _BEFORE, _AFTER = 0.2, 1.0  # s around a press that are not idle
 _FEWEST = 50  # idle frames

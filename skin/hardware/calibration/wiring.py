@@ -11,7 +11,9 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from skin.core.settings import checked
 from skin.device.base import AbstractSimulated
+from skin.device.calibration import Calibration
 from skin.errors import InputError
 from skin.hardware.calibration.bench import BenchSession, Gauge, per_newton
 from skin.hardware.calibration.channels import (
@@ -21,8 +23,6 @@ from skin.hardware.calibration.channels import (
     match_channels,
 )
 from skin.hardware.calibration.presses import BenchData, build_bench_data
-from skin.settings import checked
-from skin.signal.calibration import Calibration
 
 Turn = Literal[
     "as_given",

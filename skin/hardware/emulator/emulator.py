@@ -18,12 +18,12 @@ import torch
 from annotated_types import Ge, Le
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
+from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
+from skin.device.resampling import Check
 from skin.errors import InputError
 from skin.hardware.emulator.gestures import Converter, Gesture, emulated_gestures, upsample
-from skin.rng import Stream, generator
-from skin.signal.frame import Check
-from skin.wire.protocol import (
+from skin.hardware.wire.protocol import (
     Announcement,
     Header,
     encode_announcement,
@@ -32,7 +32,7 @@ from skin.wire.protocol import (
     encode_header,
     encode_line,
 )
-from skin.wire.segmentation import label_text
+from skin.hardware.wire.segmentation import label_text
 
 _PATIENCE = 1.0  # s that a reader may be late before bytes are lost, as in a device without flow control
 _PAUSE = 0.002  # s until a full buffer is tried again

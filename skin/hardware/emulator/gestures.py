@@ -8,8 +8,8 @@ from itertools import count
 import numpy as np
 import torch
 
+from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
-from skin.rng import Stream, generator
 from skin.touch.sampler import balanced
 
 _BATCH = 16  # every combination of the labels once
@@ -71,7 +71,7 @@ def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gest
 
 
 def gestures_with_labels(device: AbstractSimulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
-    """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``skin.labels.TOUCH``."""
+    """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``TOUCH``."""
     return _drawn(device, labels, generator(Stream.TEST, 5, seed))
 
 

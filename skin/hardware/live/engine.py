@@ -9,13 +9,19 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from skin.labels import OPPOSITE, Task
-from skin.settings import checked
-from skin.signal.contact_detection import DRIFT, ContactDetector
-from skin.signal.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown
-from skin.signal.frame import Frame, StreamClock
-from skin.signal.resampling import Window
-from skin.wire.channels import EXPECTED, FROZEN, UnitConversion
+from skin.core.settings import checked
+from skin.device.resampling import Frame, StreamClock, Window
+from skin.evaluation.decisions import (
+    DECISIONS,
+    DRIFT,
+    RELEASE,
+    ContactDetector,
+    as_press,
+    held_frames,
+    longest_shown,
+)
+from skin.hardware.wire.channels import EXPECTED, FROZEN, UnitConversion
+from skin.touch.labels import OPPOSITE, Task
 
 State = Literal["touch", "no touch", "unknown"]
 _NAMED = 3  # sensors

@@ -4,21 +4,60 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from time import monotonic
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from annotated_types import Ge, Gt, Le
 from omegaconf import DictConfig
 
+from skin.core.settings import configured
 from skin.errors import InputError
-from skin.exported.model import ExportedModel
+from skin.evaluation.decisions import DRIFT
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
-from skin.hardware.live.live_settings import LiveSettings
 from skin.hardware.live.selftest import SelfTest
-from skin.signal.contact_detection import DRIFT
-from skin.trained_model import TrainedModel
-from skin.wire.channels import UnitConversion
-from skin.wire.reader import PortSettings, SkinTimeout
-from skin.wire.skin import Skin
-from skin.wire.source import SerialSource, Source
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.reader import PortSettings, SkinTimeout
+from skin.hardware.wire.skin import Skin
+from skin.hardware.wire.source import SerialSource, Source
+from skin.runs.exported.model import ExportedModel
+from skin.runs.trained_model import TrainedModel
+
+# The settings of ``skin live``.
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """Settings under ``live:`` (``conf/live.yaml``).
+
+    Attributes:
+        web_port: port of the page; 0: any free one.
+        top: upper end of the colour scale, N.
+        touch: contact threshold, N above the baseline; None: that of the run.
+        drift: N in ten minutes that the baseline may follow without touch.
+        verdicts: where JSON lines go: ``stdout``, or a TCP port, 0: any free one; None: nowhere.
+        log: file to which alarms are appended; None: no log.
+        selftest: whether simulated dangerous touches must raise the alarm at the start.
+        patience: settings of debouncing.
+    """
+
+    web_port: Annotated[int, Ge(0), Le(65535)]
+    top: Annotated[float, Gt(0)]
+    touch: Annotated[float, Gt(0)] | None
+    drift: Annotated[float, Ge(0)]
+    verdicts: Literal["stdout"] | Annotated[int, Ge(0), Le(65535)] | None
+    log: str | None
+    selftest: bool
+    patience: DebounceSettings
+
+    @classmethod
+    def of(cls, live: Mapping[str, Any]) -> "LiveSettings":
+        """Return checked settings from plain containers.
+
+        Raises:
+            InputError: a setting is unknown or invalid.
+        """
+        patience = configured(DebounceSettings, live["patience"], "live.patience")
+        return configured(cls, {**live, "patience": patience}, "live")
+
 
 USUAL_RATE = 100.0
 """Hz: of a device whose rate is not known yet, for the choice of a threshold."""
@@ -124,10 +163,10 @@ def watch_run(
     """
     import torch
 
-    from skin.build import build_device
-    from skin.finished_run import FinishedRun
-    from skin.hardware.wired import open_source
-    from skin.model_of_run import equation10_warning, load_model
+    from skin.hardware.serial import open_source
+    from skin.runs.build import build_device
+    from skin.runs.finished_run import FinishedRun
+    from skin.runs.model_of_run import equation10_warning, load_model
 
     torch.set_num_threads(config.tracking.threads or 1)
     run = FinishedRun.named(config)

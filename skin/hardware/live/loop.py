@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 
+from skin.device.resampling import Frame
 from skin.hardware.live.engine import Engine, Verdict
-from skin.signal.frame import Frame
-from skin.wire.channels import Tare, UnitConversion
-from skin.wire.reader import SkinDisconnected, SkinTimeout
-from skin.wire.skin import Skin
+from skin.hardware.wire.channels import Tare, UnitConversion
+from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
+from skin.hardware.wire.skin import Skin
 
 _log = logging.getLogger(__name__)
 

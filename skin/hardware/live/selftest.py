@@ -7,13 +7,13 @@ from itertools import count
 import numpy as np
 import torch
 
+from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.emulator.gestures import gestures_with_labels, upsample
 from skin.hardware.live.engine import Engine, EngineSettings, sensor_list
-from skin.rng import Stream, generator
-from skin.signal.frame import Frame
-from skin.wire.channels import RawRange, UnitConversion
+from skin.hardware.wire.channels import RawRange, UnitConversion
 
 STRENGTH = 1.5
 """Pressure of the touches as a multiple of the limit of ``dangerous``."""

@@ -19,9 +19,9 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayState
-from skin.representation._interpolation import weights
-from skin.representation._pixels import centres
-from skin.wire.segmentation import typed_lines
+from skin.hardware.wire.segmentation import typed_lines
+from skin.learning.representation.image import centres
+from skin.learning.representation.interp import weights
 
 _FEWEST = 3
 _INWARDS = 1e-6

@@ -12,8 +12,8 @@ from threading import Event, Lock, Thread
 from time import monotonic
 from typing import Any, Literal, TextIO
 
+from skin.core.files import json_line, unwritable
 from skin.errors import InputError
-from skin.files import json_line, unwritable
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display
 

@@ -18,8 +18,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from skin.core.files import json_line
 from skin.errors import InputError
-from skin.files import json_line
 from skin.hardware.live.loop import Display, DisplayState
 from skin.hardware.live.terminal import SkinPicture, contact_text
 

@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from skin import files
+from skin.core import files
+from skin.core.files import unwritable
+from skin.device.calibration import read_calibration
+from skin.device.files import write_recording
+from skin.device.resampling import Frame
+from skin.device.touches import concatenate
 from skin.errors import InputError
-from skin.files import unwritable
 from skin.hardware.record.session import StoredSession, encode_event, line_sum, read_session, write_about
-from skin.hardware.wired import AbstractWired
-from skin.recording import concatenate
-from skin.recording_file import write_recording
-from skin.signal.calibration import read_calibration
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
-from skin.wire.protocol import Header
-from skin.wire.reader import SkinDisconnected, SkinTimeout
-from skin.wire.segmentation import ContinuousSegmenter, RecordedGesture
+from skin.hardware.serial import AbstractWired
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.protocol import Header
+from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
+from skin.hardware.wire.segmentation import ContinuousSegmenter, RecordedGesture
 
 try:
     import fcntl

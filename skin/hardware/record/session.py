@@ -21,16 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from skin import files
-from skin.checksum import sha256
+from skin.body.sensors import MOST
+from skin.core import files
+from skin.core.files import json_line
+from skin.core.safe_loading import parse_json, read_file, regular, sha256
+from skin.device.resampling import Frame, Resampled, Window
 from skin.errors import InputError
-from skin.files import json_line
-from skin.safe_loading import parse_json, read_file, regular
-from skin.sensors import MOST
-from skin.signal.frame import Frame
-from skin.signal.resampling import Resampled, Window
-from skin.wire.channels import UnitConversion
-from skin.wire.segmentation import RecordedGesture
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.segmentation import RecordedGesture
 
 _SUM = ', "sum": "'
 

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
+from skin.device.calibration import Calibration, write_calibration
+from skin.device.imperfection import Imperfection
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench import Gauge, per_newton
@@ -15,11 +18,8 @@ from skin.hardware.calibration.fit import (
     print_calibration,
 )
 from skin.hardware.calibration.presses import BenchData, Protocol, build_bench_data, emulate_session
-from skin.layout.grid import Grid
-from skin.signal.calibration import Calibration, write_calibration
-from skin.signal.imperfection import Imperfection
-from skin.simulator.fem import PlatesAndBeams
-from skin.simulator.solid import Solid
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.solid import Solid
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

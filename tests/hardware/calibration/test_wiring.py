@@ -6,7 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from skin.body.layout.file import File
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
+from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.hardware.calibration.bench import BenchSession, Gauge
@@ -21,11 +24,8 @@ from skin.hardware.calibration.wiring import (
     turn_gauge,
     wired_bench,
 )
-from skin.layout.file import File
-from skin.layout.grid import Grid
-from skin.signal.calibration import Calibration
-from skin.simulator.fem import PlatesAndBeams
-from skin.simulator.solid import Solid
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.solid import Solid
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.010},

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from skin.core.settings import configured
 from skin.errors import InputError
 from skin.hardware.emulator.emulator import Faults
-from skin.settings import configured
 
 
 def test_no_fault_changes_nothing():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from skin.device.resampling import resample
 from skin.hardware.emulator.gestures import Converter, upsample
-from skin.signal.resampling import resample
 
 RATE = 10.0
 

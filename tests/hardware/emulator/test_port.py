@@ -12,7 +12,7 @@ pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.errors import InputError
 from skin.hardware.emulator.emulator import _Tcp, open_port
-from skin.wire.reader import open_stream
+from skin.hardware.wire.reader import open_stream
 
 
 def hear(stream, count):

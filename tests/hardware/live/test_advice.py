@@ -2,9 +2,9 @@
 
 import pytest
 
-from skin.build import build_device
-from skin.config import validate_config
-from skin.model_of_run import equation10_warning
+from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
+from skin.runs.model_of_run import equation10_warning
 
 PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 

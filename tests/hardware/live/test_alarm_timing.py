@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from skin.build import build_data, build_device, build_learner
 from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings
 from skin.hardware.live.engine_builder import engine_settings
 from skin.hardware.live.selftest import COURSES, dangerous_touches, play_touch
-from skin.model_of_run import RunModel
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.model_of_run import RunModel
 
 SMALL = ["simulator=naive", "layout=grid", "layout.rows=3", "layout.columns=3", "data.gestures=600"]
 LEARNERS = {

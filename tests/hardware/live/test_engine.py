@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from skin.device.resampling import Frame
+from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.hardware.live.engine import Debounce, DebounceSettings, Detection, Engine
-from skin.labels import TOUCH, Task
-from skin.model_of_run import window_classifier
-from skin.recording import Touches
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
+from skin.hardware.wire.channels import UnitConversion
+from skin.runs.model_of_run import window_classifier
+from skin.touch.labels import TOUCH, Task
 
 PLAIN_PARTS = np.ones(4), np.zeros(4), np.zeros(4, bool)
 PLAIN = UnitConversion(*PLAIN_PARTS)

@@ -11,15 +11,14 @@ from threading import Event, Thread
 import numpy as np
 import pytest
 
+from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.exported.writer import write_model
 from skin.hardware.live.engine import DebounceSettings
-from skin.hardware.live.engine_builder import watch_exported
-from skin.hardware.live.live_settings import LiveSettings
-from skin.learner.network import Network
-from skin.paths import ROOT
-from skin.wire.protocol import Header, encode_header, encode_line
+from skin.hardware.live.engine_builder import LiveSettings, watch_exported
+from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.learning.learner.network import Network
+from skin.runs.exported.writer import write_model
 
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device
@@ -27,7 +26,7 @@ PATIENCE = 300  # s
 LIVE = LiveSettings(0, 4.0, None, 0.2, None, None, True, DebounceSettings())
 WATCH = """
 import sys
-from skin.cli import main
+from skin.__main__ import main
 try:
     main(["live", *sys.argv[1:]])
 finally:
@@ -38,8 +37,8 @@ finally:
 @pytest.fixture(scope="module")
 def trained(configured):
     """Return a small untrained network with six sensors, whose alarm is above 0.25, and some touches."""
-    from skin.build import build_data, build_device, build_learner
-    from skin.model_of_run import RunModel
+    from skin.runs.build import build_data, build_device, build_learner
+    from skin.runs.model_of_run import RunModel
 
     sizes = ["layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=100"]
     config = configured("simulator=naive", *sizes, "representation=readings", "model=mlp", "fusion=early")

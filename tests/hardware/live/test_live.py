@@ -10,7 +10,7 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 
-from skin.wire.protocol import Header, encode_header, encode_line
+from skin.hardware.wire.protocol import Header, encode_header, encode_line
 
 SMALL = [
     "experiment=rules",

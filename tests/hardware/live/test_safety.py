@@ -13,12 +13,12 @@ from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.live.selftest import SelfTest
-from skin.labels import TOUCH
-from skin.model_of_run import window_classifier
-from skin.wire.channels import RawRange, UnitConversion
-from skin.wire.protocol import Header, encode_header, encode_line
-from skin.wire.reader import PortSettings
-from skin.wire.source import SerialSource
+from skin.hardware.wire.channels import RawRange, UnitConversion
+from skin.hardware.wire.protocol import Header, encode_header, encode_line
+from skin.hardware.wire.reader import PortSettings
+from skin.hardware.wire.source import SerialSource
+from skin.runs.model_of_run import window_classifier
+from skin.touch.labels import TOUCH
 
 RATE, SENSORS = 100, 9
 SPEED = 8  # times faster than the device's clock says

@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
-from skin.build import build_data, build_device, build_learner
+from skin.device.files import read_recording
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
 from skin.hardware.record.recorder import convert_session, record_session
 from skin.hardware.serial import Serial
-from skin.labels import TOUCH
-from skin.layout.grid import Grid
-from skin.model_of_run import window_classifier
-from skin.recording_file import read_recording
-from skin.wire.protocol import (
+from skin.hardware.wire.protocol import (
     Announcement,
     Header,
     encode_announcement,
@@ -26,6 +23,9 @@ from skin.wire.protocol import (
     encode_header,
     encode_line,
 )
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.model_of_run import window_classifier
+from skin.touch.labels import TOUCH
 
 SHEET = Sheet((0.16, 0.16), (32, 32), [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 LAYOUT = Grid(2, 3)

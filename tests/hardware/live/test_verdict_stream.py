@@ -12,11 +12,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.verdict_stream import HEARTBEAT, stream_verdicts
-from skin.paths import ROOT
 
 PATIENCE = 60  # s
 

@@ -15,13 +15,13 @@ import pytest
 from rich.console import Console
 from scipy.interpolate import LinearNDInterpolator
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.live import terminal, web
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayInfo
 from skin.hardware.live.terminal import SkinPicture
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
+from skin.hardware.wire.channels import UnitConversion
 
 PLACES = np.array([[0.02, 0.02, 0], [0.14, 0.03, 0], [0.03, 0.1, 0], [0.13, 0.11, 0], [0.08, 0.06, 0]])
 SIZE = 0.16, 0.12

@@ -12,12 +12,12 @@ import pytest
 
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.record.recorder import LineWriter, SessionLog, locked
 from skin.hardware.record.session import decode_event, encode_event, read_session
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
-from skin.wire.segmentation import RecordedGesture
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.segmentation import RecordedGesture
 
 ABOUT = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc"}
 

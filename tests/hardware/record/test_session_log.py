@@ -9,12 +9,12 @@ import time
 import numpy as np
 import pytest
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.record.recorder import SessionLog
 from skin.hardware.record.session import read_session
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
-from skin.wire.segmentation import RecordedGesture
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.segmentation import RecordedGesture
 
 ABOUT = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc"}
 MEANING = UnitConversion(np.array([0.1, 0.2]), np.array([512.0, 500.0]), np.array([False, False]))

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.record.recorder import SessionLog
 from skin.hardware.record.session import read_session
-from skin.signal.frame import Frame
-from skin.wire.channels import UnitConversion
-from skin.wire.segmentation import RecordedGesture
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.segmentation import RecordedGesture
 from tests.damage import DAMAGED_FILES, damaged, opened
 
 ABOUT = {"positions": [[0.0, 0.0, 0.0]] * 2, "unit": "adc", "window": 5, "rate": 50.0}

@@ -1,0 +1,1 @@
+"""What every room needs: settings and their errors, files, messages, random numbers."""

@@ -1,0 +1,108 @@
+"""Error messages for a command, or one job of a multirun, that cannot continue."""
+
+import errno
+import logging
+import os
+import sqlite3
+import warnings
+from collections.abc import Iterator
+
+from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
+from omegaconf.errors import OmegaConfBaseException
+
+from skin.errors import InputError
+
+PARENT = "SKIN_PARENT_RUN"
+"""Environment variable by which a sweep tells its jobs the id of their parent run, so that they are quiet."""
+
+# Errors of the disk or its permissions; all other system errors are bugs.
+_DISK = frozenset(
+    (
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EIO,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.ENOTDIR,
+    )
+)
+# What a class raises that gets a setting which it cannot use and whose range it does not declare.
+_UNFIT = (ArithmeticError, AttributeError, LookupError, ValueError)
+
+
+class JobInputError(InputError, CompactHydraException):
+    """Bad input of one job of a multirun; Hydra prints its message without a traceback."""
+
+
+def to_input_error(error: Exception) -> InputError | None:
+    """Return an error as an InputError with a message for the user; None for bugs, which need a traceback."""
+    if isinstance(error, InputError):
+        return error
+    for link in _chain(error):
+        if isinstance(link, sqlite3.OperationalError) or type(link) is sqlite3.DatabaseError:
+            return InputError(
+                f"the database of runs failed: {link}: make room, or give another one, as in "
+                "tracking.uri=sqlite:////FOLDER/runs.db; what has finished is kept"
+            )
+        if isinstance(link, OSError) and link.errno in _DISK:
+            where = link.filename2 or link.filename or "a file"
+            return InputError(
+                f"cannot use {where}: {os.strerror(link.errno)}: make room or give another folder, and run "
+                "the same command again; what has finished is kept"
+            )
+    if not isinstance(error, HydraException | OmegaConfBaseException | TypeError):
+        return None
+    if isinstance(error, OverrideParseException):
+        return InputError(f"{error.override} is no override: {one_line(error)}")
+    cause = error.__cause__ if isinstance(error, InstantiationException) else None
+    if isinstance(cause, InputError):
+        return cause
+    reason = cause or error
+    if isinstance(reason, TypeError) and "argument" not in str(reason):
+        return InputError(one_line(error)) if isinstance(error, InstantiationException) else None
+    if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
+        return InputError(one_line(error)) if isinstance(cause, _UNFIT) else None
+    return InputError(one_line(reason))
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error and its causes: libraries wrap errors of the system."""
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error on one line, without the details that OmegaConf adds."""
+    text = str(error).split("Config search path:")[0]
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    lines_left = [line for line in lines if not line.startswith(("object_type", "reference_type"))]
+    ends = [" " if line.endswith((".", ":", ",")) else "; " for line in lines_left[:-1]] + [""]
+    return "".join(line + end for line, end in zip(lines_left, ends, strict=True))
+
+
+# Silence library messages that a user of the command line cannot act on.
+
+
+def quiet() -> None:
+    """Quieten Lightning's remarks on hardware and logging, and torch's on a change in its own insides."""
+    for name in ("lightning_fabric", "pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.setLevel(logging.ERROR)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    logging.getLogger("mlflow").setLevel(logging.WARNING)
+    logging.getLogger("urllib3.connectionpool").addFilter(_tell_of_server)
+    warnings.filterwarnings("ignore", message=".*treespec.*", category=FutureWarning)
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*`srun` command is available.*")  # one task needs none
+
+
+def _tell_of_server(record: logging.LogRecord) -> bool:
+    """Say in plain words that a request to the tracking server is repeated."""
+    if "/mlflow" in str(record.args):
+        record.msg, record.args = "the tracking server does not answer: trying again", ()
+    return True

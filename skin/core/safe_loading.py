@@ -1,0 +1,333 @@
+"""Read files from unknown sources without running code and in bounded memory."""
+
+import hashlib
+import json
+import math
+import mmap
+import os
+import re
+import stat
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+TEXT = 1 << 20
+"""Bytes of a configuration or a calibration: the largest ones are some kB."""
+_DEEP = 50  # levels: the deepest configuration has 6
+_BYTES = 1 << 30
+
+
+def regular(path: Path) -> None:
+    """Check that a file is a regular one: a device has no end, and a named pipe may never answer.
+
+    Raises:
+        ValueError: it is something else.
+        OSError: there is none.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise ValueError("it is no regular file")
+
+
+def read_file(path: Path, most: int = _BYTES) -> bytes:
+    """Return the content of a regular file.
+
+    Args:
+        path: of the file.
+        most: largest size, bytes.
+
+    Raises:
+        ValueError: larger, or no regular file.
+        OSError: unreadable.
+    """
+    regular(path)
+    with path.open("rb") as file:
+        # Reading with a limit would allocate as much as the limit.
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(min(size, most) + 1)
+    if len(content) > most:
+        raise ValueError(f"it has more than {most} bytes")
+    return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the content of JSON text, whose numbers are finite.
+
+    Raises:
+        ValueError: no JSON, nested too deep, or with ``NaN`` or ``Infinity``.
+    """
+    try:
+        return json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    if math.isinf(number := float(text)):
+        raise ValueError(f"{text} is too large")
+    return number
+
+
+def load_yaml(path: Path) -> Any:
+    """Return the content of a YAML file as plain containers, without resolving interpolations.
+
+    Raises:
+        ValueError: no regular file, no YAML, too large, or with aliases, which can expand to gigabytes.
+        OSError: unreadable.
+    """
+    return parse_yaml(read_file(path, TEXT).decode("utf-8"))
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the content of YAML text as :func:`load_yaml` does.
+
+    Raises:
+        ValueError: no YAML, or with aliases.
+    """
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > _DEEP:
+                raise ValueError(f"aliases and more than {_DEEP} levels are not read")
+        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (yaml.YAMLError, OmegaConfBaseException, AssertionError, TypeError, LookupError) as error:
+        raise ValueError(" ".join(str(error).split()) or "it is no configuration") from error
+
+
+def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file without objects.
+
+    Args:
+        path: of the file.
+        most: largest total size of the arrays, bytes.
+
+    Raises:
+        ValueError: no such file, objects, larger arrays, or shapes that do not match the data.
+        OSError: unreadable.
+    """
+    regular(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(_claimed(archive, entry) for entry in archive.infolist())
+        if total > most:
+            raise ValueError(f"its arrays take {total} bytes, more than {most}")
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except OSError:
+        raise
+    except Exception as error:  # whatever zipfile, zlib, numpy and the parser of its header raise
+        raise ValueError(" ".join(str(error).split()) or "it is cut off") from error
+
+
+def check_archive(path: Path, most: int = _BYTES) -> None:
+    """Check that what a zip archive, such as weights of torch, expands to fits into memory, as its arrays do.
+
+    Args:
+        path: of the file.
+        most: largest total size of its entries, bytes.
+
+    Raises:
+        ValueError: no regular file, no zip archive, larger entries, or arrays that claim another size.
+        OSError: unreadable.
+    """
+    regular(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            total = sum(entry.file_size for entry in entries)
+            for entry in entries:
+                if entry.filename.endswith(".npy"):
+                    _claimed(archive, entry)
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"it is no archive of weights: {error}") from error
+    if total > most:
+        raise ValueError(f"it expands to {total} bytes, more than {most}")
+
+
+def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+    """Return the size of an array, bytes, which must match that of its entry."""
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        if version not in readers:
+            raise ValueError(f"{entry.filename} has the unknown version {version}")
+        shape, _, kind = readers[version](file)
+        size = math.prod(shape) * kind.itemsize
+        if kind.hasobject or size != entry.file_size - file.tell():
+            raise ValueError(f"{entry.filename} holds objects, or claims another size than it has")
+    return size
+
+
+@contextmanager
+def limited_memory(more: int) -> Iterator[None]:
+    """Let this process take no more than ``more`` bytes on top of what it has, while the block runs.
+
+    Who asks for more gets a MemoryError or the error of its library. There is no limit where the system does
+    not know one for address space, as on macOS and Windows.
+    """
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        yield
+        return
+    import resource  # not on Windows
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    limit = int(statm.read_text().split()[0]) * resource.getpagesize() + more
+    if before[0] != resource.RLIM_INFINITY:
+        limit = min(limit, before[0])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+# Checksums inside the files that they are of, so that damage never passes for content.
+
+
+KEY = "skin_file_sha256"
+"""Name of the entry with the checksum in the metadata of a binary file (Parquet, ONNX)."""
+BLANK = 64 * "0"
+"""Its value before :func:`seal`."""
+# The formats write at most three bytes between a key and its value.
+_ENTRY = re.compile(KEY.encode() + b".{1,4}?([0-9a-f]{64})", re.DOTALL)
+_LINE = "sha256:"
+
+
+class ChecksumError(ValueError):
+    """A file is not as it was written."""
+
+    def __init__(self, fix: str = "") -> None:
+        reason = "it is damaged or was changed: its checksum is not that of its content"
+        super().__init__(f"{reason}: {fix}" if fix else reason)
+
+
+def sha256(content: bytes) -> str:
+    """Return the checksum of some bytes, 64 hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """Return the checksum of a regular file, which need not fit into memory.
+
+    Raises:
+        ValueError: no regular file.
+        OSError: unreadable.
+    """
+    regular(path)
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_parquet(table: "pa.Table", path: Path, **settings: Any) -> None:
+    """Write a Parquet file with a checksum for :func:`check_seal`.
+
+    Args:
+        table: to write.
+        path: of the file.
+        settings: of ``pyarrow.parquet.ParquetWriter``.
+    """
+    import pyarrow.parquet as pq  # not needed for calibrations, which are read first
+
+    with pq.ParquetWriter(path, table.schema, write_page_checksum=True, **settings) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata({KEY: BLANK})
+    seal(path)
+
+
+def seal(path: Path) -> None:
+    """Replace the value :data:`BLANK` of the entry :data:`KEY` of a file by the checksum of the file.
+
+    The checksum is of all bytes, with :data:`BLANK` in its own place.
+
+    Raises:
+        ValueError: the file has no such entry.
+    """
+    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
+        place = _find(content)
+        if place is None:
+            raise ValueError(f"{path} has no entry {KEY}")
+        content[place] = _digest(content, place).encode()
+
+
+def check_seal(path: Path) -> None:
+    """Check the checksum of :func:`seal` before anything else of a file is interpreted.
+
+    Files of older versions and of other programs have none and pass.
+
+    Raises:
+        ChecksumError: the file is not as it was written.
+        ValueError: no regular file.
+        OSError: unreadable.
+    """
+    regular(path)
+    if path.stat().st_size:  # nothing cannot be mapped
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            check_content(content)
+
+
+def check_content(content: bytes | mmap.mmap) -> None:
+    """Do the same with the content of a file.
+
+    Raises:
+        ChecksumError: it is not as it was written.
+    """
+    place = _find(content)
+    if place is not None and content[place].decode() != _digest(content, place):
+        raise ChecksumError
+
+
+def _find(content: bytes | mmap.mmap) -> slice | None:
+    """Return where the checksum is: in the last entry, because metadata are at the end."""
+    start = content.rfind(KEY.encode())
+    match = None if start < 0 else _ENTRY.match(content, start)
+    if start >= 0 and match is None:
+        raise ChecksumError
+    return match and slice(*match.span(1))
+
+
+def _digest(content: bytes | mmap.mmap, place: slice) -> str:
+    with memoryview(content) as whole:
+        result = hashlib.sha256(whole[: place.start])
+        result.update(BLANK.encode())
+        result.update(whole[place.stop :])
+    return result.hexdigest()
+
+
+def text_sum(text: str) -> str:
+    """Return the line of YAML with the checksum of all other lines of a text."""
+    return f'{_LINE} "{_text_digest(text)}"  # of the other lines: remove it if you change them'
+
+
+def check_text(text: str, content: Mapping) -> None:
+    """Check the line of :func:`text_sum` in a YAML file, if there is one.
+
+    Args:
+        text: of the file.
+        content: that YAML finds in it.
+
+    Raises:
+        ChecksumError: another line was changed.
+    """
+    if "sha256" in content and content["sha256"] != _text_digest(text):
+        raise ChecksumError
+
+
+def _text_digest(text: str) -> str:
+    # Editors and git may convert the ends of lines.
+    return sha256("\n".join(line for line in text.splitlines() if not line.startswith(_LINE)).encode())

@@ -1,0 +1,218 @@
+"""Class balance of a data set: shape, area, force and position per class, and leakage of labels by shape."""
+
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from skin.body.base import AbstractBody
+from skin.device.base import AbstractDevice
+from skin.device.stream import only_touches
+from skin.device.touches import Recording
+from skin.errors import InputError
+from skin.touch.gesture import GestureSettings
+from skin.touch.labels import OPPOSITE
+
+_log = logging.getLogger(__name__)
+
+
+def report_balance(device: AbstractDevice, recording: Recording | None = None, shown: bool = True) -> None:
+    """Log the class balance of the gestures that a simulated device is trained on, and check it.
+
+    Args:
+        device: the device; nothing is done unless it is simulated.
+        recording: its gestures; None: its training budget.
+        shown: whether to log the balance.
+
+    Raises:
+        InputError: as :func:`check_label_leakage`.
+    """
+    if device.simulation is None:
+        return
+    sampler = device.simulation.sampler
+    found = class_balance(recording or device.recording(None, complete=False), sampler.shapes.names)
+    if shown:
+        _log.info("\n".join(balance_table(found)))
+    check_label_leakage(found, sampler.settings)
+
+
+def class_balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, Any]:
+    """Return statistics of the gestures of each class, in SI units and shares of 1.
+
+    Args:
+        recording: simulated touches.
+        shapes: names of the shapes; the parameter ``shape`` is an index into them.
+
+    Returns:
+        shapes, stretched (share of touches that were stretched) and, for each label, accuracy and error (see
+        :func:`accuracy_from_shape`), and for its classes yes and no: touches, shapes (share of each), area,
+        force (N), x and y (m; mean and standard deviation of the first position), rejected (share of drawn
+        paths with other labels) and misfits (share of drawn bodies that do not fit on the sheet).
+    """
+    recording = only_touches(recording)
+    known = {name: values.double().numpy() for name, values in recording.parameters.items()}
+    labels = recording.touches.labels
+    assert labels is not None
+    report: dict[str, Any] = {
+        "shapes": list(shapes),
+        "stretched": float((known["stretch"] != 1).mean()),
+        "labels": {},
+    }
+    shape = known["shape"].astype(int)
+    for column, name in enumerate(recording.task.names):
+        if name in OPPOSITE:
+            holds = labels[:, column].numpy() > 0.5
+            accuracy, error = accuracy_from_shape(shape, holds)
+            classes = {"yes": _class(known, holds, len(shapes)), "no": _class(known, ~holds, len(shapes))}
+            report["labels"][name] = {"accuracy": accuracy, "error": error, **classes}
+    return report
+
+
+def _class(known: dict[str, np.ndarray], rows: np.ndarray, shapes: int) -> dict[str, Any]:
+    count = int(rows.sum())
+    if not count:
+        return {"touches": 0}
+    own = {name: values[rows] for name, values in known.items()}
+    return {
+        "touches": count,
+        "shapes": (np.bincount(own["shape"].astype(int), minlength=shapes) / count).tolist(),
+        "area": float(own["area"].mean()),
+        "force": float(np.median(own["force"])),
+        "x": [float(own["x"].mean()), float(own["x"].std())],
+        "y": [float(own["y"].mean()), float(own["y"].std())],
+        "rejected": 1 - count / float(own["draws"].sum()),
+        "misfits": 1 - count / (count + float(own["misfits"].sum())),
+    }
+
+
+def accuracy_from_shape(shape: np.ndarray, holds: np.ndarray) -> tuple[float, float]:
+    """Return the balanced accuracy of predicting a label from the shape, and its standard error.
+
+    The prediction is leave-one-out: each touch is assigned to the class in which its shape is more frequent
+    among all other touches. The accuracy is 0.5 if a class has fewer than two touches.
+
+    Args:
+        shape: (B,), whole numbers from 0.
+        holds: (B,), bool; the label.
+    """
+    counts = np.stack(
+        [np.bincount(shape[holds == side], minlength=shape.max() + 1) for side in (False, True)]
+    )
+    totals = counts.sum(axis=1, keepdims=True)
+    if totals.min() < 2:
+        return 0.5, 0.0
+    rates = []
+    for side in (0, 1):
+        others = (counts[side] - 1) / (totals[side] - 1)
+        against = counts[1 - side] / totals[1 - side]
+        right = np.where(np.isclose(others, against), 0.5, others > against)
+        rates.append(float((counts[side] * right).sum() / totals[side, 0]))
+    error = (
+        np.sqrt(sum(rate * (1 - rate) / total for rate, total in zip(rates, totals[:, 0], strict=True))) / 2
+    )
+    return sum(rates) / 2, float(error)
+
+
+def balance_table(report: dict[str, Any]) -> list[str]:
+    """Return a class balance as lines of a table, two per label."""
+    names = [Path(shape).stem for shape in report["shapes"]]
+    table = [["", "accuracy", *names, "area %", "force N", "x mm", "y mm", "paths", "bodies"]]
+    for name, of in report["labels"].items():
+        for title, told, side in ((name, f"{of['accuracy']:.2f}", "yes"), (OPPOSITE[name], "", "no")):
+            if of[side]["touches"]:
+                table.append([title, told, *_cells(of[side])])
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    rows = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
+    return [
+        f"balance: {report['stretched']:.0%} of touches were stretched to fit. Shapes are in % of a class, "
+        "paths and bodies in % rejected; accuracy: balanced accuracy of the label from the shape alone",
+        *rows,
+    ]
+
+
+def _cells(side: dict[str, Any]) -> list[str]:
+    shares = [f"{100 * share:.0f}" for share in (*side["shapes"], side["area"])]
+    places = [f"{1e3 * side[axis][0]:.0f}±{1e3 * side[axis][1]:.0f}" for axis in "xy"]
+    lost = [f"{100 * side[kind]:.0f}" for kind in ("rejected", "misfits")]
+    return [*shares, f"{side['force']:.0f}", *places, *lost]
+
+
+def check_label_leakage(report: dict[str, Any], settings: GestureSettings) -> None:
+    """Warn if the shape alone predicts a label.
+
+    A label leaks if its balanced accuracy is above ``settings.leak`` by more than two standard errors; the
+    margin keeps small data sets from failing by chance.
+
+    Raises:
+        InputError: a label leaks and ``settings.strict`` is set.
+    """
+    leaking = {
+        name: of["accuracy"]
+        for name, of in report["labels"].items()
+        if of["accuracy"] - 2 * of["error"] > settings.leak
+    }
+    if not leaking:
+        return
+    named = " and ".join(f"{name} ({score:.0%})" for name, score in leaking.items())
+    sentence = (
+        f"the shape alone predicts {named} of these gestures, more than touch.leak={settings.leak:g} "
+        "allows: a model may learn the shape instead of the label; give touch.shapes of one kind, raise "
+        "touch.stretch, or give touch.leak=0.5, which fits every shape to the sheet"
+    )
+    if settings.strict:
+        raise InputError(sentence + "; touch.strict=false only warns")
+    warnings.warn(sentence, RuntimeWarning, stacklevel=3)
+
+
+# Summary of a data set in one line: forces, strains, clipped readings, accepted draws.
+
+
+def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
+    """Return what a simulated data set is like, as shares of 1 and SI units.
+
+    The strain is the largest of the top layer by the linear solution or, where a recording has none, its
+    highest pressure by its modulus. Linear theory is good to about 0.3; beyond 1 a linear layer would be
+    squeezed to nothing. The report's thresholds are kept all the same.
+
+    Returns:
+        gestures; acceptance (share of draws kept); force (N: quantiles .05, .5, .95 and the largest);
+        strain_over_30_percent and strain_over_100_percent; strain_solved (else pressure by modulus);
+        clipped and clipped_dangerous (gestures in which a sensor passes the clip, of all and of the dangerous
+        ones); unconverged (frames whose pressure was not found, so that their gestures were drawn again),
+        where it had to be.
+    """
+    known, labels = recording.parameters, recording.touches.labels
+    assert labels is not None
+    strain = known.get("strain", known["peak"] / body.layers[-1].material.young)
+    force = torch.quantile(known["force"], torch.tensor([0.05, 0.5, 0.95, 1.0]))
+    dangerous = labels[:, recording.task.names.index("dangerous")] > 0.5
+    summary = {
+        "gestures": len(recording),
+        "acceptance": len(recording) / float(known["draws"].sum()),
+        "force": dict(zip(("q05", "q50", "q95", "largest"), force.tolist(), strict=True)),
+        "strain_over_30_percent": float((strain > 0.3).float().mean()),
+        "strain_over_100_percent": float((strain > 1).float().mean()),
+        "strain_solved": "strain" in known,
+        "clipped": float(known["clipped"].mean()),
+        "clipped_dangerous": float(known["clipped"][dangerous].mean()) if dangerous.any() else 0.0,
+    }
+    if "unconverged" in known:
+        summary["unconverged"] = int(known["unconverged"].sum())
+    return summary
+
+
+def summary_line(summary: dict[str, Any]) -> str:
+    """Return a summary in one line."""
+    force = summary["force"]
+    strain = "strain" if summary.get("strain_solved") else "pressure by modulus"
+    solved = f"; {summary['unconverged']} frames not solved" if "unconverged" in summary else ""
+    return (
+        f"{summary['gestures']} gestures, {summary['acceptance']:.0%} of draws kept; force median "
+        f"{force['q50']:.0f} N (5 to 95 %: {force['q05']:.0f} to {force['q95']:.0f} N, largest "
+        f"{force['largest']:.0f} N); {strain} over 30 % in {summary['strain_over_30_percent']:.0%}, "
+        f"over 100 % in {summary['strain_over_100_percent']:.0%}; clipped {summary['clipped']:.0%} "
+        f"({summary['clipped_dangerous']:.0%} of dangerous){solved}"
+    )

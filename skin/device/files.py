@@ -1,0 +1,503 @@
+"""Recordings as Parquet and CSV files: one row per frame, as in the report (2.1.1).
+
+Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
+(N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
+rows, then ``saturated_00`` ...: 1 where a sensor is at its limit. What is unknown has no column; a reading
+that means nothing (a dead sensor) is empty and is read back as 0 and invalid. Everything else (units,
+layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in
+``x.csv.json``.
+
+Both have checksums of everything: a Parquet file as of :mod:`skin.core.safe_loading`, and ``x.csv.json``
+under ``sha256`` of the table and of itself. What has none, of older versions or made by hand, is read
+without.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import torch
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from torch import Tensor
+
+from skin.body.base import require_memory
+from skin.core import files
+from skin.core.files import MANIFEST, tabular, whole
+from skin.core.safe_loading import ChecksumError, check_seal, file_sha256, read_file, sha256, write_parquet
+from skin.core.settings import ONCE, check_settings
+from skin.device.touches import Recording, Touches
+from skin.errors import InputError
+from skin.touch.labels import Task
+
+# The schema of recordings, and checks of their JSON metadata before memory is allocated for the rows.
+
+
+FORMAT = 1
+UNITS = {"reading": "N", "force": "N", "D_s": "m", "D_t": "m", "positions": "m", "size": "m", "rate": "Hz"}
+
+_Count = Annotated[int, Ge(1), Le(2**31 - 1)]  # rows, gestures and frames are numbered in 32 bits
+_Extent = Annotated[float, Gt(0), Lt(1e9)]
+
+
+@dataclass(frozen=True)
+class _Description:
+    """Required keys, which older recordings have too, and ``first``."""
+
+    units: dict
+    gestures: _Count
+    frames: _Count
+    rate: _Extent
+    positions: Annotated[list[tuple[float, float, float]], MinLen(1)]
+    footprint: tuple[_Extent, _Extent]
+    size: tuple[_Extent, _Extent]
+    task: dict
+    labelled: bool
+    force: bool
+    displacement: bool
+    parameters: Annotated[list[str], ONCE]
+    metadata: dict
+    first: Annotated[int, Ge(0), Le(2**31 - 1)] = 0  # older recordings do not say
+
+
+def check_metadata(about: Any, where: str) -> Task:
+    """Check the metadata of a recording, and return its task.
+
+    Args:
+        about: decoded JSON.
+        where: file, for the message.
+
+    Raises:
+        InputError: a key is missing or has a wrong type; the message names it.
+        ValueError: invalid labels.
+    """
+    fields = about
+    if isinstance(about, Mapping):
+        if unknown := set(about) - set(_Description.__annotations__) - {"format", "saturated", "sha256"}:
+            raise ValueError(f"its description has unknown entries: {', '.join(sorted(unknown))}")
+        fields = {name: value for name, value in about.items() if name in _Description.__annotations__}
+    check_settings(_Description, fields, f"{where}: description", whole=True)
+    check_settings(Task, about["task"], f"{where}: task", whole=True)
+    return Task(**about["task"] | {"names": tuple(about["task"]["names"])})
+
+
+def check_rows(about: Mapping[str, Any], rows: int, columns: int, where: str) -> None:
+    """Check that a file has the rows that its metadata describe, and that they fit into memory.
+
+    Args:
+        about: checked before.
+        rows, columns: that the file has.
+        where: it is, for the message.
+
+    Raises:
+        InputError: more rows than memory allows.
+        ValueError: other rows.
+    """
+    gestures, frames = about["gestures"], about["frames"]
+    if gestures * frames != rows:
+        raise ValueError(f"it has {rows} rows, not {gestures} touches of {frames} frames: is it cut off?")
+    require_memory(16.0 * rows * columns, f"{where}, {rows} rows,", "give a recording of fewer gestures")
+
+
+def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
+    """Return everything that a file contains beside its rows; ``first`` is the number of the first touch."""
+    touches = recording.touches
+    return {
+        "format": FORMAT,
+        "units": UNITS,
+        "gestures": len(touches),
+        "first": first,
+        "frames": touches.readings.shape[1],
+        "rate": touches.rate,
+        "positions": touches.positions.tolist(),
+        "footprint": list(recording.footprint),
+        "size": list(recording.size),
+        "task": asdict(recording.task),
+        "labelled": touches.labels is not None,
+        "force": recording.force is not None,
+        "displacement": recording.displacement is not None,
+        "saturated": touches.saturated is not None,
+        "parameters": list(recording.parameters),
+        "metadata": recording.metadata,
+    }
+
+
+def numbered(name: str, count: int) -> list[str]:
+    """Return the columns of a quantity with one value per sensor."""
+    digits = max(2, len(str(count - 1)))
+    return [f"{name}_{number:0{digits}d}" for number in range(count)]
+
+
+def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
+    """Return the name and type of every column of a description, in order."""
+    task, sensors = about["task"], len(about["positions"])
+    columns = {"simulation": pa.int32(), "frame": pa.int32()}
+    if about["labelled"]:
+        cosines = 2 if task.get("direction") else 0  # older recordings do not say
+        kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
+        columns |= dict(zip(task["names"], kinds, strict=True))
+    names = numbered("reading", sensors) + ["force"] * about["force"]
+    limits = numbered("saturated", sensors) if about.get("saturated") else []  # older recordings do not say
+    if about["displacement"]:
+        names += numbered("D_s", sensors) + numbered("D_t", sensors)
+    names += [f"gesture_{name}" for name in about["parameters"]]
+    return columns | dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
+
+
+_EACH_FRAME = ("reading_", "force", "D_s_", "D_t_")
+
+
+def write_recording(recording: Recording, path: str | Path, first: int = 0) -> Path:
+    """Write a recording atomically.
+
+    Args:
+        recording: to write.
+        path: ``x.parquet`` or ``x.csv``.
+        first: number of its first touch in the column ``simulation``.
+
+    Raises:
+        InputError: another ending, or a folder that cannot be written.
+    """
+    path = tabular(path, "a recording")
+    about = describe_recording(recording, first)
+    table = _table(recording, about)
+    with whole(path) as partial:
+        if path.suffix == ".parquet":
+            text = files.json_line(about)
+            table = table.replace_schema_metadata({"skin": text, "skin_sha256": sha256(text.encode())})
+            # A dictionary of noisy readings would take most of the time and save no space.
+            dictionary = [name for name in table.column_names if not name.startswith(_EACH_FRAME)]
+            write_parquet(table, partial, compression="zstd", use_dictionary=dictionary)
+        else:
+            pa.csv.write_csv(table, partial)
+            # The table is moved last, because the sidecar is useless without it.
+            sums = {"sha256": {"table": file_sha256(partial), "description": _description_sum(about)}}
+            files.write(files.json_line(about | sums, indent=1) + "\n", _sidecar(path))
+    return path
+
+
+def read_recording(path: str | Path, complete: bool = True) -> Recording:
+    """Read a recording of :func:`write_recording`; equal to the last bit.
+
+    Args:
+        path: ``x.parquet`` or ``x.csv``.
+        complete: read force, displacements and parameters too.
+
+    Raises:
+        InputError: no such file, not a recording, damaged, or rows that are not whole touches.
+    """
+    path = tabular(path, "a recording")
+    with _refused(path):
+        if path.suffix == ".parquet":
+            check_seal(path)
+        about, task = _described(path)
+        if not complete:
+            about |= {"force": False, "displacement": False, "parameters": []}
+        return _recording(_read_table(path, about), about, task)
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """Return everything that a recording contains beside its rows, as :func:`describe_recording` does.
+
+    Raises:
+        InputError: as of :func:`read_recording`; the rows are not read.
+    """
+    with _refused(path):
+        return _described(path)[0]
+
+
+@contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with a file that is no recording into an InputError."""
+    if not path.is_file():
+        raise InputError(f"no recording {path}: skin generate n=1000 out={path} makes one")
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, pa.ArrowException, ValueError, KeyError, OverflowError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path} is damaged or no recording of this project: {reason}") from error
+
+
+def _described(path: Path) -> tuple[dict[str, Any], Task]:
+    about = _read_about(path)
+    if isinstance(about, dict) and about.get("format") != FORMAT:
+        raise ValueError(f"it has format {about.get('format')}, this version reads format {FORMAT}")
+    task = check_metadata(about, str(path))
+    sums = about.pop("sha256", None)
+    if sums is not None and sums != {"table": file_sha256(path), "description": _description_sum(about)}:
+        raise ChecksumError(f"remove sha256 from {_sidecar(path).name} if you changed it or the table")
+    return about, task
+
+
+def _description_sum(about: dict[str, Any]) -> str:
+    """Return the checksum of a description, whatever its spacing and order."""
+    return sha256(files.json_line(about, sort_keys=True).encode())
+
+
+def _sidecar(path: Path) -> Path:
+    return path.with_name(path.name + ".json")
+
+
+def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
+    touches = recording.touches
+    batch, time, sensors = touches.readings.shape
+
+    def per_gesture(values: Tensor) -> np.ndarray:
+        return np.repeat(values.cpu().numpy(), time)
+
+    arrays = [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)]
+    arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
+    readings = touches.readings.reshape(-1, sensors).cpu().numpy()
+    invalid = ~touches.valid.reshape(-1, sensors).cpu().numpy()
+    arrays += [np.ma.masked_array(readings[:, s], invalid[:, s]) for s in range(sensors)]
+    if recording.force is not None:
+        arrays.append(recording.force.flatten().cpu().numpy())
+    if recording.displacement is not None:
+        arrays += list(recording.displacement.permute(3, 2, 0, 1).reshape(2 * sensors, -1).cpu().numpy())
+    arrays += [per_gesture(values) for values in recording.parameters.values()]
+    if touches.saturated is not None:
+        arrays += list(touches.saturated.reshape(-1, sensors).T.cpu().numpy())
+    columns = column_types(about)
+    return pa.table(
+        {
+            name: pa.array(np.ma.getdata(array), kind, mask=np.ma.getmaskarray(array), safe=False)
+            for (name, kind), array in zip(columns.items(), arrays, strict=True)
+        }
+    )
+
+
+def _read_about(path: Path) -> dict[str, Any]:
+    if path.suffix == ".csv":
+        sidecar = _sidecar(path)
+        if not sidecar.is_file():
+            raise ValueError(f"it needs {sidecar.name} beside it: units, layout and rate are there")
+        return json.loads(read_file(sidecar))
+    stored = pa.parquet.read_schema(path).metadata or {}
+    if b"skin" not in stored:
+        raise ValueError("its schema has no units, layout and rate under 'skin'")
+    # Older files have no checksum.
+    if stored.get(b"skin_sha256", sha256(stored[b"skin"]).encode()) != sha256(stored[b"skin"]).encode():
+        raise ValueError("its units, layout and rate are not those that were written")
+    return json.loads(stored[b"skin"])
+
+
+def _read_table(path: Path, about: dict[str, Any]) -> pa.Table:
+    columns = column_types(about)
+    if path.suffix == ".csv":
+        convert = pa.csv.ConvertOptions(column_types=columns, include_columns=list(columns))
+        table = pa.csv.read_csv(path, convert_options=convert)
+        check_rows(about, len(table), len(columns), str(path))
+        return table
+    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+        check_rows(about, file.metadata.num_rows, len(columns), str(path))
+        return file.read(columns=list(columns)).cast(pa.schema(columns.items()))
+
+
+def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
+    if about["units"] != UNITS:
+        raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
+    batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
+    rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
+    first = about.get("first", 0)  # older recordings do not say
+    whole = np.stack([np.repeat(np.arange(batch) + first, time), np.tile(np.arange(time), batch)], axis=1)
+    if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
+        raise ValueError(
+            f"row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
+            f"{whole[wrong[0]].tolist()}: every touch needs its {time} frames in order"
+        )
+
+    def column(name: str) -> Tensor:
+        return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
+
+    def columns(name: str) -> Tensor:
+        return torch.stack([column(column_name) for column_name in numbered(name, sensors)], dim=-1)
+
+    present = [table[name].is_valid().to_numpy() for name in numbered("reading", sensors)]
+    touches = Touches(
+        columns("reading"),
+        torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),
+        torch.tensor(about["positions"], dtype=torch.float32),
+        torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
+        about["rate"],
+        saturated=columns("saturated") > 0.5 if about.get("saturated") else None,
+    )
+    return Recording(
+        touches,
+        task,
+        tuple(about["size"]),
+        tuple(about["footprint"]),
+        column("force") if about["force"] else None,
+        torch.stack([columns("D_s"), columns("D_t")], dim=-1) if about["displacement"] else None,
+        {name: column(f"gesture_{name}")[:, 0] for name in about["parameters"]},
+        about["metadata"],
+    )
+
+
+# A data set: a folder of recordings, its shards, with a manifest.
+#
+# ``manifest.json`` has the schema of the shards and its version, the units, the seed, the source commit and
+# the
+# configuration. ``shards/00000.parquet`` and so on are recordings (:mod:`skin.device.files`); the column
+# ``simulation`` numbers the touches of all shards.
+
+
+_Positive = Annotated[int, Ge(1)]
+_AGAIN = "delete it, and repeat the skin generate that made the data set, which draws it again"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Description of a data set.
+
+    Attributes:
+        version: of the schema.
+        columns: name of each column of a shard -> its type.
+        units: quantity -> its unit; columns without one are numbers.
+        gestures: number of touches in all shards.
+        frames: of each touch.
+        rate: frames per second, Hz.
+        seed: of the gestures.
+        source_commit: last commit of the code that draws them; without git, the version of the package.
+        source_dirty: whether files differed from that commit: true, false or unknown.
+        config_hash: of the configuration, of the files that it names and of the version of the package.
+        config: the configuration.
+        shards: number of touches of each shard.
+    """
+
+    version: int
+    columns: dict[str, str]
+    units: dict[str, str]
+    gestures: _Positive
+    frames: _Positive
+    rate: Annotated[float, Gt(0)]
+    seed: int | None
+    source_commit: str
+    source_dirty: str
+    config_hash: str
+    config: dict
+    shards: Annotated[list[_Positive], MinLen(1)]
+
+    @classmethod
+    def of(cls, about: dict[str, Any], shards: Sequence[int], **source: Any) -> "Manifest":
+        """Return the manifest of shards.
+
+        Args:
+            about: description of any of them (:func:`skin.device.files.describe_recording`).
+            shards: number of touches of each.
+            source: seed, source_commit, source_dirty, config_hash and config.
+        """
+        columns = {name: str(kind) for name, kind in column_types(about).items()}
+        counts = sum(shards), about["frames"], about["rate"]
+        return cls(FORMAT, columns, UNITS, *counts, shards=list(shards), **source)
+
+    @classmethod
+    def read(cls, folder: Path) -> "Manifest":
+        """Return the manifest in a folder.
+
+        Raises:
+            InputError: there is none, it is damaged, or of another version.
+        """
+        path = folder / MANIFEST
+        if not path.is_file():
+            raise InputError(
+                f"{folder} is no data set, because it has no {MANIFEST}: give a folder that skin generate "
+                f"n=1000 out={folder.name} made"
+            )
+        try:
+            stored = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{path} is damaged: {error}: restore it, or generate the data again") from error
+        if isinstance(stored, dict) and stored.get("version", FORMAT) != FORMAT:
+            raise InputError(
+                f"{path} has schema version {stored['version']}, this program reads version {FORMAT}: "
+                "use the program that wrote it, or generate the data again"
+            )
+        check_settings(cls, stored, str(path), whole=True)
+        manifest = cls(**{name: value for name, value in stored.items() if name in cls.__annotations__})
+        if manifest.units != UNITS or sum(manifest.shards) != manifest.gestures:
+            raise InputError(
+                f"{path} is damaged: its units or counts are not those that were written: generate the data "
+                "again"
+            )
+        return manifest
+
+    def write(self, folder: Path) -> None:
+        """Write the manifest into a folder."""
+        files.write(files.json_line(vars(self), indent=1) + "\n", folder / MANIFEST)
+
+    def path(self, folder: Path, number: int) -> Path:
+        """Return the path of a shard."""
+        return folder / "shards" / f"{number:05d}.parquet"
+
+    def missing(self, folder: Path) -> list[int]:
+        """Return the numbers of the shards that are not in a folder."""
+        return [n for n in range(len(self.shards)) if not self.path(folder, n).is_file()]
+
+    @property
+    def firsts(self) -> list[int]:
+        """The number of the first touch of each shard."""
+        return list(accumulate(self.shards[:-1], initial=0))
+
+
+class DataSet:
+    """A complete data set in a folder.
+
+    Opening it reads the manifest and the description of every shard, but no touches.
+
+    Args:
+        folder: as ``skin generate out=FOLDER`` wrote it.
+
+    Attributes:
+        manifest: its manifest.
+        counts: number of touches of each shard.
+
+    Raises:
+        InputError: there is no manifest, or a shard is missing, damaged or of another data set.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder).expanduser()
+        self.manifest = Manifest.read(self.folder)
+        self.counts = self.manifest.shards
+        if missing := self.manifest.missing(self.folder):
+            raise InputError(
+                f"{self.folder} is not complete, {len(missing)} of {len(self.counts)} shards are missing, as "
+                f"{self.path(missing[0]).name} is: repeat the skin generate that made it, which adds them"
+            )
+        for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
+            with _mended():
+                about = read_description(self.path(number))
+            expected = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
+            if expected != (count, first, self.manifest.config_hash):
+                raise InputError(f"{self.path(number)} is not the shard that {MANIFEST} describes: {_AGAIN}")
+
+    def path(self, number: int) -> Path:
+        """Return the path of a shard."""
+        return self.manifest.path(self.folder, number)
+
+    def read(self, number: int, complete: bool = True) -> Recording:
+        """Return the touches of a shard; ``complete`` adds force and parameters.
+
+        Raises:
+            InputError: the shard is damaged.
+        """
+        with _mended():
+            return read_recording(self.path(number), complete)
+
+
+@contextmanager
+def _mended() -> Iterator[None]:
+    """Add to an InputError about a shard what to do."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{error}: {_AGAIN}") from error

@@ -1,0 +1,547 @@
+"""Read a port: its settings, streams of bytes, feeds of frames, and the thread that fills a queue."""
+
+import errno
+import logging
+import os
+import socket
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from itertools import count
+from math import inf
+from threading import Condition, Event, Thread
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from skin.core.settings import RISING, check_settings
+from skin.device.resampling import After, Frame
+from skin.errors import InputError
+from skin.hardware.wire.channels import ChannelHealth, ChannelState, Limits
+from skin.hardware.wire.decoder import Decoder, Format, stopped_clock_error
+
+_log = logging.getLogger("skin.hardware.wire")
+
+
+def _check_order(limits: Limits) -> Limits:
+    numbers = [limit for limit in limits if limit is not None]
+    if sorted(set(numbers)) != numbers:
+        raise ValueError("must be [smallest, largest]")
+    return limits
+
+
+@dataclass(kw_only=True, eq=False)
+class PortSettings:
+    """Where a skin is and how to read it.
+
+    Args:
+        port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
+        baudrate: bits per second, for serial ports.
+        format: ``auto``, ``text`` or ``binary``.
+        limits: smallest and largest value of a channel, as in
+        :class:`skin.hardware.wire.channels.ChannelHealth`;
+            None: the largest count, if the header gives the bits.
+        timeout: s without a frame after which iterating and reading raise ``SkinTimeout``.
+        backoff: s before the first attempt to reconnect, and the longest between two.
+        silence: s without a byte after which a socket is closed and opened again, if it is to be reconnected;
+            None or 0: never. A computer that lost its power closes no connection. Serial ports are left open:
+            the system reports when one is unplugged, and opening one restarts many boards.
+        tare: duration of the tare, s.
+        scale: N per unit of the device; negative if values fall with force.
+        calibration: calibration file.
+
+    Raises:
+        InputError: a setting is invalid.
+    """
+
+    port: str | None = None
+    baudrate: PositiveInt = 115200
+    format: Format = "auto"
+    limits: Annotated[Limits, AfterValidator(_check_order)] | None = None
+    timeout: PositiveFloat = 5.0
+    backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
+    silence: NonNegativeFloat | None = 5.0
+    tare: float = 2.0
+    scale: float | None = None
+    calibration: str | None = None
+
+    def __post_init__(self) -> None:
+        # To open the port shows whether it is one.
+        settings = {
+            entry.name: (getattr(self, entry.name), entry.default) for entry in fields(PortSettings)[1:]
+        }
+        changed = {name: value for name, (value, default) in settings.items() if value != default}
+        check_settings(PortSettings, changed, "device")
+        if self.tare < 0:
+            raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")
+
+    @classmethod
+    def select(cls, device: Mapping[str, Any]) -> "PortSettings":
+        """Return those of the settings of ``device=serial`` that describe the port."""
+        return cls(**{entry.name: device[entry.name] for entry in fields(cls) if entry.name in device})
+
+
+class _TooFewFramesError(Exception):
+    """Fewer frames arrived than requested.
+
+    Attributes:
+        frames: those that arrived.
+    """
+
+    def __init__(self, message: str, frames: Sequence[Frame] = ()) -> None:
+        super().__init__(message)
+        self.frames = list(frames)
+
+
+class SkinTimeout(_TooFewFramesError, TimeoutError):  # noqa: N818 - named as TimeoutError is
+    """The frames did not arrive in time."""
+
+
+class SkinDisconnected(_TooFewFramesError, ConnectionError):  # noqa: N818
+    """The skin was unplugged, or a recording has ended."""
+
+
+if TYPE_CHECKING:
+    from skin.device.touches import Touches
+
+try:
+    import termios
+except ImportError:  # Windows
+    _Gone: type[Exception] = OSError
+else:
+    _Gone = termios.error
+
+_WAIT = 0.1  # s
+_CONNECT = 5.0  # s
+# A reader does not notice that the other side lost its power; by default the system checks after two hours.
+_KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, attempts
+_MOST = 65536  # bytes at once
+
+
+class ByteStream(Protocol):
+    """A source of bytes; a custom ``opener`` returns such an object."""
+
+    def read(self) -> bytes:
+        """Return the received bytes, possibly none, within 0.1 s; OSError once the stream is closed."""
+
+    def close(self) -> None:
+        """Close the port."""
+
+
+def open_stream(port: str, baudrate: int) -> ByteStream:
+    """Open a serial port, or ``socket://host:number``.
+
+    Raises:
+        InputError: there is no such port, it cannot be opened, or it is in use.
+    """
+    return _Socket(port) if port.startswith("socket://") else _Serial(port, baudrate)
+
+
+def check_port(port: str) -> None:
+    """Check that there is something at a port, without opening it: that would restart many boards.
+
+    Args:
+        port: as of :func:`open_stream`. Names of Windows and hosts elsewhere cannot be checked.
+
+    Raises:
+        InputError: there is no such device, or nothing on this machine listens at the address.
+    """
+    if port.startswith("socket://"):
+        _check_address(*_address(port), port)
+    elif os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
+        raise InputError(f"no port {port}: {_existing()}")
+
+
+def _check_address(host: str, number: int, port: str) -> None:
+    """Refuse an address of this machine at which nothing listens: one that could be taken."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except OSError:
+        return  # something listens, or it is another machine
+    raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
+
+
+class _Serial:
+    def __init__(self, port: str, baudrate: int) -> None:
+        import serial
+
+        try:
+            # Exclusive, or two readers would get half the bytes each.
+            self._port = serial.Serial(port, baudrate, timeout=_WAIT, exclusive=True)
+        except (OSError, _Gone, ValueError, OverflowError) as error:
+            raise _refused(port, baudrate, error) from error
+
+    def read(self) -> bytes:
+        try:
+            return self._port.read(max(1, min(self._port.in_waiting, _MOST)))
+        except (OSError, _Gone) as error:
+            raise OSError(str(error)) from error
+
+    def close(self) -> None:
+        self._port.close()
+
+
+class _Socket:
+    def __init__(self, port: str) -> None:
+        host, number = _address(port)
+        try:
+            self._socket = socket.create_connection((host, number), timeout=_CONNECT)
+        except OSError as error:
+            raise InputError(f"cannot reach {port}: {error}; does anything listen there?") from error
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):
+                self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+        self._socket.settimeout(_WAIT)
+
+    def read(self) -> bytes:
+        try:
+            data = self._socket.recv(_MOST)
+        except TimeoutError as error:
+            if error.errno is not None:  # ETIMEDOUT: no answer to keepalive
+                raise
+            return b""
+        if not data:
+            raise ConnectionResetError("the other side closed the connection")
+        return data
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _address(port: str) -> tuple[str, int]:
+    """Return host and number of ``socket://host:number``."""
+    try:
+        address = urlsplit(port)
+        host, number = address.hostname, address.port
+    except ValueError:
+        host = number = None
+    if not host or not number:
+        raise InputError(f"{port} is no address: give device.port=socket://HOST:NUMBER")
+    return host, number
+
+
+def _refused(port: str, baudrate: int, error: Exception) -> InputError:
+    number, text = getattr(error, "errno", None), str(error)
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
+        return InputError(f"no port {port}: {_existing()}")
+    # Windows reports "access is denied" for a port in use.
+    if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "PermissionError" in text:
+        return InputError(f"{port} is in use: close the serial monitor or any other program that reads it")
+    if number in (errno.EACCES, errno.EPERM):
+        return InputError(
+            f"{port} may not be opened: add your user to dialout with "
+            "sudo usermod -a -G dialout $USER, and log in again"
+        )
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
+        return InputError(f"{port} is no serial port: {_existing()}")
+    return InputError(f"cannot open {port} with device.baudrate={baudrate}: {text}")
+
+
+def _existing() -> str:
+    from serial.tools import list_ports
+
+    ports = ", ".join(sorted(entry.device for entry in list_ports.comports()))
+    return (
+        f"there are {ports}; give device.port=PORT" if ports else "there is no serial port; is it plugged in?"
+    )
+
+
+_AT_ONCE = 256  # frames, where time does not matter
+_STILL = 2.0, 10  # s and frames: a device's clock that is the same for as long stands still
+_WEAK = {
+    "none": "no checksum: a wrong value passes in 29 % of flipped bits and 76 % of lost bytes",
+    "xor": "a weak checksum (*HH): 2 % of double flipped bits and 6 % of double lost bytes pass",
+}
+
+
+class Feed(Protocol):
+    """A sequence of frames.
+
+    Attributes:
+        patient: the feed can wait, so no frame needs to be dropped.
+    """
+
+    patient: bool
+
+    def poll(self) -> list[Frame]:
+        """Return the frames of about 0.1 s; OSError once it is unplugged, EOFError at its end."""
+
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return the state of each channel."""
+
+    def close(self) -> None:
+        """Close the feed."""
+
+
+class WireFeed:
+    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
+
+    Args:
+        stream: of bytes.
+        decoder: turns them into frames.
+        limits: smallest and largest value of a channel.
+        silence: s without a byte after which the stream counts as gone.
+    """
+
+    patient = False
+
+    def __init__(
+        self,
+        stream: ByteStream,
+        decoder: Decoder,
+        limits: Limits | None,
+        silence: float = inf,
+        health: ChannelHealth | None = None,
+    ) -> None:
+        self._stream, self._decoder, self._limits = stream, decoder, limits
+        self._health = health or ChannelHealth()
+        self._told = False
+        self._said = Counter(decoder.stats.bad)
+        self._said_at = self._heard_at = monotonic()
+        self._silence = silence
+        self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
+
+    def poll(self) -> list[Frame]:
+        """Return the frames received since the last call.
+
+        Raises:
+            InputError: no format is detected, or the device's clock stands still.
+            OSError: the stream is closed, or silent for too long.
+        """
+        data, now = self._stream.read(), monotonic()
+        if data:
+            self._heard_at = now
+        elif now - self._heard_at >= self._silence:
+            raise TimeoutError(f"nothing received for {self._silence:g} s")
+        frames = self._decoder.feed(data, now) if data else []
+        if frames:
+            self._prepare()
+            self._check_clock(frames, now)
+        elif data and (error := self._decoder.error()):
+            raise error
+        if now - self._said_at >= 1:
+            self._say(now)
+        return [self._judged(frame) for frame in frames]
+
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return the state of each channel."""
+        return self._health.states()
+
+    def close(self) -> None:
+        """Close the port."""
+        self._stream.close()
+
+    def _prepare(self) -> None:
+        """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
+        frame_format, header = self._decoder.frame_format, self._decoder.header
+        if not self._told and frame_format is not None and frame_format.check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[frame_format.check])
+        self._told = True
+        if header is not None and header.bits:
+            self._health.largest = 2**header.bits - 1
+        if self._limits is not None:
+            self._health.limits = self._limits
+        elif header is not None and header.bits:
+            self._health.limits = (None, 2**header.bits - 1)
+
+    def _check_clock(self, frames: list[Frame], now: float) -> None:
+        """Raise InputError if frames arrive but the device's clock stands still."""
+        if frames[-1].t != self._clock:
+            self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
+        self._clock_frames += len(frames)
+        least, few = _STILL
+        if now - self._clock_since >= least and self._clock_frames >= few:
+            raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
+
+    def _judged(self, frame: Frame) -> Frame:
+        if frame.after not in ("", "gap"):
+            self._health.restart()
+        valid, saturated = self._health.check(frame.values, frame.t)
+        if frame.saturated is not None:
+            saturated = saturated | frame.saturated
+        return frame._replace(valid=valid & frame.valid, saturated=saturated & frame.valid)
+
+    def _say(self, now: float) -> None:
+        fresh = self._decoder.stats.bad - self._said
+        self._said, self._said_at = Counter(self._decoder.stats.bad), now
+        if fresh:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
+            trouble = self._decoder.quality.trouble
+            _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, f"; {trouble}" if trouble else "")
+
+
+class PlaybackFeed:
+    """Frames from memory, in real time or as fast as they are read.
+
+    Args:
+        strips: touches in N, all with one rate; a window should not span two of them.
+        realtime: False: as fast as they are read.
+    """
+
+    def __init__(self, strips: "Iterable[Touches]", realtime: bool = True) -> None:
+        self.patient, self._start = not realtime, monotonic()
+        self._frames = self._play(strips)
+        self._next = next(self._frames, None)
+
+    def _play(self, strips: "Iterable[Touches]") -> Iterator[Frame]:
+        number, segments = count(), count()
+        for strip in strips:
+            saturated = strip.valid & False if strip.saturated is None else strip.saturated
+            masks = strip.valid.numpy(), saturated.numpy()
+            for touch in zip(strip.readings.double().numpy(), *masks, strict=True):
+                segment = next(segments)
+                after: After = "cut" if segment else ""
+                for values, valid, limited in zip(*touch, strict=True):
+                    seq = next(number)
+                    t = seq / strip.rate
+                    yield Frame(seq, t, self._start + t, values, valid, segment, 0, after, limited)
+                    after = ""
+
+    def poll(self) -> list[Frame]:
+        """Return the frames that are due."""
+        if self._next is None:
+            raise EOFError("the recording has ended")
+        if not self.patient:
+            sleep(min(_WAIT, max(0.0, self._next.t_host - monotonic())))
+        frames, now = list[Frame](), monotonic()
+        while self._next and len(frames) < _AT_ONCE and (self.patient or self._next.t_host <= now):
+            frames.append(self._next)
+            self._next = next(self._frames, None)
+        return frames
+
+    def states(self) -> tuple[ChannelState, ...]:
+        """Return nothing: the frames of a file already have masks of valid values."""
+        return ()
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+_PAUSE = 0.002  # s between two reads of the port: fewer and larger pieces cost a tenth of the time
+_RATE = 256  # frames over which the rate is taken
+_WAKE = 0.2  # s: longer waits for a lock would block Ctrl-C on Windows
+
+
+class Reader:
+    """Reads frames until it is closed. A full queue drops its oldest frame; the next one counts it as lost.
+
+    Args:
+        connect: opens the feed; called again after each disconnection.
+        queue: largest number of frames in the queue.
+        reconnect: try to open the feed again after a disconnection.
+        backoff: s before the first attempt, and the longest between two; it doubles until frames arrive.
+
+    Attributes:
+        dropped: number of frames dropped from a full queue.
+        reconnects: number of reconnections.
+        away: the feed is disconnected and being reopened.
+        error: why the thread ended; EOFError at the end of a recording.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], Feed],
+        queue: int,
+        reconnect: bool = False,
+        backoff: tuple[float, float] = (1.0, 10.0),
+    ) -> None:
+        self._connect, self._reconnect, self._backoff = connect, reconnect, backoff
+        self._wait = backoff[0]
+        self.dropped = self.reconnects = 0
+        self.away = False
+        self.error: Exception | None = None
+        self._frames: deque[Frame] = deque()
+        self._most = queue
+        self._times: deque[float] = deque(maxlen=_RATE)
+        self._stop, self._fresh = Event(), Condition()
+        self.feed = connect()
+        self._thread = Thread(target=self._run, name="skin-reader", daemon=True)
+        self._thread.start()
+
+    @property
+    def rate(self) -> float:
+        """Frames per second over the last frames of a segment, by the device's clock, Hz; 0 if unknown."""
+        with self._fresh:
+            times = self._times
+            passed = times[-1] - times[0] if len(times) > 1 else 0.0
+            return (len(times) - 1) / passed if passed > 0 else 0.0
+
+    def take(self, count: int, timeout: float) -> Iterator[Frame]:
+        """Yield frames as they arrive: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
+        deadline = monotonic() + timeout
+        for _ in range(count):
+            with self._fresh:
+                while not self._frames:
+                    left = deadline - monotonic()
+                    if self.error is not None or left <= 0:
+                        return
+                    self._fresh.wait(min(left, _WAKE))
+                frame = self._frames.popleft()
+                self._fresh.notify_all()
+            yield frame
+
+    def close(self) -> None:
+        """End the thread, then close the source."""
+        self._stop.set()
+        with self._fresh:
+            self._fresh.notify_all()
+        self._thread.join(timeout=5)
+        with suppress(OSError):
+            self.feed.close()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._step()
+        except Exception as error:
+            with self._fresh:
+                self.error = error
+                self._fresh.notify_all()
+
+    def _step(self) -> None:
+        try:
+            frames = self.feed.poll()
+        except OSError as error:
+            with suppress(OSError):
+                self.feed.close()
+            if not self._reconnect:
+                raise SkinDisconnected(f"the skin was unplugged: {error}") from error
+            _log.warning("the skin was unplugged (%s); trying again", error)
+            self._reopen()
+            return
+        if frames:
+            self._wait = self._backoff[0]
+            self._push(frames)
+            if not self.feed.patient:
+                self._stop.wait(_PAUSE)
+
+    def _reopen(self) -> None:
+        self.away = True
+        while not self._stop.wait(self._wait):
+            self._wait = min(2 * self._wait, self._backoff[1])
+            with suppress(OSError, InputError):
+                self.feed = self._connect()
+                self.reconnects += 1
+                self.away = False
+                return
+
+    def _push(self, frames: list[Frame]) -> None:
+        with self._fresh:
+            for frame in frames:
+                if frame.after not in ("", "gap"):
+                    self._times.clear()
+                self._times.append(frame.t)
+                while self.feed.patient and len(self._frames) >= self._most and not self._stop.is_set():
+                    self._fresh.wait(_WAKE)
+                self._frames.append(frame)
+                if len(self._frames) > self._most:
+                    dropped = self._frames.popleft()
+                    self._frames[0] = self._frames[0].behind(dropped)
+                    self.dropped += 1
+                self._fresh.notify_all()

@@ -1,0 +1,1 @@
+"""From touches to predictions: features, representations, networks, learners."""

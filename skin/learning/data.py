@@ -1,0 +1,277 @@
+"""The LightningDataModule: touches as batches of frames."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import sha256
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from pydantic import NonNegativeFloat, PositiveInt
+from torch import Tensor
+
+from skin.core.settings import checked
+from skin.device.base import AbstractDevice, Split
+from skin.device.touches import Touches, touches_hash
+from skin.errors import InputError
+from skin.learning.classifier import Batch
+from skin.learning.representation.base import AbstractRepresentation, Frames
+from skin.touch.labels import Task
+
+# Data augmentation: changes of a touch that keep its labels.
+
+
+_IDLE = 8
+_MARGIN = 2  # frames that a touch may last beyond what stands out
+
+
+@checked("data.augment")
+@dataclass(frozen=True)
+class Augmentation:
+    """Shifts, reverses, scales and blurs touches of a training batch.
+
+    It needs no simulator, so it applies to recordings of a real skin too. It assumes that a window contains a
+    whole touch with idle frames around it.
+
+    Args:
+        shift: shift the touch in its window, as far as it stays whole; idle frames wrap around.
+        reverse: reverse time with probability 0.5.
+        gain: standard deviation of the logarithm of a factor per sensor and touch.
+        noise: standard deviation of the noise added to every reading, N.
+
+    Raises:
+        InputError: a negative number.
+    """
+
+    shift: bool = False
+    reverse: bool = False
+    gain: NonNegativeFloat = 0.0
+    noise: NonNegativeFloat = 0.0
+
+    def __call__(self, touches: Touches, generator: torch.Generator) -> Touches:
+        """Return augmented touches; ``generator`` is the source of randomness.
+
+        Raises:
+            InputError: touches whose sensors move, for which shifts are not defined.
+        """
+        if touches.motion is not None:
+            raise InputError("data.augment does not support touches with motion: leave out data.augment")
+        count, time, sensors = touches.readings.shape
+        order = torch.arange(time).expand(count, time)
+        if self.shift:
+            order = (order - self._shifts(touches, generator)[:, None]) % time
+        if self.reverse:
+            turned = torch.rand(count, generator=generator) < 0.5
+            order = torch.where(turned[:, None], order.flip(1), order)
+        order = order[..., None].expand(-1, -1, sensors)
+        readings, valid = touches.readings.gather(1, order), touches.valid.gather(1, order)
+        if self.gain:
+            readings = readings * (self.gain * torch.randn(count, 1, sensors, generator=generator)).exp()
+        if self.noise:
+            readings = readings + self.noise * torch.randn(readings.shape, generator=generator)
+        saturated = None if touches.saturated is None else touches.saturated.gather(1, order)
+        return replace(touches, readings=readings, valid=valid, saturated=saturated)
+
+    def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
+        """Draw the shift of each touch, (B,), frames, such that none is cut."""
+        raw = touches.readings * touches.valid
+        idle = raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
+        force = (raw - idle).clamp(min=0).sum(dim=2)
+        touched = (force > 0.12 * force.amax(dim=1, keepdim=True)).int()
+        first = touched.argmax(dim=1) - _MARGIN
+        last = raw.shape[1] - touched.flip(1).argmax(dim=1) - 1 + _MARGIN
+        early, late = first.clamp(min=0), (raw.shape[1] - 1 - last).clamp(min=0)
+        chance = torch.rand(len(raw), generator=generator)
+        return (chance * (early + late + 1)).floor().long() - early
+
+
+MakeRepresentation = Callable[[Tensor, tuple[float, float]], AbstractRepresentation]
+
+
+@checked("data")
+class TouchData(pl.LightningDataModule):
+    """Data module with batches of a device's touches in a representation.
+
+    Batches are slices of tensors; the representation runs on whole batches, on the accelerator where there is
+    one. A device that draws fresh gestures is called again every epoch. If a device makes its touches in
+    parts, each epoch has the parts in another order, and shuffles the touches of each. Processes that train
+    together share each training batch; each of them validates on all gestures.
+
+    Args:
+        device: source of touches.
+        representation: partial; takes positions (S, 3), m, and size (x, y), m.
+        batch_size: gestures per batch.
+        seed: of the order of gestures and of their augmentation; epoch e uses (seed, e).
+        augmentation: changes the touches of training batches; None leaves them.
+        geometry: returns that of the configured skin, (S, G), for touches that do not tell it (of a port or a
+            file); None: there is none.
+
+    Attributes:
+        device: as given.
+        task: the labels.
+        window: number of frames per touch.
+    """
+
+    def __init__(
+        self,
+        device: AbstractDevice,
+        representation: MakeRepresentation,
+        batch_size: PositiveInt = 64,
+        seed: int = 0,
+        augmentation: Augmentation | None = None,
+        geometry: Callable[[], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        if augmentation is not None and augmentation.reverse and device.task.direction:
+            raise InputError(
+                "a touch that runs backwards slides the other way: set data.augment.reverse=false where "
+                "data.direction=true"
+            )
+        self.device, self.batch_size, self.seed = device, batch_size, seed
+        self._make, self._geometry = representation, geometry
+        # An augmentation without effect must not draw random numbers.
+        self.augmentation = None if augmentation == Augmentation() else augmentation
+        self._known: tuple[Tensor, AbstractRepresentation] | None = None
+        self._drawn: dict[str, Touches] = {}
+
+    @property
+    def task(self) -> Task:
+        """What the labels mean."""
+        return self.device.task
+
+    @property
+    def window(self) -> int:
+        """Number of frames per touch."""
+        return self.example.readings.shape[1]
+
+    @cached_property
+    def example(self) -> Touches:
+        """The first touch of the training split."""
+        for touches in self.parts("train"):
+            return touches[torch.tensor([0])]
+        raise InputError("there are no touches to train on: generate or record more")
+
+    @property
+    def hash(self) -> str:
+        """Hash of the readings and labels of the training split."""
+        hashes = [touches_hash(touches) for touches in self.parts("train")]
+        return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode()).hexdigest()[:16]
+
+    def count(self, split: Split) -> list[int]:
+        """Return the number of touches of each part of a split, in the order of :meth:`parts`."""
+        parts = self.device.parts(split)
+        return [len(self.touches(split))] if parts is None else [part.count for part in parts]
+
+    def parts(
+        self, split: Split, epoch: int = 0, generator: torch.Generator | None = None
+    ) -> Iterator[Touches]:
+        """Yield the touches of a split, all at once unless the device makes them in parts.
+
+        Args:
+            split: of the device.
+            epoch: as of :meth:`touches`.
+            generator: shuffles the parts; None leaves them in order.
+        """
+        parts = self.device.parts(split)
+        if parts is None:
+            yield self.touches(split, epoch)
+            return
+        order = range(len(parts)) if generator is None else torch.randperm(len(parts), generator=generator)
+        for number in order:
+            yield parts[number].make().touches
+
+    def touches(self, split: Split, epoch: int = 0) -> Touches:
+        """Return the touches of a split; those of epoch 0 are kept."""
+        if epoch == 0 or not getattr(self.device, "fresh", False):
+            if split not in self._drawn:
+                self._drawn[split] = self.device.touches(split)
+            return self._drawn[split]
+        return self.device.touches(split, epoch)
+
+    def representation_for(self, positions: Tensor) -> AbstractRepresentation:
+        """Return the representation of a layout with positions (S, 3), m; that of the last layout is kept.
+
+        Raises:
+            InputError: positions that change with time, (B, T, S, 3); motion is told beside the layout.
+        """
+        if self._known is not None and self._layout_free:
+            return self._known[1]
+        if positions.ndim != 2 and not self._layout_free:
+            raise InputError(
+                "representations are built for one layout, got positions per frame: give one position "
+                "(x, y, z) per sensor, and how far it moves as Touches.motion"
+            )
+        if self._known is None or not torch.equal(self._known[0], positions):
+            self._known = (positions, self._make(positions, self.device.size).requires_grad_(False))
+        return self._known[1]
+
+    def frames(self, touches: Touches) -> Batch:
+        """Return the frames of touches and their labels (B, L), on the touches' device."""
+        labels = touches.known_labels
+        return self.show(touches), labels
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches, on the touches' device."""
+        place = touches.readings.device
+        representation = self.representation_for(touches.positions.cpu()).to(place)
+        if touches.geometry is None and self.geometry is not None:
+            touches = replace(touches, geometry=self.geometry.to(place))
+        return representation.show(touches)
+
+    @cached_property
+    def geometry(self) -> Tensor | None:
+        """The geometry of the configured skin, (S, G); None if it is unknown, or not needed."""
+        return self._geometry() if self._layout_free and self._geometry is not None else None
+
+    @property
+    def _layout_free(self) -> bool:
+        make: Any = getattr(self._make, "func", self._make)
+        return bool(make.layout_free)
+
+    def train_dataloader(self) -> "_Batches":
+        """Return the batches of the training split, in another order each epoch."""
+        return _Batches(self, "train")
+
+    def val_dataloader(self) -> "_Batches":
+        """Return the batches of the validation split."""
+        return _Batches(self, "validation")
+
+    def on_after_batch_transfer(self, batch: Touches, dataloader_idx: int) -> Batch:
+        """Return the frames and labels of a batch that has arrived where the network is."""
+        return self.frames(batch)
+
+
+class _Batches:
+    """The batches of one split; no torch DataLoader, which would touch every sample by itself."""
+
+    def __init__(self, data: TouchData, split: Split) -> None:
+        self.data, self.split = data, split
+
+    def __len__(self) -> int:
+        return sum(-(-count // self.data.batch_size) for count in self.data.count(self.split))
+
+    def __iter__(self) -> Iterator[Touches]:
+        data = self.data
+        if self.split != "train":
+            for touches in data.parts(self.split):
+                for start in range(0, len(touches), data.batch_size):
+                    yield touches[start : start + data.batch_size]
+            return
+        epoch = data.trainer.current_epoch if data.trainer else 0
+        # one stream per (seed, epoch); a mere sum would give seed 1 the orders of seed 0, an epoch late
+        generator = torch.Generator().manual_seed(data.seed * 1_000_003 + epoch)
+        for touches in data.parts(self.split, epoch, generator):
+            for index in torch.randperm(len(touches), generator=generator).split(data.batch_size):
+                batch = touches[index]
+                yield self._share(data.augmentation(batch, generator) if data.augmentation else batch)
+
+    def _share(self, batch: Touches) -> Touches:
+        """Return this process's part of a batch where several train together.
+
+        Each takes a whole batch that has less than two gestures for each of them: batch norm needs two.
+        """
+        trainer = self.data.trainer
+        if trainer is None or trainer.world_size == 1 or len(batch) < 2 * trainer.world_size:
+            return batch
+        return batch[trainer.global_rank :: trainer.world_size]

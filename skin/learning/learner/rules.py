@@ -1,0 +1,165 @@
+"""One threshold per label on an engineered feature."""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from skin.core.safe_loading import TEXT, parse_json, read_file
+from skin.device.touches import Touches
+from skin.errors import InputError
+from skin.learning.features import engineered_features
+from skin.learning.learner.base import AbstractLearner
+from skin.touch.labels import Task
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger
+
+    from skin.learning.data import TouchData
+
+LOOK_AT = {
+    "big": ("sensors above", "most sensors above"),
+    "dynamic": ("path of", "reach of", "extent of", "way of"),
+    "press": ("longest run",),
+    "dangerous": ("raw sensor maximum 1", "sensor maximum 1"),
+    "touch": ("sensor maximum 1",),
+}
+"""Label -> beginnings of the names of the features that its rule may use."""
+
+_LARGEST_LOGIT = 12.0
+
+_Split = tuple[dict[str, Tensor], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A label holds where a feature exceeds a threshold.
+
+    Attributes:
+        measurement: name of the feature; stored under this key in ``rules.json``.
+        threshold: in the unit of the feature.
+        slope: of the log odds above the threshold, per unit of the feature.
+    """
+
+    measurement: str
+    threshold: float
+    slope: float
+
+    def probability(self, values: dict[str, Tensor]) -> Tensor:
+        """Return the probability of the label, (B,)."""
+        return (self.slope * (values[self.measurement].double() - self.threshold)).sigmoid().float()
+
+
+class Rules(AbstractLearner):
+    """Tunes one threshold per label: peak force, duration of contact, travel of the centre, active sensors.
+
+    Each label uses the feature and the threshold with the highest training accuracy. The slope is fitted to
+    the validation split. Any layout is accepted.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._rules: dict[str, Rule] = {}
+
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Tune the thresholds.
+
+        Raises:
+            InputError: the labels are not those of the report, or the touches have no labels.
+        """
+        if not set(data.task.names) <= set(LOOK_AT):
+            raise InputError(
+                f"learner=rules knows the labels {', '.join(LOOK_AT)}, got {', '.join(data.task.names)}: "
+                "use learner=boosted_trees"
+            )
+        began = time.perf_counter()
+        train, validation = data.touches("train"), data.touches("validation")
+        train_features, validation_features = (
+            engineered_features(train.to("cpu")),
+            engineered_features(validation.to("cpu")),
+        )
+        self._set(
+            {
+                name: _tune(
+                    name,
+                    _defined(train_features, train.known_labels, data.task, i),
+                    _defined(validation_features, validation.known_labels, data.task, i),
+                )
+                for i, name in enumerate(data.task.names)
+            }
+        )
+        self.seconds_per_epoch = time.perf_counter() - began
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of any layout."""
+        if not self._rules:
+            raise RuntimeError("fit or load the learner first")
+        values = engineered_features(touches.to("cpu"))
+        return torch.stack([rule.probability(values) for rule in self._rules.values()], dim=1)
+
+    def save(self, folder: Path) -> Path:
+        """Write the rules to ``rules.json`` in ``folder`` and return its path."""
+        if not self._rules:
+            raise RuntimeError("fit or load the learner first")
+        path = Path(folder) / "rules.json"
+        path.write_text(json.dumps({name: asdict(rule) for name, rule in self._rules.items()}, indent=2))
+        return path
+
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Load the rules that :meth:`save` wrote."""
+        stored = parse_json(read_file(Path(path), TEXT))
+        rules = {name: Rule(**stored[name]) for name in data.task.names}
+        features = engineered_features(data.example.to("cpu"))
+        for name, rule in rules.items():
+            numbers = all(isinstance(value, int | float) for value in (rule.threshold, rule.slope))
+            if rule.measurement not in features or not numbers:
+                raise ValueError(f"the rule of {name} is {asdict(rule)}")
+        self._set(rules)
+
+    def _set(self, rules: dict[str, Rule]) -> None:
+        self._rules = rules
+        self.parameters = 2 * len(rules)
+
+
+def _defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
+    """Return the features and one label of the touches for which that label is defined."""
+    rows = task.counts(labels)[:, label].cpu()
+    return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()
+
+
+def _tune(label: str, train: _Split, validation: _Split) -> Rule:
+    """Return the best rule for one label: feature and threshold from ``known``, slope from ``other``."""
+    values, truth = train
+    # The trailing blank keeps "maximum 1" from matching "maximum 10".
+    looked_at = tuple(f"{name} " for name in LOOK_AT[label])
+    allowed = [name for name in values if f"{name} ".startswith(looked_at)]
+    _, threshold, name = max((*_threshold(values[name].double().numpy(), truth), name) for name in allowed)
+    values, truth = validation
+    distance = values[name].double().numpy() - threshold
+    unit = np.std(distance) or 1.0
+
+    def loss(log_slope: float) -> float:
+        return float(np.logaddexp(0, np.exp(log_slope) * distance / unit * (1 - 2 * truth)).mean())
+
+    # The slope is limited so that float32 probabilities have no ties, which would change the ranking.
+    steepest = np.log(_LARGEST_LOGIT * unit / max(float(np.abs(distance).max()), 1e-12))
+    log_slope = minimize_scalar(loss, bounds=(steepest - 9, steepest), method="bounded").x
+    return Rule(name, threshold, float(np.exp(log_slope) / unit))
+
+
+def _threshold(scores: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Return the highest accuracy of ``scores > threshold`` and that threshold, between two scores."""
+    order = np.argsort(scores)
+    scores, truth = scores[order], truth[order]
+    # Correct when cutting after i: the zeros up to i and the ones after it.
+    right = np.cumsum(1 - truth) + truth.sum() - np.cumsum(truth)
+    cut = np.diff(scores) > 0
+    if not cut.any():
+        return float(max(truth.mean(), 1 - truth.mean())), float(scores[0])
+    i = int(np.argmax(np.where(cut, right[:-1], -1)))
+    return float(right[i] / len(truth)), float((scores[i] + scores[i + 1]) / 2)

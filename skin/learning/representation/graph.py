@@ -1,0 +1,230 @@
+"""A graph of sensors with edges between neighbours."""
+
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from pydantic import PositiveInt
+from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial.distance import cdist
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.core.settings import checked
+from skin.device.touches import Touches
+from skin.errors import InputError
+from skin.learning.representation.base import AbstractRepresentation, Frames, channels
+
+Edges = Literal["knn", "delaunay"]
+Weight = Literal["exp", "distance", "stiffness", "none"]
+Positions = Literal["layout", "deformed"]
+
+
+def neighbours(positions: np.ndarray, edges: Edges, count: int = 6) -> np.ndarray:
+    """Return which sensors (S, 3), m, are neighbours: (S, S), bool, symmetric, without self-loops.
+
+    ``knn``: one of the two is among the ``count`` nearest of the other. ``delaunay``: they share an edge of
+    the Delaunay triangulation in the plane.
+
+    Raises:
+        InputError: the sensors do not form a triangle.
+    """
+    linked = np.zeros((len(positions), len(positions)), dtype=bool)
+    if edges == "knn":
+        nearest = cKDTree(positions).query(positions, k=range(1, min(count + 1, len(positions)) + 1))[1]
+        np.put_along_axis(linked, nearest, True, axis=1)
+    else:
+        try:
+            triangles = Delaunay(positions[:, :2]).simplices
+        except (QhullError, ValueError):
+            raise InputError(
+                f"representation.edges=delaunay needs at least three sensors that are not in one line, "
+                f"got {len(positions)}: set representation.edges=knn"
+            ) from None
+        for corner in range(3):
+            linked[triangles[:, corner], triangles[:, corner - 1]] = True
+    np.fill_diagonal(linked, False)
+    return linked | linked.T
+
+
+def typical_distance(positions: np.ndarray) -> float:
+    """Return d0, the median distance of sensors (S, 3), m, to their nearest neighbours, m."""
+    distance = cdist(positions, positions)
+    return float(np.median((distance + np.diag(np.full(len(distance), np.inf))).min(axis=1)))
+
+
+def adjacency(
+    positions: np.ndarray, linked: np.ndarray, weight: Weight, body: AbstractBody | None = None
+) -> np.ndarray:
+    """Return the weights (S, S) of the edges ``linked``; 0 where there is none.
+
+    With d the distance and d0 the typical one (:func:`typical_distance`): ``exp`` is exp(-d / d0),
+    ``distance`` is d / d0 (the report's edge value, free of the unit of length), ``none`` is 1. ``stiffness``
+    is that of the strip of skin between the two sensors, k = E h w / d summed over layers and averaged along
+    the line between them where the modulus varies, over that of a strip of length d0 in a skin without
+    variation ("other physical information", report, 2.2.1): d0 / d in a skin of uniform layers, whatever w.
+
+    Distances are those along the surface, on a sheet and on an arm alike: a straight line of the chart is the
+    shortest way on a cylinder too, and the strip of skin along it is the one that is stretched.
+
+    Args:
+        positions: (S, 3), m.
+        linked: (S, S), bool, symmetric.
+        weight: see above.
+        body: whose surface; only ``stiffness`` needs it.
+
+    Raises:
+        InputError: stiffness without a body.
+    """
+    if weight == "none" or not linked.any():
+        return linked.astype(float)
+    unit = typical_distance(positions)
+    if weight == "stiffness":
+        return _stiffness(positions, linked, unit, body)
+    distance = cdist(positions, positions)
+    return linked * (np.exp(-distance / unit) if weight == "exp" else distance / unit)
+
+
+def _stiffness(
+    positions: np.ndarray, linked: np.ndarray, unit: float, body: AbstractBody | None
+) -> np.ndarray:
+    if body is None:
+        raise InputError(
+            "representation.weight=stiffness needs to know the skin: set representation.body=${body}, "
+            "or representation.weight=exp"
+        )
+    first, second = np.nonzero(linked)
+    weights = np.zeros(linked.shape)
+    weights[first, second] = body.stiffness(positions[first], positions[second], width=unit) / body.tension
+    return (weights + weights.T) / 2
+
+
+def normalised(edges: np.ndarray) -> np.ndarray:
+    """Return D^-1/2 (A + I) D^-1/2 of edge weights A (S, S), D the row sums of A + I (Kipf, Welling 2017).
+
+    Its diagonal is therefore 1 / D, from which ``fusion=linked`` recovers D.
+    """
+    looped = edges + np.eye(len(edges))
+    root = np.sqrt(looped.sum(axis=1))
+    return looped / np.outer(root, root)
+
+
+def self_share(adjacency: Tensor) -> float:
+    """Return the mean diagonal entry of a normalised adjacency (..., S, S).
+
+    Close to 1 the graph mixes neighbours little; close to 1 / S it mixes all nodes.
+    """
+    return float(adjacency.diagonal(dim1=-2, dim2=-1).mean())
+
+
+@checked("representation")
+class Graph(AbstractRepresentation):
+    """Represents sensors as nodes with edges between neighbours (report, section 2.2).
+
+    It needs positions only and applies to any layout and number of sensors. The adjacency is one dense
+    matrix, normalised once and shared by all frames; with ``positions=deformed`` each frame has its own
+    (report, section 4.2). Edges and the unit d0 always follow from the layout at rest, so that the graph
+    changes continuously.
+
+    Args:
+        layout: (S, 3), m; by position.
+        size: extent (x, y) of the sheet, m; by position.
+        edges: ``knn`` or ``delaunay``; see :func:`neighbours`.
+        count: number of nearest neighbours under ``knn``.
+        weight: ``exp``, ``distance``, ``stiffness`` or ``none``; see :func:`adjacency`.
+        positions: of the sensors for distances: ``layout``, or ``deformed``, the displaced positions in each
+            frame, which needs touches with displacements and a fusion that accepts a graph per frame.
+        coordinates: append x / size_x and y / size_y as the last two node features of every frame.
+        scale: N; readings are divided by it.
+        mask: append a node feature that is 1 where the reading is not valid.
+        body: model of the skin; only ``weight=stiffness`` needs it.
+
+    Raises:
+        InputError: an unknown option, or sensors that do not form a graph.
+    """
+
+    kind: ClassVar[Literal["image", "graph", "readings"]] = "graph"
+    adjacency: Tensor
+    layout: Tensor
+    size: Tensor
+    pairs: Tensor
+    at_rest: Tensor
+
+    def __init__(
+        self,
+        layout: Tensor,
+        size: tuple[float, float],
+        /,
+        edges: Edges = "knn",
+        count: PositiveInt = 6,
+        weight: Weight = "exp",
+        positions: Positions = "layout",
+        coordinates: bool = False,
+        scale: float = 10.0,
+        mask: bool = False,
+        body: AbstractBody | None = None,
+    ) -> None:
+        super().__init__()
+        self.scale, self.mask, self.coordinates = scale, mask, coordinates
+        self.weight, self.positions = weight, positions
+        if positions == "deformed" and weight == "none" and not coordinates:
+            raise InputError(
+                "representation.positions=deformed changes nothing at representation.weight=none: set "
+                "representation.weight=exp, or representation.positions=layout"
+            )
+        places = layout.cpu().numpy().astype(float)
+        weights = adjacency(places, neighbours(places, edges, count), weight, body)
+        first, second = np.nonzero(np.triu(weights))
+        # A single sensor has no distance and no edges.
+        self.unit = typical_distance(places) if len(places) > 1 else 1.0
+        self.register_buffer("adjacency", torch.from_numpy(normalised(weights)).to(torch.float32))
+        self.register_buffer("layout", torch.from_numpy(places).to(torch.float32))
+        self.register_buffer("size", torch.tensor(size, dtype=torch.float32))
+        self.register_buffer("pairs", torch.from_numpy(np.stack([first, second])))
+        distance = np.linalg.norm(places[first] - places[second], axis=1)
+        self.register_buffer("at_rest", torch.from_numpy(weights[first, second] * distance).float())
+
+    def forward(self, readings: Tensor, valid: Tensor, motion: Tensor | None = None) -> Frames:
+        """Return frames (B, T, S, F) and the adjacency (S, S) or (B, T, S, S) of readings (B, T, S), N.
+
+        Args:
+            readings: (B, T, S), N.
+            valid: (B, T, S), bool.
+            motion: (B, T, S, 3), m, displacement of each sensor from its place in the layout; only
+                ``positions=deformed`` needs it.
+
+        Raises:
+            InputError: the motion is needed and not known.
+        """
+        places, matrix = self.layout, self.adjacency
+        if self.positions == "deformed":
+            if motion is None:
+                raise InputError(
+                    "representation.positions=deformed needs touches with displacements of sensors: give "
+                    "Touches(motion=...), or set representation.positions=layout"
+                )
+            places = self.layout + motion
+            matrix = self.adjacency if self.weight == "none" else self._adjacency_at(places)
+        x = channels(readings, valid, self.scale, self.mask)
+        if self.coordinates:
+            where = (places[..., :2] / self.size).to(x.dtype).expand(*x.shape[:-1], 2)
+            x = torch.cat([x, where], dim=-1)
+        return Frames(x, matrix)
+
+    def show(self, touches: Touches) -> Frames:
+        """Return the frames of touches, with the sensors at their displaced positions if these are known."""
+        return self(touches.readings, touches.valid, touches.motion)
+
+    def _adjacency_at(self, places: Tensor) -> Tensor:
+        """Return the normalised adjacency (B, T, S, S) of sensors at places (B, T, S, 3), m."""
+        first, second = self.pairs
+        distance = (places.index_select(-2, first) - places.index_select(-2, second)).norm(dim=-1)
+        if self.weight == "stiffness":
+            weights = self.at_rest / distance
+        else:
+            share = distance / self.unit
+            weights = (-share).exp() if self.weight == "exp" else share
+        looped = torch.eye(places.shape[-2], device=places.device).expand(*places.shape[:-1], -1).clone()
+        looped[..., first, second] = looped[..., second, first] = weights
+        root = looped.sum(dim=-1).sqrt()
+        return looped / (root[..., :, None] * root[..., None, :])

@@ -1,0 +1,1 @@
+"""From surface pressure to true sensor readings, and from an object to surface pressure."""

@@ -1,0 +1,41 @@
+"""Prescribed pressure, as in the report: the image of an object is its pressure."""
+
+from typing import final
+
+import numpy as np
+import torch
+
+from skin.body.base import AbstractBody
+from skin.mechanics.contact.base import AbstractContact
+from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.gesture import Trajectories
+from skin.touch.sampler import ContactProblem, ContactResult
+
+
+@final
+class Prescribed(AbstractContact):
+    """Takes the grey-scale image of an object as its pressure (report, equations 1 and 2).
+
+    Use it for the gestures of the report, for simulators without mechanics, and for objects that are softer
+    than the skin, whose pressure does not depend on the skin.
+
+    Args:
+        body, simulator: not used.
+    """
+
+    proportional = True
+
+    def __init__(self, body: AbstractBody | None = None, simulator: AbstractSimulator | None = None) -> None:
+        del body, simulator
+
+    def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
+        """Return the images at the force at which the peak cell of the gesture has the wanted pressure."""
+        frames = problem.shapes.render(*trajectories.poses)
+        # Equation 2: the drawn peak is that of the whole movie.
+        peak = (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
+        width, height = problem.shapes.body.cell
+        force = trajectories.peak * (width * height) / peak
+        owner = torch.from_numpy(trajectories.owner)
+        frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
+        none = np.zeros(len(force), bool)
+        return ContactResult(frames, force, trajectories.peak, none, none)

@@ -1,0 +1,108 @@
+"""Where the sensors of a skin are, and what they respond to, as numbers for a network."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.body.sensors import GEOMETRY, REACHES, Sensors
+from skin.mechanics.simulator.base import AbstractSimulator
+
+# The pressure of a fingertip, differentiable in its place, radius and force.
+
+
+PARAMETERS = ("x", "y", "radius", "force")
+"""What a fingertip is described by, m, m, m, N, in the order of the last axis."""
+
+
+class Fingertip:
+    """Pressure of discs with a soft rim on the cells of a body.
+
+    The pressure at a distance d from the centre is proportional to 1 / (1 + exp((d - radius) / rim)). A cell
+    has the mean of samples that are at most two rims apart. The part of a disc beyond the edge of the body is
+    cut off, and the rest carries the whole force.
+
+    Args:
+        body: what is touched; distances are those of its chart.
+        rim: m, over which the pressure falls by about a quarter of its maximum.
+    """
+
+    def __init__(self, body: AbstractBody, rim: float) -> None:
+        self._shape, self._rim = body.shape, rim
+        self._area = math.prod(body.cell)
+        x, y = (_samples(count, cell, rim) for count, cell in zip(body.cells, body.cell, strict=True))
+        self._x, self._y = x, y
+
+    def __call__(self, touches: Tensor) -> Tensor:
+        """Return the pressure (B, H, W), Pa, of touches (B, 4) as in :data:`PARAMETERS`, in their dtype."""
+        x, y, radius, force = touches[:, :, None, None].unbind(1)
+        across, down = self._x.to(touches) - x, self._y.to(touches)[:, None] - y
+        # The root of 0 has no derivative; a micrometre changes nothing.
+        distance = (across.square() + down.square() + 1e-12).sqrt()
+        share = torch.sigmoid((radius - distance) / self._rim)
+        height, width = self._shape
+        cells = share.unflatten(1, (height, -1)).unflatten(3, (width, -1)).mean((2, 4))
+        return force * cells / (self._area * cells.sum((1, 2), keepdim=True))
+
+
+def _samples(count: int, cell: float, rim: float) -> Tensor:
+    """Return sample points along an axis, m: equally many in each cell."""
+    each = max(1, math.ceil(cell / (2 * rim)))
+    return (torch.arange(count * each, dtype=torch.float64) + 0.5) * (cell / each)
+
+
+_RADIUS, _RIM = 0.008, 0.0015  # m, of the fingertip that probes a skin
+_AROUND = 8  # places at each distance from a sensor
+_UNIFORM = 1000.0  # Pa
+
+
+@torch.no_grad()
+def sensor_geometry(body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> Tensor:
+    """Return the columns :data:`skin.device.touches.GEOMETRY` of each sensor, (S, G), float32.
+
+    Responses are readings of ``model`` under a fingertip of 1 N at some distances from the sensor, the mean
+    over places around it that are on the surface, and under a uniform pressure, relative to the force on the
+    footprint.
+
+    Args:
+        body: the body.
+        sensors: S sensors.
+        model: of these sensors.
+    """
+    count = len(sensors)
+    parts = [
+        sensors.positions,
+        sensors.normals,
+        np.broadcast_to(sensors.footprint, (count, 2)),
+        np.broadcast_to(body.size, (count, 2)),
+        np.full((count, 1), body.thickness),
+    ]
+    uniform = model(torch.full((1, *body.shape), _UNIFORM)).readings[0]
+    share = uniform / (_UNIFORM * math.prod(sensors.footprint))
+    reaches = torch.stack([_response(body, sensors, model, reach) for reach in REACHES], dim=1)
+    known = torch.from_numpy(np.concatenate(parts, axis=1)).float()
+    found = torch.cat([known, share[:, None].float(), reaches.float()], dim=1)
+    assert found.shape == (count, len(GEOMETRY))
+    return found
+
+
+def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, reach: float) -> Tensor:
+    """Return the mean reading (S,), N, of each sensor under fingertips of 1 N at a distance, m."""
+    angles = np.linspace(0, 2 * np.pi, _AROUND if reach else 1, endpoint=False)
+    around = reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    places = sensors.positions[:, None, :2] + around
+    inside = ((places >= 0) & (places <= body.size)).all(axis=2)
+    inside |= ~np.any(
+        inside, axis=1, keepdims=True
+    )  # of a small body: beyond the edge is better than nowhere
+    owner, number = np.nonzero(inside)
+    rest = np.broadcast_to([_RADIUS, 1.0], (len(owner), 2))
+    touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), rest], axis=1))
+    rows = torch.arange(len(owner))
+    index = torch.from_numpy(owner)
+    fingertip = Fingertip(body, _RIM)
+    felt = torch.cat([model(fingertip(part).float()).readings for part in touches.split(64)])
+    total = torch.zeros(len(sensors)).index_add(0, index, felt[rows, index].float())
+    return total / torch.bincount(index, minlength=len(sensors))

@@ -1,0 +1,68 @@
+"""Largest strains of the top layer, which show whether the linear solution is valid."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from torch import Tensor
+
+from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator.base import factorised
+from skin.mechanics.simulator.plates import Structure
+
+# Components xx, yy, zz, yz, xz, xy, and how often each stands in the tensor.
+_PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+_TIMES = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+_NUMBERS_AT_ONCE = 2**24
+
+
+def squeeze(structure: Structure) -> np.ndarray:
+    """Return the compressive strain of the top layer of plates and beams, (nodes, cells), 1/Pa."""
+    moved = factorised(structure.stiffness()).solve(structure.load().toarray())
+    layers, rows, columns = structure.grid
+    down = -moved.reshape(layers, rows * columns, len(structure.free), -1)[:, :, structure.free.index(2)]
+    below = down[-2] if layers > 1 else 0.0
+    return (down[-1] - below) / structure.body.layers[-1].thickness
+
+
+def solid_rows(
+    mesh: Hexahedra, deep: int, read: Callable[[sp.csr_matrix], np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Yield the strain of the upper ``deep`` rows of elements at their middles, (6, elements, cells), 1/Pa.
+
+    Args:
+        mesh: of the body.
+        deep: rows of elements.
+        read: gives rows (R, 3 N) over the cells, (R, cells).
+    """
+    x, y, z = ((line[1:] + line[:-1]) / 2 for line in mesh.lines)
+    for depth in z[:deep]:
+        places = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
+        rows = mesh.strain(np.column_stack([places, np.full(len(places), depth)]))
+        yield np.stack([read(part) for part in rows])
+
+
+def largest(cells: Tensor, rows: Tensor) -> Tensor:
+    """Return the largest principal strain by size, (F,), under pressures on the cells (F, cells), Pa.
+
+    Where the strain tensor is largest by its norm; a single component is its own principal strain.
+
+    Args:
+        cells: (F, cells), Pa.
+        rows: (C, places, cells), 1/Pa, with C = 1, or 6 for xx, yy, zz, yz, xz, xy.
+    """
+    components, places, _ = rows.shape
+    strains = []
+    for part in cells.split(max(1, _NUMBERS_AT_ONCE // (components * places))):
+        strain = (part @ rows.flatten(0, 1).T).unflatten(-1, (components, places))
+        if components == 1:
+            strains.append(strain.abs().amax((1, 2)))
+            continue
+        at = (strain.square() * _TIMES[:, None]).sum(1).argmax(1)
+        worst = strain[torch.arange(len(part)), :, at]
+        tensor = worst.new_zeros(len(part), 3, 3)
+        for value, (i, j) in zip(worst.T, _PAIRS, strict=True):
+            tensor[:, i, j] = tensor[:, j, i] = value
+        strains.append(torch.linalg.eigvalsh(tensor).abs().amax(1))
+    return torch.cat(strains)

@@ -1,0 +1,1 @@
+"""Configuration, training, and finished runs and models."""

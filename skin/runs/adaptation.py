@@ -1,0 +1,454 @@
+"""Adapt a finished run to another skin: fine-tune its network on few gestures, if that is better.
+
+The gestures are split into folds with equal shares of each combination of labels. For each choice of layers
+and learning rate, and each fold, a copy of the network is trained on the other folds, and its loss on the
+fold is measured after each epoch. The choice and number of epochs with the lowest mean loss train on all
+gestures.
+
+The lowest of many losses is too low by chance. So the result is judged on each fold with the choice that has
+the lowest loss on the other folds. The network is changed only if this loss is lower than that of the
+original network by more than two standard errors of the difference, and the accuracy is not lower.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import islice, product
+from typing import Annotated, Any, Literal
+
+import torch
+from annotated_types import Ge, Le, MinLen
+from hydra import compose
+from omegaconf import DictConfig, OmegaConf
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from rich.console import Console
+from torch import Tensor, nn
+
+from skin.core.rng import Stream, generator
+from skin.core.settings import checked, configured
+from skin.device.base import AbstractDevice, Blank
+from skin.device.touches import Touches, touches_hash
+from skin.errors import InputError
+from skin.evaluation.metrics import compute_metrics
+from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
+from skin.evaluation.report import evaluate, metrics_table
+from skin.learning.classifier import TouchClassifier, probabilities
+from skin.learning.data import TouchData
+from skin.runs.alarm_threshold import alarm_point, threshold_device
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.configuration import plain, validate_config
+from skin.runs.finished_run import TAG, FinishedRun
+from skin.runs.progress import Steps
+from skin.runs.store import Store, note_reuse
+from skin.runs.train import describe, log_learner, log_report, tags
+from skin.touch.labels import Task
+
+ADAPTED = "adapted"
+"""Tag of an adapted run: the id of the run that it was made from."""
+LEAST = 8
+"""Smallest number of gestures to fine-tune on."""
+_DEFAULT = 48  # gestures of a simulated device
+_CLIP = 1.0  # largest norm of the gradient
+_CHUNK = 64  # gestures at a time when predicting
+_CLEAR = 2.0  # standard errors
+_COMMAND = ("adapt", "data", "evaluation")  # groups that are taken from the command, not from the run
+# Expected seconds of each step, for the share in the progress.
+_STEPS = {"loading the run": 10.0, "reading or simulating the gestures": 15.0}
+_STEPS |= {"choosing the threshold of the alarm": 15.0, "fine-tuning": 60.0, "evaluating the result": 40.0}
+
+Layers = Literal["head", "all"]
+
+
+@checked("adapt")
+@dataclass(frozen=True, kw_only=True)
+class FineTuning:
+    """Settings of a fine-tuning, explained in ``conf/adapt.yaml``; InputError where they are invalid."""
+
+    gestures: Annotated[int, Ge(LEAST)] | None = None
+    folds: Annotated[int, Ge(2), Le(LEAST)] = 4
+    layers: Annotated[Sequence[Layers], MinLen(1)] = ("head", "all")
+    lr: Annotated[Sequence[PositiveFloat], MinLen(1)] = (1e-4, 5e-4)
+    epochs: PositiveInt = 60
+    patience: PositiveInt = 10
+    batch_size: PositiveInt = 32
+    seed: NonNegativeInt = 0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A choice of layers and learning rate, with its held-out losses (E) and logits (E, B, L).
+
+    The first ones are those before the training, the others those after each epoch.
+    """
+
+    layers: Layers
+    lr: float
+    losses: list[float]
+    logits: Tensor
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """The result of a fine-tuning.
+
+    Attributes:
+        trials: all choices.
+        choice: the settings with which the network was trained; empty if it was not changed.
+        before: probabilities (B, L) of the gestures from the original network.
+        after: the same, of each from a network that was not trained on it, nor its settings chosen on it.
+    """
+
+    trials: list[Trial]
+    choice: str
+    before: Tensor
+    after: Tensor
+
+    @property
+    def better(self) -> bool:
+        """Whether ``after`` is better than ``before``. If not, the network is not changed."""
+        return bool(self.choice)
+
+
+def fine_tune(
+    network: TouchClassifier, data: TouchData, touches: Touches, settings: FineTuning
+) -> Adaptation:
+    """Fine-tune a network, in place, if that is better on held-out gestures.
+
+    Args:
+        network: trained.
+        data: representation and augmentation of the touches.
+        touches: B labelled gestures, at least one per fold.
+        settings: of the fine-tuning.
+
+    Raises:
+        InputError: gestures without labels.
+    """
+    folds = Folds(network, data, touches, settings)
+    with torch.random.fork_rng():
+        torch.manual_seed(settings.seed)
+        first = folds.logits(network.eval(), touches)
+        trials = [folds.attempt(first, layers, lr) for layers, lr in product(settings.layers, settings.lr)]
+        chosen, choice = min(trials, key=lambda trial: min(trial.losses)), ""
+        epochs, judged = _lowest(chosen.losses), folds.judged(trials)
+        if epochs > 0 and _is_better(network, first, judged, touches.known_labels):
+            choice = f"layers={chosen.layers} lr={chosen.lr:g} epochs={epochs}"
+            steps = folds.train(touches, chosen.layers, chosen.lr, settings.folds)
+            network.load_state_dict(next(islice(steps, epochs - 1, None)).state_dict())
+    return Adaptation(trials, choice, *(probabilities(logits, network.task) for logits in (first, judged)))
+
+
+def split_folds(labels: Tensor, count: int, seed: int) -> Tensor:
+    """Return the fold of each gesture, (B,), from 0 up, for labels (B, L).
+
+    Folds differ by at most one in size, and in the number of gestures with each combination of labels. The
+    gestures are dealt out in an order that the seed gives.
+    """
+    order = torch.randperm(len(labels), generator=torch.Generator().manual_seed(seed))
+    combination = torch.unique(labels > 0.5, dim=0, return_inverse=True)[1]
+    order = order[combination[order].argsort(stable=True)]
+    folds = torch.empty_like(order)
+    folds[order] = torch.arange(len(order)) % count
+    return folds
+
+
+@dataclass(frozen=True)
+class Folds:
+    """The arguments of :func:`fine_tune`, and the fold of each gesture, (B,), as ``fold``."""
+
+    network: TouchClassifier
+    data: TouchData
+    touches: Touches
+    settings: FineTuning
+
+    @cached_property
+    def fold(self) -> Tensor:
+        return split_folds(self.touches.known_labels, self.settings.folds, self.settings.seed)
+
+    def attempt(self, first: Tensor, layers: Layers, lr: float) -> Trial:
+        """Train on all folds but one, for each, epoch by epoch, until the held-out loss rises.
+
+        Args:
+            first: logits (B, L) of the original network.
+            layers: to train.
+            lr: learning rate.
+        """
+        settings, touches, labels = self.settings, self.touches, self.touches.known_labels
+        held = [self.fold == number for number in range(settings.folds)]
+        runs = [self.train(touches[~rows], layers, lr, number) for number, rows in enumerate(held)]
+        losses, logits = [float(self.network.loss(first, labels))], [first]
+        while len(losses) <= settings.epochs and len(losses) - _lowest(losses) <= settings.patience:
+            epoch = torch.empty_like(first)
+            for rows, run in zip(held, runs, strict=True):
+                epoch[rows] = self.logits(next(run), touches[rows])
+            losses.append(float(self.network.loss(epoch, labels)))
+            logits.append(epoch)
+        text = f"layers={layers} lr={lr:g}: held-out loss {losses[0]:.4f} before, {min(losses):.4f} after"
+        print(f"{text} {_lowest(losses)} epochs", file=sys.stderr, flush=True)
+        return Trial(layers, lr, losses, torch.stack(logits))
+
+    def judged(self, trials: Sequence[Trial]) -> Tensor:
+        """Return the logits (B, L) of each fold, of the choice with the lowest loss on the other folds."""
+        labels, judged = self.touches.known_labels, torch.empty_like(trials[0].logits[0])
+        candidates = torch.cat([trial.logits for trial in trials])
+        for number in range(self.settings.folds):
+            held = self.fold == number
+            losses = [float(self.network.loss(logits[~held], labels[~held])) for logits in candidates]
+            judged[held] = candidates[_lowest(losses)][held]
+        return judged
+
+    def train(self, touches: Touches, layers: Layers, lr: float, number: int) -> Iterator[TouchClassifier]:
+        """Yield a copy of the network after each epoch; ``number`` selects the order of the gestures."""
+        network = deepcopy(self.network).requires_grad_(False)
+        trained = network.head if layers == "head" else network
+        parameters = list(trained.requires_grad_(True).parameters())
+        optimizer = torch.optim.Adam(parameters, lr)
+        draw = torch.Generator().manual_seed(1000 * self.settings.seed + number)
+        augmentation = self.data.augmentation
+        while True:
+            network.train()
+            for module in network.modules():
+                # Few gestures of one skin would spoil their statistics.
+                if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
+                    module.eval()
+            for rows in torch.randperm(len(touches), generator=draw).split(self.settings.batch_size):
+                batch = touches[rows]
+                frames, labels = self.data.frames(augmentation(batch, draw) if augmentation else batch)
+                optimizer.zero_grad()
+                network.loss(network(frames), labels).backward()
+                nn.utils.clip_grad_norm_(parameters, _CLIP)
+                optimizer.step()
+            yield network.eval()
+
+    @torch.no_grad()
+    def logits(self, network: TouchClassifier, touches: Touches) -> Tensor:
+        """Return the logits (B, L) of a network in evaluation mode."""
+        starts = range(0, len(touches), _CHUNK)
+        return torch.cat([network(self.data.frames(touches[at : at + _CHUNK])[0]) for at in starts])
+
+
+def _lowest(losses: Sequence[float]) -> int:
+    """Return the place of the lowest loss, the first of equal ones."""
+    return min(range(len(losses)), key=losses.__getitem__)
+
+
+def _is_better(network: TouchClassifier, first: Tensor, last: Tensor, labels: Tensor) -> bool:
+    """Return whether the loss is lower by more than two standard errors, and the accuracy is not lower."""
+    pairs = zip(first.split(1), last.split(1), labels.split(1), strict=True)
+    gain = torch.stack([network.loss(old, truth) - network.loss(new, truth) for old, new, truth in pairs])
+    before, after = (
+        compute_metrics(probabilities(logits, network.task), labels, network.task)["overall/accuracy"]
+        for logits in (first, last)
+    )
+    return bool(gain.mean() > _CLEAR * gain.std() / len(gain) ** 0.5) and after >= before
+
+
+@dataclass(frozen=True)
+class Target:
+    """A skin to adapt a run to.
+
+    Attributes:
+        device: the skin, or its recording.
+        twin: a simulated device with the body and layout of the skin. Its imperfections are those of the run,
+            or of ``evaluation.profile``.
+        config: of the adapted run.
+    """
+
+    device: AbstractDevice
+    twin: AbstractDevice
+    config: DictConfig
+
+
+def find_target(
+    parent: FinishedRun, config: DictConfig, settings: FineTuning, overrides: Sequence[str]
+) -> Target:
+    """Return the skin that a command describes.
+
+    Args:
+        parent: the run to adapt.
+        config: of the command.
+        settings: of the fine-tuning.
+        overrides: of the command line.
+
+    Raises:
+        InputError: no skin is given, or its gestures have other labels than the run.
+    """
+    words = [word for word in overrides if _group(word) not in _COMMAND]
+    measured = parent.configured(config, words)
+    if "test" in measured.device:  # a recording, which is used as a whole
+        measured = _changed(measured, device={"test": "all"})
+    # The device of the run, on this skin: its fresh gestures determine the threshold of the alarm.
+    words = [word for word in words if _group(word) not in ("device", "profile")]
+    words += [] if "simulator" in parent.stored.device else ["device=simulated"]
+    simulated = _changed(
+        parent.configured(compose("adapt", words), words), evaluation=plain(config)["evaluation"]
+    )
+    device, twin = build_device(measured), threshold_device(simulated, simulated)
+    _check(parent, device, twin)
+    drawn = device.simulation is not None
+    budget = simulated_budget(settings.gestures or _DEFAULT)
+    gestures = {"gestures": budget, "fresh": False} if drawn else {}
+    identity = {"run": parent.run.data.tags["fingerprint"], "device": plain(measured)["device"]}
+    adapted = _changed(
+        measured if drawn else simulated,
+        adapt=asdict(settings) | identity,
+        data=gestures | {"augment": plain(config)["data"]["augment"]},
+        device=gestures | ({"data_seed": settings.seed} if drawn else {}),
+        evaluation=plain(config)["evaluation"],
+        row=f"{parent.stored.row.removesuffix('_adapted')}_adapted",
+    )
+    return Target(device, twin, adapted)
+
+
+def _group(override: str) -> str:
+    """Return the group of an override."""
+    return override.lstrip("+~").split("=")[0].split(".")[0]
+
+
+def _changed(config: DictConfig, row: str | None = None, **groups: dict[str, Any]) -> DictConfig:
+    """Return a configuration with other values in its groups, and perhaps another name."""
+    whole = plain(config) | ({"row": row} if row else {})
+    changes = {name: (whole.get(name) or {}) | values for name, values in groups.items()}
+    return validate_config(OmegaConf.create(whole | changes))
+
+
+def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) -> None:
+    """Raise InputError if a device is not one skin, or has other labels than the run."""
+    if device.simulation is None and device.reference is not None:
+        raise InputError(
+            f"run {parent.identity} was trained on many skins: name the one to adapt to, as in "
+            "device=recording device.path=session.parquet or device=simulated layout.path=sensors.csv"
+        )
+    if device.task != twin.task:
+        raise InputError(
+            f"run {parent.identity} predicts {', '.join(twin.task.names)}, the gestures have the labels "
+            f"{', '.join(device.task.names)}: give gestures with the labels of the run"
+        )
+
+
+def choose_gestures(device: AbstractDevice, settings: FineTuning) -> tuple[Touches, AbstractDevice | None]:
+    """Return the gestures to fine-tune on, and a device with others for the report.
+
+    A simulated device draws as many as are wanted: the training split that ``skin train`` has with
+    ``data.gestures`` = n / 0.8 and the same seed. The others are its test gestures. For all other devices, a
+    part of the touches of :meth:`AbstractDevice.all_touches` is drawn, and the others are what is left.
+
+    Raises:
+        InputError: there are fewer gestures than wanted, or than can be used.
+    """
+    if device.simulation is not None:
+        count = settings.gestures or _DEFAULT
+        budget = {"gestures": simulated_budget(count), "fresh": False, "data_seed": settings.seed}
+        drawn = device.simulation.replace(**budget)
+        return drawn.touches("train")[:count], drawn
+    touches = device.all_touches()
+    touches.known_labels  # noqa: B018 - raises InputError without labels
+    count = settings.gestures or len(touches)
+    if len(touches) < LEAST:
+        raise InputError(f"{len(touches)} gestures are too few to adapt to a skin: record {LEAST} or more")
+    if count > len(touches):
+        raise InputError(
+            f"adapt.gestures={count} is more than the {len(touches)} gestures of the device: "
+            f"use adapt.gestures={len(touches)}"
+        )
+    order = torch.from_numpy(generator(Stream.SPLIT, settings.seed).permutation(len(touches)))
+    left = touches[order[count:]]
+    return touches[order[:count]], Blank(device.task, device.size, left) if len(left) else None
+
+
+def simulated_budget(count: int) -> int:
+    """Return the budget of gestures whose training split, 80 %, has ``count`` of them or one more."""
+    return -(-count * 10 // 8)
+
+
+def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Adapt a finished run to the skin of a configuration: log a new run and print the figures.
+
+    Nothing is done if a run with the same fingerprint has finished, unless ``tracking.resume=false``.
+
+    Args:
+        config: of ``skin adapt``.
+        overrides: of the command line.
+
+    Raises:
+        InputError: the run is no network or does not fit the skin, the gestures have no labels, or there are
+            fewer than wanted.
+    """
+    with Steps(_STEPS) as steps:
+        _adapt(config, overrides, steps)
+
+
+def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
+    settings = configured(FineTuning, plain(config)["adapt"], "adapt")
+    if config.tracking.threads:
+        torch.set_num_threads(config.tracking.threads)
+    parent = FinishedRun.named(config)
+    target = find_target(parent, config, settings, overrides)
+    identity = tags(target.config) | {ADAPTED: parent.identity, "target": " ".join(overrides)}
+    if config.tracking.resume and (
+        earlier := parent.store.find("FINISHED", fingerprint=identity["fingerprint"])
+    ):
+        note_reuse(earlier[0])
+        print(f"run {earlier[0].info.run_id} did this before: tracking.resume=false repeats it")
+        return
+    learner, data = build_learner(target.config), build_data(target.config, target.device.blank())
+    parent.load_weights(learner, data)
+    network = learner.network  # refuses another learner before gestures are read from a port
+    steps.begin("reading or simulating the gestures")
+    steps.silent = target.device.real
+    touches, others = choose_gestures(target.device, settings)
+    steps.silent = False
+    steps.begin("choosing the threshold of the alarm")
+    task, evaluation = target.device.task, target.config.evaluation
+    point = alarm_point(parent, learner, target.config, one_skin=True, device=target.twin)
+    figures: dict[str, float] = {}
+    if others is not None:
+        tests = others.touches("test")
+        figures = _figures("before", learner.probabilities(tests), tests, task, point)
+    name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
+    store = Store.open(config.tracking)
+    with store.run(name, identity, parent.identity) as run:
+        describe(store, run.info.run_id, target.config, touches_hash(touches))
+        steps.begin("fine-tuning")
+        adaptation = fine_tune(network, data, touches, settings)
+        log_learner(store, run, learner)
+        steps.begin("evaluating the result")
+        if adaptation.better and point is not None:
+            point = choose_operating_point(learner, target.twin, evaluation)
+        figures |= _figures("validation_before", adaptation.before, touches, task)
+        after = adaptation.after if adaptation.better else adaptation.before
+        figures |= _figures("validation", after, touches, task)
+        if others is None:
+            store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
+            store.log_metrics(run, figures)
+        else:
+            report = evaluate(learner, others, evaluation, point)
+            log_report(store, run, report, task, figures)
+            same = {key: value for key, value in report.metrics.items() if key.startswith("same/")}
+            figures |= same
+        store.client.log_text(run.info.run_id, _table(adaptation.trials), "adapt.csv")
+        store.client.set_tag(run.info.run_id, "chosen", adaptation.choice)
+    Console().print(metrics_table(figures, f"{name}, run {run.info.run_id}"))
+    about = "validation: the gestures to adapt on, each predicted by a network that was not trained on it"
+    print(about, "" if others is None else "; before, same: other gestures of the skin", sep="")
+    unchanged = "fine-tuning is not better on held-out gestures: the new run keeps the weights of run "
+    print(f"fine-tuned: {adaptation.choice}" if adaptation.better else f"{unchanged}{parent.identity}")
+
+
+def _figures(
+    column: str, chances: Tensor, touches: Touches, task: Task, point: OperatingPoint | None = None
+) -> dict[str, float]:
+    """Return the metrics of predictions (B, L) of gestures, as ``column/name``."""
+    figures = compute_metrics(chances, touches.known_labels, task, point)
+    return {f"{column}/{name}": value for name, value in figures.items()}
+
+
+def _table(trials: Sequence[Trial]) -> str:
+    """Return the held-out loss of each trial and epoch as CSV."""
+    rows = [
+        f"{trial.layers},{trial.lr:g},{epoch},{loss:.6f}"
+        for trial in trials
+        for epoch, loss in enumerate(trial.losses)
+    ]
+    return "\n".join(["layers,lr,epoch,loss", *rows, ""])

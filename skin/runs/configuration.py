@@ -1,0 +1,321 @@
+"""The configuration: its schema and its fingerprint.
+
+Only Hydra is imported here: ``--help`` and a mistyped key must not import torch.
+"""
+
+import hashlib
+import json
+import platform
+import re
+import subprocess
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from skin import __version__
+from skin.core.files import BUNDLED, MANIFEST, ROOT, candidates
+
+from skin.core import interrupt  # noqa: F401  # isort: skip
+import socket
+from dataclasses import dataclass, field
+from math import isnan
+from typing import cast
+from urllib.parse import urlsplit
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from skin.core.messages import one_line
+from skin.errors import InputError
+from skin.evaluation.settings import Evaluation
+
+# What a result depends on: a hash of configuration, the files it names, and version; code and processor.
+
+
+MACHINE = ("accelerator", "devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
+"""Settings of Lightning's Trainer that choose the machine, not the result."""
+_FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
+
+
+def config_hash(content: dict[str, Any]) -> str:
+    """Return the hash of a configuration in plain containers, 16 hexadecimal digits."""
+    files = {value: _hash_of(value) for value in _strings(content) if _file(value)}
+    text = json.dumps([_without_machine(content), files, __version__], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _without_machine(value: Any, group: str = "") -> Any:
+    """Return a configuration without :data:`MACHINE`."""
+    if not isinstance(value, dict):
+        return value
+    left_out = MACHINE if group == "trainer" else ()
+    return {key: _without_machine(entry, key) for key, entry in value.items() if key not in left_out}
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for entry in value.values():
+            yield from _strings(entry)
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _strings(entry)
+
+
+def _file(name: str) -> Path | None:
+    """Return the file that a setting names, the manifest of a data set, or None."""
+    plain = "/" not in name and "." not in name
+    try:
+        paths = [path / MANIFEST if plain or path.is_dir() else path for path in candidates(name)]
+        return next((found for found in paths if found.is_file()), None)
+    except OSError:
+        return None
+
+
+def _hash_of(name: str) -> str:
+    path = _file(name)
+    if path is None:
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def source_tags() -> dict[str, str]:
+    """Return the tags ``source_commit`` and ``source_dirty`` of the code, and ``processor``.
+
+    ``source_commit`` is the last commit that changed the code; without git, the version of the package.
+    ``source_dirty`` is ``true`` if files differ from that commit, ``false`` if none does, and ``unknown``
+    without git.
+    """
+    commit, dirty = _git("log", "-1", "--format=%H", "--", *_FOLDERS), "unknown"
+    if commit:
+        dirty = "true" if _git("status", "--porcelain", "--", *_FOLDERS) else "false"
+    return {
+        "source_commit": commit or __version__,
+        "source_dirty": dirty,
+        "processor": _processor(),
+    }
+
+
+def _git(*arguments: str) -> str | None:
+    """Return the output of git in the repository; None without git."""
+    if BUNDLED != ROOT:  # a wheel, which may be installed inside another repository
+        return None
+    try:
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _processor() -> str:
+    """Return the name of the processor, with its family and model where the system tells them."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        text = ""
+    known = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+    if not known:
+        return platform.processor() or platform.machine() or "unknown"
+    return ", ".join(
+        part for part in (
+            known.get("model name"),
+            f"family {known['cpu family']}" if "cpu family" in known else None,
+            f"model {known['model']}" if "model" in known else None,
+        ) if part
+    )  # fmt: skip
+
+
+_TOO_LARGE = 2**63
+_PATIENCE = 5.0  # s until a server that accepts no connection counts as away
+
+# Settings without effect on results.
+_STEERING = ("shard", "tracking", "trust")
+
+
+@dataclass
+class Data:
+    """How many gestures a training draws (``conf/data``)."""
+
+    name: str
+    gestures: int
+    padded: bool
+    fresh: bool
+    batch_size: int
+    stream: bool
+    direction: bool
+    augment: dict[str, Any]
+
+
+@dataclass
+class Tracking:
+    """Where runs are logged, and whether finished ones are skipped (``conf/train.yaml``)."""
+
+    uri: str | None
+    artifacts: str | None
+    experiment: str
+    resume: bool
+    threads: int | None
+
+
+@dataclass
+class Config:
+    """Top-level keys of a configuration; groups without a type here are checked by their class."""
+
+    row: str | None = None
+    seed: int | None = None
+    epochs: dict[str, int] | None = None
+    touch: dict[str, Any] | None = None
+    body: dict[str, Any] | None = None
+    layout: dict[str, Any] | None = None
+    simulator: dict[str, Any] | None = None
+    device: dict[str, Any] | None = None
+    representation: dict[str, Any] | None = None
+    model: dict[str, Any] | None = None
+    fusion: dict[str, Any] | None = None
+    learner: dict[str, Any] | None = None
+    data: Data | None = None
+    optimizer: dict[str, Any] | None = None
+    trainer: dict[str, Any] | None = None
+    evaluation: Evaluation | None = None
+    tracking: Tracking | None = None
+    contact: dict[str, Any] | None = None
+    shard: str | None = None
+    # What a command other than training adds.
+    run: str | None = None
+    name: str | None = None
+    licence: str | None = None
+    trust: bool = False
+    n: int | None = None
+    out: str | None = field(default=None)
+    view: str | None = None
+    labels: list[str] | None = None
+    shape: str | None = None
+    index: int | None = None
+    session: str | None = None
+    presses: str | None = None
+    calibrate: dict[str, Any] | None = None
+    port: str | None = None
+    link: str | None = None
+    seconds: float | None = None
+    web: bool | None = None
+    demo: bool | None = None
+    live: dict[str, Any] | None = None
+    export: dict[str, Any] | None = None
+    gestures: int | None = None
+    format: str | None = None
+    emulate: dict[str, Any] | None = None
+    faults: dict[str, Any] | None = None
+    record: dict[str, Any] | None = None
+    compare: dict[str, Any] | None = None
+    study: dict[str, Any] | None = None
+    smoke: bool | None = None
+    table: dict[str, Any] | None = None
+    results: dict[str, Any] | None = None
+    design: dict[str, Any] | None = None
+    adapt: dict[str, Any] | None = None
+
+
+def is_server(uri: str | None) -> bool:
+    """Return whether a tracking URI is the address of a server, not of a database."""
+    return uri is not None and uri.startswith(("http://", "https://"))
+
+
+def answers(uri: str | None) -> bool:
+    """Return whether the server of a tracking URI accepts connections; True for a database."""
+    if uri is None or not is_server(uri):
+        return True
+    place = urlsplit(uri)
+    port = place.port or (443 if place.scheme == "https" else 80)
+    try:
+        socket.create_connection((place.hostname or "", port), timeout=_PATIENCE).close()
+    except OSError:
+        return False
+    return True
+
+
+def check_server(uri: str | None) -> None:
+    """Check that the server of a tracking URI answers, before anything heavy is imported.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not answers(uri):
+        raise InputError(
+            f"the tracking server {uri} does not answer: start it, open the tunnel to it, or correct "
+            "tracking.uri; without it, finished runs are not known, and nothing begins"
+        )
+
+
+def validate_config(config: DictConfig) -> DictConfig:
+    """Return a configuration that fits the schema, read-only.
+
+    Raises:
+        InputError: a key or a value does not fit.
+    """
+    try:
+        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+    except OmegaConfBaseException as error:
+        raise InputError(one_line(error)) from error
+    assert isinstance(whole, DictConfig)
+    # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
+    for name, reason in _not_numbers(OmegaConf.to_container(whole)):
+        raise InputError(f"{name} is {reason}: give a number")
+    OmegaConf.set_readonly(whole, True)
+    return whole
+
+
+def refuse_null_groups(config: DictConfig) -> None:
+    """Raise InputError where a group of a composed configuration was replaced by null.
+
+    Args:
+        config: as Hydra composes it; groups that a command does not have are missing in it.
+    """
+    groups = {
+        name for name, hint in Config.__annotations__.items() if "dict" in str(hint) or "skin." in str(hint)
+    }
+    for name in sorted(groups & set(config)):
+        if config[name] is None:
+            raise InputError(
+                f"{name}=null leaves nothing to use: give settings or an option, or leave it out"
+            )
+
+
+def _not_numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the names of settings that are NaN or too large, with what they are."""
+    if isinstance(value, float) and isnan(value):
+        yield name, "nan"
+    elif isinstance(value, int) and abs(value) >= _TOO_LARGE:
+        yield name, "too large"
+    elif isinstance(value, dict | list):
+        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _not_numbers(one, f"{name}.{key}" if name else str(key))
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Return a configuration with every interpolation resolved, as plain containers.
+
+    Raises:
+        InputError: an interpolation cannot be resolved.
+    """
+    try:
+        return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except OmegaConfBaseException as error:
+        raise InputError(one_line(error)) from error
+
+
+def fingerprint(config: DictConfig) -> str:
+    """Return a hash of everything that results depend on: configuration, files it names, version."""
+    # Unset keys belong to other commands; a new command must not change the fingerprint of finished runs.
+    groups = plain(config).items()
+    content = {key: value for key, value in groups if key not in _STEERING and value is not None}
+    return config_hash(content)
+
+
+def overrides() -> list[str]:
+    """Return the overrides on the command line of the running command."""
+    return list(HydraConfig.get().overrides.task)

@@ -1,0 +1,469 @@
+"""An exported network: the description in its ONNX file, its skin, and how ONNX Runtime runs it safely.
+
+torch is not imported.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from math import log
+from pathlib import Path
+from threading import Thread
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, MinLen
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from skin.body.sensors import Sensors
+from skin.core.files import json_line
+from skin.core.safe_loading import KEY as CHECKSUM
+from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file
+from skin.core.settings import ONCE, check_groups, check_targets, configured
+from skin.errors import InputError
+from skin.runs.configuration import plain
+from skin.runs.overrides import apply_overrides
+from skin.runs.trained_model import TrainedModel
+from skin.touch.labels import Task
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+    from onnxruntime import InferenceSession
+
+KEY = "tactile_skin"
+"""Key of the description, JSON, in the metadata of the file."""
+
+SCHEMA = 1
+"""Version of the description and of the inputs and outputs."""
+
+
+@dataclass(frozen=True)
+class ModelMetadata:
+    """What a program must know to use an exported network.
+
+    Attributes:
+        run: id of the run.
+        title: name of the run.
+        version: of this package.
+        labels: names of the outputs.
+        kind, gate, direction: as in :class:`skin.touch.labels.Task`.
+        rate: Hz, of the frames in a window.
+        window: T, frames.
+        positions: of the sensors, (x, y, z), m.
+        size: extent (x, y) of the sheet, m.
+        saturation: largest force that the sensors of the training measured, N; None if unknown.
+        threshold: a touch is dangerous where its probability is greater; None without that label.
+        contact: N above the baseline that count as touch.
+        learned: whether the label ``touch`` counts as touch, too.
+        longest: s, longest touch of the training.
+        skin: settings of the body, the layout, the simulator, the touches and the evaluation that the network
+            was exported with; None if unknown, as in files of earlier versions.
+        thresholds: rate of a device, Hz -> threshold at which safe touches raise the alarm of the live view
+            as seldom as wanted; None: only ``threshold``, chosen for single windows.
+        presses: (S, S), N, readings of a press at the limit of ``dangerous`` on each sensor; None if unknown.
+    """
+
+    run: str
+    title: str
+    version: str
+    labels: Annotated[list[str], MinLen(1), ONCE]
+    kind: Literal["binary", "exclusive"]
+    gate: str | None
+    direction: bool
+    rate: Annotated[float, Gt(0)]
+    window: Annotated[int, Ge(1)]
+    positions: Annotated[list[tuple[float, float, float]], MinLen(1)]
+    size: tuple[float, float]
+    saturation: float | None
+    threshold: float | None
+    contact: Annotated[float, Gt(0)]
+    learned: bool
+    longest: Annotated[float, Gt(0)]
+    skin: dict[str, Any] | None = None
+    thresholds: dict[str, float] | None = None
+    presses: list[list[float]] | None = None
+
+    @property
+    def task(self) -> Task:
+        """The labels."""
+        return Task(tuple(self.labels), self.kind, self.gate, self.direction)
+
+    def text(self) -> str:
+        """Return the description as JSON, with its schema and the number of sensors."""
+        return json_line({"schema": SCHEMA, "sensors": len(self.positions), **asdict(self)})
+
+    @classmethod
+    def parse(cls, entries: Mapping[str, str], path: str) -> "ModelMetadata":
+        """Return the description in the metadata of a file.
+
+        Args:
+            entries: the metadata.
+            path: of the file, for messages.
+
+        Raises:
+            InputError: the description is missing, of another schema, or damaged.
+        """
+        again = "write it again with skin export"
+        if KEY not in entries:
+            raise InputError(f"{path} was not written by skin export: it describes no labels and no sensors")
+        try:
+            known = json.loads(entries[KEY])
+            schema, sensors = known.pop("schema"), known.pop("sensors")
+        except (ValueError, KeyError, AttributeError, TypeError) as error:
+            raise InputError(f"{path} has a damaged description: {again}") from error
+        if schema != SCHEMA:
+            raise InputError(f"{path} has schema {schema}, this version reads {SCHEMA}: {again}")
+        found = configured(cls, known, f"description of {path}")
+        if len(found.positions) != sensors:
+            raise InputError(f"{path} has {len(found.positions)} positions for {sensors} sensors: {again}")
+        return found
+
+
+_NAMES = """
+Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh AveragePool BatchNormalization Cast
+CastLike Ceil Celu Clip Concat Constant ConstantOfShape Conv ConvTranspose Cos Cosh CumSum
+DepthToSpace Div Dropout Einsum Elu Equal Erf Exp Expand EyeLike Flatten Floor GRU Gather
+GatherElements GatherND Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GridSample
+GroupNormalization HardSigmoid HardSwish Identity InstanceNormalization IsInf IsNaN LSTM
+LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max MaxPool Mean Min Mish Mod
+Mul Neg Not Or PRelu Pad Pow RNN Range Reciprocal ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp
+ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare Relu Reshape Resize Round
+ScatterElements ScatterND Selu Shape Sigmoid Sign Sin Sinh Size Slice Softmax Softplus Softsign
+SpaceToDepth Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Tile TopK Transpose Trilu Unsqueeze
+Where Xor
+"""
+OPERATORS = frozenset(_NAMES.split())
+"""Operators that a file may use: each computes tensors from tensors, without loops, branches or chance."""
+
+# Operator -> its inputs that determine the size of its output. They may not depend on readings, so that a
+# window of zeros needs as much time and memory as any other.
+_SIZES = {
+    "ConstantOfShape": (0,),
+    "Expand": (1,),
+    "Pad": (1, 3),
+    "Range": (0, 1, 2),
+    "Reshape": (1,),
+    "Resize": (1, 2, 3),
+    "Slice": (1, 2, 3, 4),
+    "Split": (1,),
+    "Squeeze": (1,),
+    "Tile": (1,),
+    "TopK": (1,),
+    "Unsqueeze": (1,),
+}
+_BYTES = 1 << 28  # of a file: ten times the largest network of this package
+_NODES = 20_000  # ten times an ensemble of the largest ones
+_FLOAT, _BOOL, _EXTERNAL = 1, 9, 1  # TensorProto.DataType, TensorProto.DataLocation
+
+
+def inspect(path: Path) -> tuple[bytes, ModelMetadata]:
+    """Return the content of an ONNX file and the description of its network.
+
+    Raises:
+        InputError: the file is none of ``skin export``, is damaged, or could do something else than to
+            compute probabilities of readings.
+    """
+    try:
+        from google.protobuf.message import DecodeError
+        from onnx import ModelProto
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "an ONNX model needs onnx and onnxruntime: pip install onnx onnxruntime, or "
+            "'tactile-skin[export]'"
+        ) from error
+    if not path.exists():
+        raise InputError(f"there is no file {path}: skin export run=latest out={path} writes one")
+    try:
+        content = read_file(path, _BYTES)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the model {path}: {error}") from error
+    try:
+        model = ModelProto.FromString(content)
+    except DecodeError as error:
+        raise InputError(f"{path} is no model that ONNX Runtime can load: export it again") from error
+    entries = {entry.key: entry.value for entry in model.metadata_props}
+    metadata = ModelMetadata.parse(entries, str(path))
+    _check_interface(model, metadata, path)
+    try:
+        check_content(content)
+        _check(model, entries)
+    except ValueError as error:
+        wrong = "" if isinstance(error, ChecksumError) else "is no file of skin export: "
+        raise InputError(f"{path}: {wrong}{error}: export it again") from error
+    return content, metadata
+
+
+def _check_interface(model: "ModelProto", metadata: ModelMetadata, path: Path) -> None:
+    """Raise InputError unless inputs and outputs are those of ``docs/export.md``."""
+    shape, types = [metadata.window, len(metadata.positions)], {"readings": _FLOAT, "valid": _BOOL}
+    tensors = {value.name: value.type.tensor_type for value in model.graph.input}
+    inputs = {name: [axis.dim_value for axis in tensor.shape.dim][1:] for name, tensor in tensors.items()}
+    outputs = [value.name for value in model.graph.output]
+    if inputs != dict.fromkeys(types, shape) or outputs != ["probabilities"]:
+        raise InputError(
+            f"{path} has inputs {inputs}, not readings and valid of {shape}, or other outputs than "
+            "probabilities: export it again"
+        )
+    if types != {name: tensor.elem_type for name, tensor in tensors.items()}:
+        raise InputError(f"{path} has inputs of other types than float and bool: export it again")
+
+
+def _check(model: "ModelProto", entries: dict[str, str]) -> None:
+    """Raise a ValueError where a file has what no network needs."""
+    graph = model.graph
+    if other := sorted(set(entries) - {KEY, CHECKSUM}):
+        raise ValueError(f"it has the unknown entry {other[0]!r}")
+    if len(graph.node) > _NODES:
+        raise ValueError(f"it has {len(graph.node)} operators")
+    if model.functions or graph.sparse_initializer or model.training_info:
+        raise ValueError("it has functions, sparse tensors or a training")
+    # Whose content would be another file, perhaps a device.
+    if any(tensor.data_location == _EXTERNAL or tensor.external_data for tensor in _tensors(model)):
+        raise ValueError("it refers to other files")
+    known = {value.name for value in graph.input}
+    for node in graph.node:
+        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+            raise ValueError(f"it uses the operator {node.domain} {node.op_type}".replace("  ", " "))
+        if any(attribute.HasField("g") or attribute.graphs for attribute in node.attribute):
+            raise ValueError(f"{node.op_type} has a graph inside")
+        _follow(node, known)
+
+
+def _tensors(model: "ModelProto") -> Iterator:
+    yield from model.graph.initializer
+    for node in model.graph.node:
+        for attribute in node.attribute:
+            yield from (attribute.t, *attribute.tensors)
+
+
+def _follow(node, known: set[str]) -> None:  # type: ignore[no-untyped-def]
+    """Add the outputs of an operator to the names of tensors that depend on readings, if they do.
+
+    Raises:
+        ValueError: the size of its output depends on readings.
+    """
+    sizes = {node.input[place] for place in _SIZES.get(node.op_type, ()) if place < len(node.input)}
+    if sizes & known:
+        raise ValueError(f"the size of what {node.op_type} returns depends on readings")
+    if node.op_type not in ("Shape", "Size") and known & set(node.input):
+        known.update(node.output)
+
+
+_SECONDS = 20.0  # s to load a file and to classify a window, which takes some ms
+_MEMORY = 1 << 30  # bytes that it may take
+
+
+class ExportedModel(TrainedModel):
+    """A network that ``skin export`` wrote.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        path: as above.
+        metadata: its description.
+
+    Raises:
+        InputError: ONNX or ONNX Runtime is missing, the file cannot be used or is damaged, or it takes more
+            time or memory than a network needs.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path).expanduser()
+        content, about = inspect(self.path)
+        self.metadata, self.identity, self.title, self.task = about, about.run, about.title, about.task
+        self.window, self.rate, self.size, self.threshold = (
+            about.window,
+            about.rate,
+            about.size,
+            about.threshold,
+        )
+        self.positions = np.array(about.positions)
+        self._try(content, self.path)
+
+    @property
+    def contact(self) -> float:
+        """N above the baseline that count as touch."""
+        return self.metadata.contact
+
+    @property
+    def learned(self) -> bool:
+        """Whether the label ``touch`` counts as touch, too."""
+        return self.metadata.learned
+
+    @property
+    def longest(self) -> float:
+        """Longest touch of the training, s."""
+        return self.metadata.longest
+
+    @property
+    def presses(self) -> np.ndarray | None:
+        """Readings of a press at the limit of ``dangerous`` on each sensor, (S, S), N; None: unknown."""
+        return None if self.metadata.presses is None else np.array(self.metadata.presses)
+
+    def threshold_at(
+        self, rate: float, patience: float, aligned: bool, say: Callable[[str], None]
+    ) -> float | None:
+        """Return the threshold in the file for the rate that is nearest; None for a model without alarm."""
+        threshold, thresholds = self.threshold, self.metadata.thresholds
+        if threshold is None:
+            return None
+        if thresholds:
+            nearest = min(thresholds, key=lambda known: abs(log(float(known) / rate)))
+            say(f"the device sends {rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
+            threshold = thresholds[nearest]
+        else:
+            say("the threshold was chosen for single windows: a touch has many, and raises more false alarms")
+        if threshold >= 1:
+            raise InputError(
+                f"{self.path} has no threshold that raises an alarm: give live.patience.above=0.5"
+            )
+        say(f"alarm above {threshold:.4f}")
+        return threshold
+
+    def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return the probability of each label, (B, L), float32.
+
+        Args:
+            readings: (B, T, S), float32, N.
+            valid: (B, T, S), bool.
+        """
+        return self._session.run(["probabilities"], {"readings": readings, "valid": valid})[0]  # type: ignore[return-value]
+
+    def _try(self, content: bytes, path: Path) -> None:
+        """Load a file and classify a window of zeros, as costly as any other, in bounded time and memory."""
+        _runtime()  # imported before memory is limited
+        shape = 1, self.metadata.window, len(self.metadata.positions)
+        results: list[np.ndarray | BaseException] = []
+
+        def classify() -> None:
+            try:
+                self._session = _open(content)
+                results.append(self.probabilities(np.zeros(shape, np.float32), np.ones(shape, bool)))
+            except BaseException as error:  # those of ONNX Runtime share no other base
+                results.append(error)
+
+        thread = Thread(target=classify, name="skin-trial", daemon=True)
+        with limited_memory(_MEMORY):
+            thread.start()
+            thread.join(_SECONDS)
+        if not results:
+            raise InputError(f"{path} needs more than {_SECONDS:g} s for a window: export it again")
+        (result,) = results
+        if isinstance(result, InputError):
+            raise result
+        if isinstance(result, BaseException):
+            raise InputError(f"{path} is no model that ONNX Runtime can load: export it again") from result
+        labels = len(self.metadata.labels)
+        if result.shape != (1, labels) or result.dtype != np.float32 or not np.isfinite(result).all():
+            raise InputError(f"{path} does not give probabilities of its {labels} labels: export it again")
+
+
+def _runtime() -> ModuleType:
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "an ONNX model needs ONNX Runtime: pip install onnxruntime, or 'tactile-skin[export]'"
+        ) from error
+    return onnxruntime
+
+
+def _open(content: bytes) -> "InferenceSession":
+    """Return a session on one thread: a window alone is too small to be shared among threads."""
+    runtime = _runtime()
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # its errors are reported by the caller
+    return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+GROUPS = ("body", "layout", "simulator", "touch", "evaluation")
+"""Groups of settings that describe the skin of a network and how its threshold was chosen."""
+
+# What an exported network leaves to the command line.
+_FREE = ("device", "live", "web", "seconds", "run", "trust", "tracking", "hydra")
+_CLOSE = 1e-6  # m; positions in the file are single precision
+
+
+def describe_skin(config: DictConfig, positions: np.ndarray) -> dict[str, Any] | None:
+    """Return the settings of the skin of a network, for its file.
+
+    Args:
+        config: of the run, with the skin that it is exported for.
+        positions: of its sensors, (S, 3), m.
+
+    Returns:
+        The groups :data:`GROUPS`, plain; None if the sensors are not those of the configuration, such as
+        those of a recording.
+    """
+    groups = {name: value for name, value in plain(config).items() if name in GROUPS}
+    return groups if _at(_sensors(groups), positions) else None
+
+
+def check_overrides(path: str, composed: DictConfig, overrides: Sequence[str]) -> None:
+    """Check that overrides do not contradict an exported network.
+
+    Args:
+        path: of its file.
+        composed: configuration with the overrides.
+        overrides: of the command line.
+
+    Raises:
+        InputError: an override contradicts the file or has no effect on an exported network, or the file
+            cannot be used.
+    """
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    groups = [override.key_or_group.split(".")[0].split("/")[0] for override in parsed]
+    named = dict(zip(overrides, groups, strict=True))
+    asked = {override: group for override, group in named.items() if group not in _FREE}
+    for override, group in asked.items():
+        if group not in GROUPS:
+            raise InputError(f"{override} has no effect on {path}, a network for one skin: leave it out")
+    if not asked:
+        return
+    metadata = ExportedModel(path).metadata
+    folders = [override for override, group in named.items() if group == "hydra"]
+    for override in asked:
+        if not _agrees(metadata, composed, [*folders, override], path):
+            raise InputError(
+                f"{override} contradicts {path}, which was exported for another skin: leave it out, or "
+                "export the run again with it"
+            )
+
+
+def _agrees(metadata: ModelMetadata, composed: DictConfig, overrides: list[str], path: str) -> bool:
+    """Return whether overrides leave the skin of a network as it is.
+
+    Raises:
+        InputError: the file does not describe its skin, or it describes none that can be built.
+    """
+    if metadata.skin is None:
+        raise InputError(
+            f"{overrides[-1]} cannot be compared with {path}, which does not describe its skin: leave it "
+            "out, or write the file again with skin export"
+        )
+    check_targets({name: metadata.skin.get(name) for name in ("body", "layout")}, path)
+    stored = OmegaConf.create({"device": {}, **{name: metadata.skin.get(name) for name in GROUPS}})
+    before = plain(apply_overrides(stored, composed, []))
+    after = plain(apply_overrides(stored, composed, overrides))
+    if any(after[group] != before[group] for group in GROUPS if group != "layout"):
+        return False
+    same = after["layout"].get("footprint") == before["layout"].get("footprint")
+    # A file of the same name may list other positions.
+    return same and _at(_sensors(after), np.array(metadata.positions))
+
+
+def _sensors(groups: dict[str, Any]) -> Sensors:
+    """Return the sensors that settings describe."""
+    check_groups({name: groups[name] for name in ("body", "layout")})
+    return instantiate(groups["layout"]).sensors(instantiate(groups["body"]))
+
+
+def _at(sensors: Sensors, positions: np.ndarray) -> bool:
+    """Return whether sensors are at positions (S, 3), m."""
+    same = sensors.positions.shape == positions.shape
+    return same and bool(np.allclose(sensors.positions, positions, rtol=0, atol=_CLOSE))

@@ -1,0 +1,128 @@
+"""ONNX translations of the torch operators of the representations that ONNX lacks."""
+
+from collections.abc import Callable
+from typing import Any
+
+import onnx
+import torch
+from onnxscript import opset20
+
+from skin.learning.features import SINGULAR_VALUES
+
+op: Any = opset20  # its types leave out Python numbers, which it converts
+_DOUBLE, _FLOAT, _INT64 = 11, 1, 7  # TensorProto.DataType
+_SQUARINGS = 3, 6  # rounds, and squarings in each: the power 2^18
+_TINY = 1e-300
+_ONE = onnx.helper.make_tensor("one", _FLOAT, [1], [1.0])
+
+
+def nanmedian(x: Any, dim: int, keepdim: bool = False) -> tuple[Any, Any]:
+    """Translate ``aten.nanmedian.dim``: the lower median of the numbers in rows of x (B, N).
+
+    Returns:
+        The medians (B,), NaN in rows without a number, and no useful indices.
+    """
+    missing = op.IsNaN(x)
+    known = op.Where(missing, op.Constant(value_float=float("inf")), x)
+    count = op.ReduceSum(op.Cast(op.Not(missing), to=_INT64), [dim], keepdims=1)
+    length = op.Gather(op.Shape(x), [dim])
+    rising, order = op.TopK(known, length, axis=dim, largest=0)
+    middle = op.Max(op.Div(op.Sub(count, 1), 2), 0)
+    found = op.GatherElements(rising, middle, axis=dim)
+    found = op.Where(op.Greater(count, 0), found, op.Constant(value_float=float("nan")))
+    return (found, order) if keepdim else (op.Squeeze(found, [dim]), order)
+
+
+def cummax(x: Any, dim: int) -> tuple[Any, Any]:
+    """Translate ``aten.cummax`` of counts x (B, T, K), from 0 up, along T.
+
+    Returns:
+        The largest value so far (B, T, K), and no useful indices.
+    """
+    until = op.Trilu(op.ConstantOfShape([x.shape[1], x.shape[1]], value=_ONE), upper=0)
+    earlier = op.Mul(op.Unsqueeze(x, [1]), op.CastLike(op.Unsqueeze(until, [0, 3]), x))
+    return op.ReduceMax(earlier, [2], keepdims=0), op.Cast(x, to=_INT64)
+
+
+def eigenvalues(x: Any, uplo: str = "L", compute_v: bool = False) -> tuple[Any, Any]:
+    """Translate ``aten._linalg_eigh`` of symmetric matrices x (B, 2, 2), without eigenvectors.
+
+    Returns:
+        The eigenvalues (B, 2), rising, and no useful eigenvectors.
+    """
+    rows = op.Split(op.Reshape(op.Cast(x, to=_DOUBLE), [-1, 4]), num_outputs=4, axis=1)
+    first, mixed, _, last = rows
+    half = op.Mul(op.Sub(first, last), _double(0.5))
+    radius = op.Sqrt(op.Add(op.Mul(half, half), op.Mul(mixed, mixed)))
+    large = op.Add(op.Mul(op.Add(first, last), _double(0.5)), radius)
+    # The difference of mean and radius would lose the digits of a small eigenvalue.
+    determinant = op.Sub(op.Mul(first, last), op.Mul(mixed, mixed))
+    small = op.Div(determinant, op.Max(large, _double(_TINY)))
+    return op.CastLike(op.Concat(small, large, axis=1), x), op.Identity(x)
+
+
+def singular_values(
+    x: Any, full_matrices: bool = False, compute_uv: bool = True, driver: str | None = None
+) -> tuple[Any, Any, Any]:
+    """Translate ``aten._linalg_svd`` of matrices x (B, M, N), without singular vectors.
+
+    The values are roots of the eigenvalues of the smaller Gram matrix. A high power of it, by repeated
+    squaring, leaves the largest eigenvalue only, which is then removed. Where two are so close that the power
+    mixes them, the error is below 1e-6 of the value.
+
+    Returns:
+        No useful vectors; the singular values, falling, 0 after the first ``SINGULAR_VALUES``; no useful
+        vectors.
+    """
+    whole = op.Cast(x, to=_DOUBLE)
+    turned = op.Transpose(whole, perm=[0, 2, 1])
+    rows, columns = x.shape[1], x.shape[2]
+    gram = op.MatMul(turned, whole) if columns <= rows else op.MatMul(whole, turned)
+    identity = op.CastLike(op.EyeLike(op.ConstantOfShape([min(rows, columns)] * 2)), gram)
+    found = []
+    for _ in range(min(SINGULAR_VALUES, rows, columns)):
+        value, gram = _largest_eigenvalue(gram, identity)
+        found.append(value)
+    largest = op.Sqrt(op.Max(op.Concat(*found, axis=1), _double(0.0)))
+    others = min(rows, columns) - len(found)
+    found = op.Pad(op.Cast(largest, to=_FLOAT), [0, 0, 0, others])
+    # Not x itself, to which the exporter would give the shape of the output.
+    return op.Identity(x), found, op.Identity(x)
+
+
+def _largest_eigenvalue(matrix: Any, identity: Any) -> tuple[Any, Any]:
+    """Return the largest eigenvalue (B, 1) of symmetric matrices (B, N, N), and them without it."""
+    power = matrix
+    for _ in range(_SQUARINGS[0]):
+        # Between two scalings the power neither vanishes nor overflows.
+        power = op.Div(power, _positive(op.ReduceL2(power, [1, 2], keepdims=1)))
+        for _ in range(_SQUARINGS[1]):
+            power = op.MatMul(power, power)
+    diagonal = op.ReduceSum(op.Mul(power, identity), [2], keepdims=0)
+    row = op.GatherND(power, op.ArgMax(diagonal, axis=1, keepdims=1), batch_dims=1)
+    vector = op.Unsqueeze(op.Div(row, _positive(op.ReduceL2(row, [1], keepdims=1))), [2])
+    across = op.Transpose(vector, perm=[0, 2, 1])
+    image = op.MatMul(matrix, vector)
+    value = op.MatMul(across, image)
+    # (I - v v^T) M (I - v v^T)
+    mixed = op.Sub(image, op.Mul(op.Mul(value, _double(0.5)), vector))
+    outer = op.MatMul(mixed, across)
+    rest = op.Sub(op.Sub(matrix, outer), op.Transpose(outer, perm=[0, 2, 1]))
+    return op.Squeeze(value, [2]), rest
+
+
+def _positive(x: Any) -> Any:
+    return op.Max(x, _double(_TINY))
+
+
+def _double(value: float) -> Any:
+    return op.Constant(value=onnx.helper.make_tensor("value", _DOUBLE, [], [value]))
+
+
+TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
+    torch.ops.aten.nanmedian.dim: nanmedian,
+    torch.ops.aten.cummax.default: cummax,
+    torch.ops.aten._linalg_eigh.default: eigenvalues,
+    torch.ops.aten._linalg_svd.default: singular_values,
+}
+"""Operator -> its translation, for ``torch.onnx.export``."""

@@ -1,0 +1,319 @@
+"""A finished run: what it is called, its configuration, its weights and the threshold of its alarm.
+
+Runs are in MLflow, or in folders of ``models/``: pretrained models. Such a folder holds ``run.json``
+(:data:`RECORD`), ``config.yaml``, the file of weights, ``README.md`` (the card), and ``SHA256SUMS`` with the
+hashes of the others, which ``sha256sum --check`` reads.
+"""
+
+import pickle
+import re
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Ge, Le
+from hydra.errors import InstantiationException
+from mlflow.artifacts import download_artifacts
+from mlflow.entities import LifecycleStage, Metric, Run, RunData, RunInfo, RunStatus, RunTag
+from mlflow.exceptions import MlflowException
+from mlflow.utils.file_utils import local_file_uri_to_path
+from mlflow.utils.uri import is_local_uri
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from skin.core.files import candidates
+from skin.core.safe_loading import TEXT, file_sha256, load_yaml, parse_json, read_file, regular
+from skin.core.settings import check_settings, check_targets
+from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
+from skin.learning.data import TouchData
+from skin.learning.learner.base import AbstractLearner
+from skin.runs.configuration import validate_config
+from skin.runs.overrides import apply_overrides
+from skin.runs.store import Store
+
+TAG = "operating_point"
+"""Tag of a run that holds :meth:`OperatingPoint.text`; ``null`` where the task has no ``dangerous``."""
+FORMAT = 1
+"""Version of the content of a folder. Raise it when older folders can no longer be read."""
+MODELS = "models"
+"""The folder of all pretrained models, in the current folder and beside the package."""
+RECORD, CONFIG, CARD, SUMS = "run.json", "config.yaml", "README.md", "SHA256SUMS"
+
+# Errors of loading a file that is damaged or belongs to another learner.
+_UNFIT = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    pickle.PickleError,
+)
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A training run that finished.
+
+    Attributes:
+        store: where it is.
+        run: as MLflow has it; for a pretrained model, the run that it is a copy of.
+        trust: its configuration may run any code.
+    """
+
+    store: Store
+    run: Run
+    trust: bool = False
+
+    @classmethod
+    def named(cls, config: DictConfig) -> "FinishedRun":
+        """Return the run that a command names with ``run=``.
+
+        Raises:
+            InputError: as of :func:`find_run`.
+        """
+        return find_run(Store.existing(config.tracking), config.run, config.trust)
+
+    @property
+    def identity(self) -> str:
+        """The id of the run."""
+        return str(self.run.info.run_id)
+
+    @property
+    def title(self) -> str:
+        """The name of the run."""
+        return str(self.run.info.run_name)
+
+    @cached_property
+    def stored(self) -> DictConfig:
+        """The resolved configuration of the run.
+
+        Raises:
+            InputError: it cannot be read, is that of another version, or names a class that is not allowed
+                (:mod:`skin.core.settings`).
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            path = self.fetch(CONFIG, folder)
+            try:
+                stored = load_yaml(path)
+            except (ValueError, OSError) as error:
+                raise InputError(f"run {self.identity} has no readable config.yaml: {error}") from error
+        if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
+            raise InputError(f"run {self.identity} has no readable config.yaml: it holds no settings")
+        if not self.trust:
+            check_targets(stored, f"config.yaml of run {self.identity}")
+        config = OmegaConf.create(stored)
+        try:
+            validate_config(config)
+        except InputError as error:
+            raise InputError(
+                f"config.yaml of run {self.identity} does not fit this version: {error}: train it again"
+            ) from error
+        return config
+
+    def configured(self, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration with overrides, as :func:`skin.runs.overrides.apply_overrides` does."""
+        return apply_overrides(self.stored, composed, overrides)
+
+    @property
+    def stores_point(self) -> bool:
+        """Whether it is stored where the alarm is raised, or that there is none."""
+        return TAG in self.run.data.tags
+
+    @property
+    def point(self) -> OperatingPoint | None:
+        """The stored operating point of the alarm; None: none is stored, or the task has no alarm.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        return parse_operating_point(self.run.data.tags[TAG]) if self.stores_point else None
+
+    @contextmanager
+    def described(self) -> Iterator[None]:
+        """Turn what goes wrong with the stored settings into an InputError: they may be damaged."""
+        try:
+            yield
+        except (InputError, OmegaConfBaseException):
+            raise
+        except (*_UNFIT, AssertionError, InstantiationException) as error:
+            cause = error.__cause__ if isinstance(error, InstantiationException) else None
+            raise InputError(
+                f"config.yaml of run {self.identity} describes nothing that can be built: "
+                f"{_reason(cause or error)}"
+            ) from error
+
+    def load_weights(self, learner: AbstractLearner, data: TouchData) -> None:
+        """Load the weights into a learner.
+
+        Raises:
+            InputError: the weights do not fit the touches, such as another window with early fusion.
+        """
+        name = self.run.data.tags["learned"]
+        if Path(name).name != name:
+            raise InputError(
+                f"run {self.identity} names {name!r} as what it learned, which is no file of its own"
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            path = self.fetch(name, folder)
+            try:
+                learner.load(data, path)
+            except InputError:
+                raise
+            except _UNFIT as error:
+                raise InputError(
+                    f"{name} of run {self.identity} is damaged or does not fit these touches: "
+                    f"{_reason(error)}"
+                ) from error
+
+    def fetch(self, name: str, folder: str) -> Path:
+        """Copy a file or folder of the run into ``folder`` and return its path.
+
+        Raises:
+            InputError: the run does not have it, or it cannot be read.
+        """
+        place = self.run.info.artifact_uri
+        try:
+            _check_regular(place, name)
+            # Not by its id: a pretrained model is not in the database.
+            return Path(download_artifacts(f"{place}/{name}", dst_path=folder, tracking_uri=self.store.uri))
+        except (MlflowException, OSError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"run {self.identity} has no {name} in {place}: {reason}") from error
+
+
+def find_run(store: Store, name: str, trust: bool = False) -> FinishedRun:
+    """Return a pretrained model, or the finished training run whose id or fingerprint begins with ``name``.
+
+    ``latest`` is the last finished one that has weights. Of runs with equal fingerprints the last one counts.
+
+    Raises:
+        InputError: no run or more than one matches, or the files of the model were altered.
+    """
+    if (pretrained := find_pretrained(name)) is not None:
+        return FinishedRun(store, pretrained, trust)
+    runs = [run for run in store.find("FINISHED") if "learned" in run.data.tags]
+    if name == "latest":
+        matches = runs[:1]
+    else:
+        prints = {run.data.tags.get("fingerprint", ""): run for run in reversed(runs)}
+        matches = [run for run in runs if run.info.run_id.startswith(name)]
+        matches = matches or [run for value, run in prints.items() if value.startswith(name)]
+    if not matches:
+        raise InputError(f"no finished training run {name} in {store.uri}: skin train makes one")
+    if len(matches) > 1:
+        raise InputError(f"{len(matches)} runs have an id that begins with {name}: give more of it")
+    return FinishedRun(store, matches[0], trust)
+
+
+def _check_regular(place: str, name: str) -> None:
+    """Raise a ValueError where a file of a local run is a device or a named pipe, which would never end."""
+    if is_local_uri(place):
+        path = Path(local_file_uri_to_path(place)) / name
+        for part in path.rglob("*") if path.is_dir() else [path]:
+            if part.exists() and not part.is_dir():
+                regular(part)
+
+
+def _reason(error: BaseException) -> str:
+    """Return a short message; that of torch on a pickle would advise to run its code."""
+    if isinstance(error, pickle.PickleError):
+        return "it holds something else than numbers"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What is read of :data:`RECORD`; ``start_time`` in ms since 1970."""
+
+    run: str
+    start_time: Annotated[int, Ge(0), Le(2**53)]
+    tags: dict[str, str]
+    metrics: dict[str, float]
+
+
+def find_pretrained(name: str) -> Run | None:
+    """Return a pretrained model as the finished run that it is a copy of; None if no model has this name.
+
+    The artifacts of the run are the files of the folder.
+
+    Raises:
+        InputError: the folder has another format, or a file of it was altered.
+    """
+    if not is_name(name):
+        return None
+    folder = next((path for path in candidates(Path(MODELS) / name) if path.is_dir()), None)
+    return None if folder is None else _recorded_run(name, folder, _record(folder))
+
+
+def is_name(name: str) -> bool:
+    """Return whether a model may have this name: lower-case letters, digits and ``_``, and no id of a run."""
+    allowed = re.fullmatch(r"[a-z][a-z0-9_]*", name) is not None
+    return allowed and name != "latest" and re.fullmatch("[0-9a-f]+", name) is None
+
+
+def checksums(folder: Path, learned: str) -> str:
+    """Return the hashes of the files of a model, as ``sha256sum`` writes them.
+
+    Args:
+        folder: with the files.
+        learned: name of the file of weights.
+    """
+    names = sorted((RECORD, CONFIG, CARD, learned))
+    return "".join(f"{file_sha256(folder / name)}  {name}\n" for name in names)
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    """Return the content of :data:`RECORD`, after the format and the hashes were checked.
+
+    Raises:
+        InputError: the folder is not as it was written.
+    """
+    try:
+        record = parse_json(read_file(folder / RECORD, TEXT))
+        version = record["format"]
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise InputError(f"{folder} is no pretrained model, {RECORD} cannot be read: {error}") from error
+    again = "write it again with skin export format=folder"
+    if version != FORMAT:
+        raise InputError(
+            f"{folder} has format {version!r} and this version reads format {FORMAT}: install the version of "
+            f"the package that wrote it, or {again}"
+        )
+    try:
+        listed = read_file(folder / SUMS, TEXT).decode("utf-8").splitlines()
+        current = checksums(folder, Path(record["tags"]["learned"]).name).splitlines()
+    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise InputError(f"{folder} is no complete pretrained model: {error}") from error
+    if altered := [line.split()[1] for line in current if line not in listed]:
+        raise InputError(
+            f"{', '.join(altered)} in {folder} differs from {SUMS}: restore the folder, or {again}"
+        )
+    needed = {name: record[name] for name in _Record.__annotations__ if name in record}
+    check_settings(_Record, needed, f"{RECORD} of {folder}", whole=True)
+    return record
+
+
+def _recorded_run(name: str, folder: Path, record: dict[str, Any]) -> Run:
+    """Return a finished run with the artifacts, tags and metrics of a model."""
+    info = RunInfo(
+        run_id=record["run"],
+        experiment_id="",
+        user_id="",
+        status=RunStatus.to_string(RunStatus.FINISHED),
+        start_time=record["start_time"],
+        end_time=record["start_time"],  # a record does not say when the training ended
+        lifecycle_stage=LifecycleStage.ACTIVE,
+        artifact_uri=folder.resolve().as_uri(),
+        run_name=name,
+    )
+    metrics = [Metric(key, value, record["start_time"], 0) for key, value in record["metrics"].items()]
+    return Run(info, RunData(metrics=metrics, tags=[RunTag(*tag) for tag in record["tags"].items()]))

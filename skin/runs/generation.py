@@ -1,0 +1,187 @@
+"""Write the touches of a device to a file, or to a data set with flat memory."""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from omegaconf import DictConfig
+
+from skin.body.base import require_memory
+from skin.core.files import MANIFEST
+from skin.device.balance import report_balance, summary_line
+from skin.device.base import AbstractDevice, in_threads
+from skin.device.files import DataSet, Manifest, describe_recording, write_recording
+from skin.device.touches import Part
+from skin.errors import InputError
+from skin.runs.configuration import fingerprint, plain, source_tags
+from skin.runs.progress import format_duration
+
+_PAUSE = 10.0  # s between two lines of progress
+_BYTES = 40.0  # of memory for each reading of a file: with displacements, and a table of everything
+
+
+def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) -> str:
+    """Write the touches of a device as a data set, and return a summary of it.
+
+    Shards are drawn on as many threads as torch has. Each appears whole, and those that are in the folder
+    already are not drawn again.
+
+    Args:
+        device: draws or reads the touches; simulated ones have no displacements.
+        config: its configuration.
+        folder: new, empty, or with a part of the same data set.
+
+    Raises:
+        InputError: the folder has something else, or cannot be written.
+    """
+    parts = list(device.parts() or [])
+    if not parts:
+        whole = device.recording()
+        parts = [Part(len(whole), lambda: whole)]
+    source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(plain(config)))}
+    if not (folder / MANIFEST).is_file():
+        _begin(device, parts, source, folder)
+    manifest = Manifest.read(folder)
+    _compare(manifest, source, folder)
+    with _locked(folder):
+        for left in folder.glob("shards/.*"):  # of a process that was killed
+            left.unlink()
+        _write_missing(parts, manifest, folder)
+    data_set = DataSet(folder)
+    size = sum(data_set.path(number).stat().st_size for number in range(len(data_set.counts)))
+    return f"{manifest.gestures} gestures in {len(data_set.counts)} shards, {size / 1e6:.0f} MB"
+
+
+def _begin(device: AbstractDevice, parts: list[Part], source: dict[str, Any], folder: Path) -> None:
+    """Draw the first shard, check the balance of its touches, and write the manifest."""
+    if folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
+        raise InputError(f"{folder} exists and has no {MANIFEST}: add out= with a new or an empty folder")
+    drawn = [parts[0].make()]
+    report_balance(device, drawn[0])
+    tags = source_tags()
+    manifest = Manifest.of(
+        describe_recording(drawn[0]),
+        [part.count for part in parts],
+        seed=source["config"].get("seed"),
+        source_commit=tags["source_commit"],
+        source_dirty=tags["source_dirty"],
+        **source,
+    )
+    manifest.write(folder)
+    parts[0] = Part(parts[0].count, drawn.pop)  # its memory is free once it is written
+
+
+def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
+    """Check that a data set was begun with the same settings by the same code."""
+    commit = source_tags()["source_commit"]
+    if manifest.config_hash != source["config_hash"]:
+        before, now = dict(_flat(manifest.config)), dict(_flat(source["config"]))
+        changed = [name for name in before | now if before.get(name, ...) != now.get(name, ...)]
+        changed.sort(key=lambda name: name.count("."))  # settings before what is derived from them
+        differences = [f"{name}={before.get(name)}, not {now.get(name)}" for name in changed[:3]]
+        what = (
+            "; ".join(differences) or "other contents of the files that its settings name, or another version"
+        )
+        raise InputError(f"{folder} was begun with {what}: repeat those settings, or add out= with a new one")
+    if manifest.source_commit != commit:
+        raise InputError(
+            f"{folder} was begun by the code of commit {manifest.source_commit[:12]}, this is {commit[:12]}: "
+            "use that code, or add out= with a new folder"
+        )
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the settings of a configuration by their names on the command line."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from generating the same folder."""
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            yield
+    except Timeout as error:
+        raise InputError(
+            f"another process generates {folder}: wait for it, or add out= with a new folder"
+        ) from error
+
+
+def _write_missing(parts: list[Part], manifest: Manifest, folder: Path) -> None:
+    """Draw and write the shards that a folder lacks."""
+    missing, firsts = manifest.missing(folder), manifest.firsts
+    progress = _Progress(manifest.gestures, sum(parts[n].count for n in missing))
+
+    def write(turn: int) -> None:
+        number = missing[turn]
+        shard = parts[number].make()
+        about = shard.metadata | {"config_hash": manifest.config_hash}
+        write_recording(replace(shard, metadata=about), manifest.path(folder, number), firsts[number])
+        progress.add(len(shard))
+
+    in_threads(write, len(missing))
+
+
+class _Progress:
+    """Prints how far a generation is, at most every ten seconds.
+
+    Args:
+        total: gestures of the data set.
+        left: those of them that are not written yet.
+    """
+
+    def __init__(self, total: int, left: int) -> None:
+        self._total, self._left, self._made = total, left, 0
+        self._began = self._said = time.monotonic()
+        self._lock = threading.Lock()
+        if left < total:
+            print(f"{total - left} of {total} gestures are there already", file=sys.stderr)
+
+    def add(self, count: int) -> None:
+        """Count written gestures; may be called from several threads."""
+        with self._lock:
+            self._made += count
+            self._left -= count
+            now = time.monotonic()
+            if now - self._said < _PAUSE:
+                return
+            self._said, rate = now, self._made / (now - self._began)
+            print(
+                f"{self._total - self._left} of {self._total} gestures, {rate:.0f} a second, about "
+                f"{format_duration(self._left / rate)} left",
+                file=sys.stderr,
+            )
+
+
+def generate_file(device: AbstractDevice, config: DictConfig, path: Path) -> str:
+    """Write the touches of a device as one recording, and return a summary of them.
+
+    Args:
+        device, config: as of :func:`generate_data_set`.
+        path: ``x.parquet`` or ``x.csv``.
+
+    Raises:
+        InputError: the touches do not fit into memory, or the file cannot be written.
+    """
+    if (simulation := device.simulation) is not None:
+        readings = float(config.n * simulation.window * len(simulation.sensors))
+        require_memory(
+            _BYTES * readings, f"n={config.n} in one file", "add out=FOLDER for a data set, which needs less"
+        )
+    recording = device.recording()
+    report_balance(device, recording)
+    about = recording.metadata | {"config_hash": fingerprint(config), "config": plain(config)}
+    write_recording(replace(recording, metadata=about), path)
+    # The metadata of a file may have any content.
+    return f"{len(recording)} gestures" if simulation is None else summary_line(recording.metadata["summary"])

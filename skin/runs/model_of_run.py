@@ -1,0 +1,331 @@
+"""The model of a finished run: it predicts, evaluates and raises the alarm on the skin that it is used on."""
+
+import warnings
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from math import log
+from typing import overload
+
+import numpy as np
+import torch
+from hydra.errors import InstantiationException
+from numpy.typing import ArrayLike
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from skin import __version__
+from skin.body.base import AbstractBody
+from skin.body.layout.base import AbstractLayout
+from skin.core.messages import to_input_error
+from skin.core.settings import configured
+from skin.device.base import AbstractDevice
+from skin.device.skin_distribution import SkinDistribution
+from skin.device.touches import Touches
+from skin.errors import InputError
+from skin.evaluation.operating_point import LABEL, ContactThreshold, OperatingPoint, Predictor, Watching, rise
+from skin.learning.learner.base import AbstractLearner
+from skin.runs.alarm_threshold import alarm_point, alarm_point_for_touches
+from skin.runs.build import build_data, build_device, build_learner, build_skin
+from skin.runs.configuration import Tracking, plain, validate_config
+from skin.runs.exported.model import ExportedModel, ModelMetadata
+from skin.runs.finished_run import FinishedRun, find_run
+from skin.runs.overrides import with_skin
+from skin.runs.progress import Steps
+from skin.runs.store import Store
+from skin.runs.trained_model import TrainedModel
+
+_RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
+_FAINT = 0.3  # N, default contact threshold
+_MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
+_EXPECTED = 20.0  # s
+
+
+class RunModel(TrainedModel):
+    """The model of a run.
+
+    Args:
+        device: of its training, or as its configuration was changed.
+        learner: trained.
+        example: touches of its window, rate and sensors.
+        point: operating point of its alarm for single windows; None: not chosen, or no label ``dangerous``.
+        touch: contact threshold, N; None: tuned on simulated streams of the device, and the learned label
+            ``touch`` counts, too.
+        run: the run; None: it was trained in this process.
+        watched: configuration of the run with the skin, the device and the profile that it is used on.
+
+    Attributes:
+        device, learner, point, run, config: as above; ``config`` is ``watched``.
+        places: :attr:`positions` as a tensor.
+    """
+
+    def __init__(
+        self,
+        device: AbstractDevice,
+        learner: AbstractLearner,
+        example: Touches,
+        point: OperatingPoint | None = None,
+        touch: float | None = None,
+        run: FinishedRun | None = None,
+        watched: DictConfig | None = None,
+    ) -> None:
+        self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, watched
+        self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
+        self.task, self.size = device.task, device.size
+        self.window, self.rate = example.readings.shape[1], example.rate
+        self.places, self.positions = example.positions, example.positions.numpy()
+        self.threshold = None if point is None else point.threshold
+        self._touch = touch
+
+    @property
+    def learned(self) -> bool:
+        """Whether the label ``touch`` counts as touch, too."""
+        return self._touch is None and self.task.gate is not None
+
+    @cached_property
+    def contact(self) -> float:
+        """N above the baseline that count as touch.
+
+        Raises:
+            InputError: it is neither given nor learned and the device has no streams to tune it on.
+        """
+        if self._touch is not None:
+            return self._touch
+        if self.device.reference is None:
+            if self.learned:
+                return _FAINT
+            raise InputError(
+                "this run has no contact threshold: give live.touch=0.3 (N), or train on streams"
+            )
+        streams = self.device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY)
+        touches = streams.touches("validation")
+        assert touches.labels is not None
+        return ContactThreshold.tuned(rise(touches), touches.labels[:, -1] > 0.5).least
+
+    @property
+    def longest(self) -> float:
+        """Longest touch of the training, s; two thirds of the window if unknown."""
+        if self.device.reference is not None:
+            return self.device.reference.sampler.settings.press[1]
+        return self.window * 2 / 3 / self.rate
+
+    @cached_property
+    def presses(self) -> np.ndarray | None:
+        """Readings of a press at the limit of ``dangerous`` on each sensor, (S, S), N; None: unknown."""
+        reference = self.device.reference
+        return None if reference is None else reference.press_readings().double().numpy()
+
+    @overload
+    def predict(self, readings: Touches) -> Tensor: ...
+
+    @overload
+    def predict(self, readings: ArrayLike) -> np.ndarray: ...
+
+    def predict(self, readings: Touches | ArrayLike) -> Tensor | np.ndarray:
+        """Return the probability of each label, (B, L), for touches of this window and rate.
+
+        Args:
+            readings: B touches, which may have other sensors; or an array as in
+                :meth:`skin.runs.trained_model.TrainedModel.predict`.
+
+        Returns:
+            A tensor for touches, else an array.
+
+        Raises:
+            InputError: the touches do not fit the run.
+        """
+        return (
+            self.learner.probabilities(readings)
+            if isinstance(readings, Touches)
+            else super().predict(readings)
+        )
+
+    def probabilities(self, readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        """Return the probability of each label, (B, L), for readings (B, T, S), N, and their validity."""
+        return window_classifier(self.learner, self.places, self.rate)(readings, valid)
+
+    def watching(self, rate: float, patience: float, aligned: bool) -> Watching:
+        """Return how a live view watches a device.
+
+        Args:
+            rate: of the device, Hz; the nearest of some rates is used.
+            patience: s for which decisions must be dangerous.
+            aligned: whether the device gives the frames of the model.
+        """
+        # A measured rate is never the same twice, and the threshold would be chosen anew at each start.
+        ratio = min(_RATIOS, key=lambda ratio: abs(log(ratio * self.rate / rate)))
+        column = self.task.names.index(LABEL)
+        return Watching(ratio * self.rate, self.contact, self.longest, patience, column, aligned)
+
+    def point_at(
+        self, rate: float, patience: float, aligned: bool, say: Callable[[str], None]
+    ) -> OperatingPoint | None:
+        """Return the operating point of the live view, chosen on safe touches of this skin and device.
+
+        Args:
+            rate, patience, aligned, say: as in :meth:`threshold_at`.
+        """
+        if not self.alarms or self.run is None or self.config is None:
+            return self.point
+        watching = self.watching(rate, patience, aligned)
+        return alarm_point_for_touches(self.run, self.learner, self.config, watching, say)
+
+    def threshold_at(
+        self, rate: float, patience: float, aligned: bool, say: Callable[[str], None]
+    ) -> float | None:
+        """Return the threshold of :meth:`point_at`, which is announced."""
+        with Steps({"choosing the threshold of the alarm": _EXPECTED}):
+            point = self.point_at(rate, patience, aligned, say)
+        if point is None:
+            return None
+        if point.silent:
+            raise InputError(f"{point.warning()}: give live.patience.above=0.5, or train another run")
+        say(point.sentence())
+        return point.threshold
+
+    def describe(self, thresholds: Mapping[str, float] | None = None) -> ModelMetadata:
+        """Return the description of the model for an exported file.
+
+        Args:
+            thresholds: rate of a device, Hz -> threshold of the alarm; None: :attr:`threshold` only.
+
+        Raises:
+            InputError: as of :attr:`contact`.
+        """
+        return ModelMetadata(
+            run=self.identity,
+            title=self.title,
+            version=__version__,
+            labels=list(self.task.names),
+            kind=self.task.kind,
+            gate=self.task.gate,
+            direction=self.task.direction,
+            rate=self.rate,
+            window=self.window,
+            positions=self.positions.tolist(),
+            size=self.size,
+            saturation=None if self.device.reference is None else self.device.reference.imperfection.clip,
+            threshold=self.threshold,
+            contact=self.contact,
+            learned=self.learned,
+            longest=self.longest,
+            thresholds=dict(thresholds) if thresholds else None,
+            presses=None if self.presses is None else self.presses.round(4).tolist(),
+        )
+
+
+def window_classifier(
+    learner: Predictor, positions: Tensor, rate: float
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return a function of the readings and validity of windows that asks a learner.
+
+    Args:
+        learner: trained.
+        positions: (S, 3), m.
+        rate: Hz.
+    """
+
+    @torch.inference_mode()
+    def classify(readings: np.ndarray, valid: np.ndarray) -> np.ndarray:
+        windows = torch.from_numpy(readings), torch.from_numpy(valid)
+        return learner.probabilities(Touches(*windows, positions, None, rate)).numpy()
+
+    return classify
+
+
+def load_run(
+    name: str = "latest",
+    uri: str | None = None,
+    trust: bool = False,
+    body: AbstractBody | str | None = None,
+    layout: AbstractLayout | str | None = None,
+) -> TrainedModel:
+    """Return the model of a finished training run, a pretrained model, or a file of ``skin export``.
+
+    Args:
+        name: of the model, the beginning of the run's id, or the path of an ONNX file; ``latest`` is the last
+            run that finished.
+        uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
+        trust: allow any class in its configuration, which may run any code.
+        body: the body of the skin to use it on, such as :class:`skin.body.sheet.Sheet`, or the name of an
+            option, such as ``arm``; None: that of the run.
+        layout: the sensors of this skin: a layout such as :class:`skin.body.layout.grid.Grid`, the name of an
+            option, or the path of a CSV file; None: those of the run.
+
+    Raises:
+        InputError: there is no such run, it cannot be loaded, or it does not fit the skin.
+    """
+    if name.endswith(".onnx"):
+        if body is not None or layout is not None:
+            raise InputError(f"{name} is a network for one skin: leave out body and layout")
+        return ExportedModel(name)
+    run = find_run(Store.existing(Tracking(uri, None, "skin", True, None)), name, trust)
+    try:
+        whole = with_skin(plain(run.stored), body, layout)
+        return load_model(run, validate_config(OmegaConf.create(whole)))
+    except InstantiationException as error:
+        raise to_input_error(error) or error from error
+
+
+def load_model(
+    run: FinishedRun,
+    config: DictConfig | None = None,
+    watched: DictConfig | None = None,
+    device: AbstractDevice | None = None,
+    touch: float | None = None,
+    one_skin: bool = False,
+    alarm: bool = True,
+) -> RunModel:
+    """Return the model of a finished run.
+
+    Args:
+        run: the run.
+        config: its configuration, changed as :meth:`FinishedRun.configured` does; None: not changed.
+        watched: its configuration with the device that a live view watches; None: ``config``.
+        device: to use it on; None: that of ``config``.
+        touch: as in :class:`RunModel`.
+        one_skin: as in :func:`skin.runs.alarm_threshold.alarm_point`.
+        alarm: choose the threshold of the alarm for single windows; False: it has none.
+
+    Raises:
+        InputError: its weights do not fit the configuration.
+    """
+    config = validate_config(run.stored) if config is None else config
+    if device is None:
+        _warn_of_unknown_skin(run.stored, config)
+    with run.described():
+        device = device or build_device(config)
+        learner = build_learner(config)
+        data = build_data(config, device.blank())
+    run.load_weights(learner, data)
+    point = alarm_point(run, learner, config, one_skin) if alarm else None
+    return RunModel(device, learner, data.example, point, touch, run, watched or config)
+
+
+def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:
+    """Warn where a run that was trained on drawn skins is used on one that they do not include."""
+    if (ranges := OmegaConf.select(stored, "device.skins")) is None:
+        return
+    distribution, skin = configured(SkinDistribution, plain(ranges), "device.skins"), build_skin(config)
+    if outside := distribution.outside(skin.body, skin.sensors):
+        warnings.warn(
+            f"this skin is unlike those that the run was trained on: {', '.join(outside)}; its verdicts may "
+            "be worse than the run's results",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def equation10_warning(stored: DictConfig, device: AbstractDevice | None = None) -> str | None:
+    """Return a warning if a run trained with equation 10 is used on a real skin; else None.
+
+    Args:
+        stored: the run's configuration.
+        device: the watched device; None: a real skin.
+    """
+    reading = OmegaConf.select(stored, "device.simulator.reading")
+    if reading != "equation10" or (device is not None and not device.real):
+        return None
+    return (
+        "warning: this run learned from simulator=fem and equation 10, which does not carry over to other "
+        "mechanics (docs/results.md): train one with simulator=solid for a real skin"
+    )

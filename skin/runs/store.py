@@ -1,0 +1,363 @@
+"""Runs in MLflow: one SQLite file or a server, one experiment, and a status that is true after a crash.
+
+A request to a server that is away is repeated by MLflow: for seconds, and for twelve minutes during a run.
+"""
+
+import os
+
+# Before mlflow is imported, because it sends telemetry by default.
+os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+# Seconds, not minutes, until a server counts as away: waits of 0, 2 and 4 s between the attempts.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR", "1")
+
+import atexit
+import json
+import logging
+import platform
+import sqlite3
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import unquote
+
+import psutil
+from alembic.util import CommandError
+from filelock import FileLock
+from mlflow import MlflowClient
+from mlflow.entities import Experiment, Metric, Run, ViewType
+from mlflow.exceptions import MlflowException, RestException
+from mlflow.protos.databricks_pb2 import RESOURCE_ALREADY_EXISTS, ErrorCode
+from mlflow.store.tracking import SEARCH_MAX_RESULTS_THRESHOLD
+from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
+from sqlalchemy.exc import SQLAlchemyError
+
+from skin.core.files import whole
+from skin.core.interrupt import ends_on_signal
+from skin.errors import InputError
+from skin.runs.configuration import Tracking, answers, check_server, is_server, source_tags
+
+_log = logging.getLogger(__name__)
+
+PROCESS = "process"
+"""Tag of the process that makes a run."""
+
+_QUICK = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1"}
+# During a run: waits of 0, 20, 40, 80 and five times 120 s, together 12 minutes. MLflow takes no more than 9.
+_PATIENT = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "9", "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "10"}
+_SET_CLOCK = 60  # s by which the clock of a machine may be set without a process looking like another one
+
+# The table of runs in the UI of MLflow: the shared view of a link, with widths of its columns in pixels.
+_VIEW = "skin"
+_NAME = "attributes.`Run Name`"
+_COLUMNS = {
+    _NAME: 420,
+    "metrics.`same/overall/accuracy`": 180,
+    "metrics.`same/dangerous/alarm_recall`": 230,
+    "metrics.`same/dangerous/false_alarm_rate`": 250,
+}
+_SHOWN = {
+    "selectedColumns": [name for name in _COLUMNS if name != _NAME],
+    "columnOrder": list(_COLUMNS),
+    "columnWidths": _COLUMNS,
+}
+TAGS = {
+    # Which of its two interfaces MLflow shows. 3.17 takes it from the link instead.
+    "mlflow.experimentKind": "custom_model_development",
+    f"mlflow.sharedViewState.{_VIEW}": json.dumps(_SHOWN),
+}
+"""Tags of an experiment that holds runs of this package."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """An MLflow experiment in a database that exists.
+
+    Attributes:
+        client: of the tracking store.
+        uri: of the tracking store.
+        experiment: id of the experiment.
+    """
+
+    client: MlflowClient
+    uri: str
+    experiment: str
+
+    @classmethod
+    def open(cls, settings: Tracking) -> "Store":
+        """Return the experiment, made with its database where they are missing.
+
+        Raises:
+            InputError: the database is none, belongs to another version of MLflow, or cannot be written; or
+                the server does not answer.
+        """
+        uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
+        artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
+        check_server(uri)
+        try:
+            with _alone(uri, artifacts):
+                client = MlflowClient(tracking_uri=uri)
+                # A server keeps the artifacts of its runs, unless a folder is given.
+                served = is_server(uri) and settings.artifacts is None
+                location = None if served else (artifacts / settings.experiment).resolve().as_uri()
+                identity = _experiment(client, settings.experiment, location)
+        except (MlflowException, SQLAlchemyError, CommandError, sqlite3.Error, OSError) as error:
+            reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
+            raise InputError(
+                f"cannot use the runs in {uri}: {reason}: give another place, as in "
+                "tracking.uri=sqlite:////FOLDER/runs.db"
+            ) from error
+        store = cls(client, uri, identity)
+        store._close_abandoned()
+        return store
+
+    @classmethod
+    def existing(cls, settings: Tracking) -> "Store":
+        """Return the experiment like :meth:`open`; without a database, one without runs, and make no file.
+
+        For a command that may still be refused. The client of such a store cannot be used.
+
+        Raises:
+            InputError: as of :meth:`open`.
+        """
+        uri = settings.uri or database_uri(Path.cwd() / "mlflow.db")
+        if uri.startswith("sqlite:///") and not _database(uri).exists():
+            return cls(cast(MlflowClient, None), uri, "")
+        return cls.open(settings)
+
+    def find(self, status: str | None = None, **tags: str) -> list[Run]:
+        """Return the runs that have the tags, newest first; ``status`` as MLflow calls it (``FINISHED``)."""
+        if not self.experiment:
+            return []
+        terms = [f"tags.`{name}` = '{value}'" for name, value in tags.items()]
+        terms += [f"attributes.status = '{status}'"] if status else []
+        return self.client.search_runs(
+            [self.experiment],
+            " and ".join(terms),
+            ViewType.ACTIVE_ONLY,
+            max_results=SEARCH_MAX_RESULTS_THRESHOLD,
+            order_by=["attributes.start_time DESC"],
+        )
+
+    def create(self, name: str, tags: dict[str, str]) -> Run:
+        """Return a new run, tagged with this process; the caller must end it."""
+        return self.client.create_run(self.experiment, tags=tags | {PROCESS: _me()}, run_name=name)
+
+    def _close_abandoned(self) -> None:
+        """Set the status of runs whose process no longer exists to KILLED.
+
+        Only processes of this machine can be checked. Runs without the tag are left unchanged.
+        """
+        for run in self.find("RUNNING"):
+            if _is_gone(run.data.tags.get(PROCESS, "")):
+                self.client.set_terminated(run.info.run_id, "KILLED")
+
+    @contextmanager
+    def run(
+        self, name: str, tags: dict[str, str], parent: str | None = None, again: Run | None = None
+    ) -> Iterator[Run]:
+        """Open a run; it is FINISHED only if the block ends by itself, else FAILED, or KILLED by a signal.
+
+        A request to a server that is away waits for it for twelve minutes.
+
+        Args:
+            name: of the run.
+            tags: of the run.
+            parent: id of the run of its sweep.
+            again: a killed run to open instead of a new one.
+
+        Raises:
+            InputError: the server stayed away.
+        """
+        tags = tags | source_tags() | ({MLFLOW_PARENT_RUN_ID: parent} if parent else {})
+        run = again or self.create(name, tags)
+        if again:
+            self.client.update_run(run.info.run_id, status="RUNNING")
+            for key, value in (tags | {PROCESS: _me()}).items():
+                self.client.set_tag(run.info.run_id, key, value)
+        status = "KILLED"
+        try:
+            with ends_on_signal(lambda: self._end(run, status)), _patience():
+                yield run
+                self.client.set_terminated(run.info.run_id, "FINISHED")
+            status = "FINISHED"
+        except Exception as error:
+            if self._lost(error):
+                raise InputError(
+                    f"the tracking server {self.uri} does not answer, and run {run.info.run_id} is not "
+                    "complete: repeat the command when it does; a training continues after its last epoch"
+                ) from error
+            status = "FAILED"
+            if answers(self.uri):
+                self.client.set_tag(run.info.run_id, "error", f"{type(error).__name__}: {error}"[:500])
+            raise
+        finally:
+            if status != "FINISHED":
+                self._end(run, status)
+
+    def _lost(self, error: Exception) -> bool:
+        """Return whether an error means that the server gives no answer; what it answers is another one."""
+        return (
+            is_server(self.uri)
+            and isinstance(error, MlflowException)
+            and not isinstance(error, RestException)
+            and str(error).startswith("API request to")
+        )
+
+    def _end(self, run: Run, status: str) -> None:
+        """End a run; without the server it stays RUNNING until the next start closes it."""
+        if answers(self.uri):
+            self.client.set_terminated(run.info.run_id, status)
+
+    def log_metrics(self, run: Run, values: dict[str, float]) -> None:
+        """Log final metrics, 1000 in one transaction; what is not defined (NaN) is left out."""
+        now = int(1000 * time.time())
+        metrics = [Metric(name, value, now, 0) for name, value in values.items() if value == value]
+        for start in range(0, len(metrics), 1000):
+            self.client.log_batch(run.info.run_id, metrics[start : start + 1000], synchronous=True)
+
+
+@contextmanager
+def _patience() -> Iterator[None]:
+    """Let a request wait for a server that is away, unless a person chose otherwise."""
+    before = {name: os.environ[name] for name in _QUICK}
+    os.environ |= _PATIENT if before == _QUICK else {}
+    try:
+        yield
+    finally:
+        os.environ |= before
+
+
+def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
+    """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
+    if (found := client.get_experiment_by_name(name)) is None:
+        try:
+            return client.create_experiment(name, artifact_location=location, tags=TAGS)
+        except MlflowException as error:
+            if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
+                raise
+            return _experiment(client, name, location)
+    _tag(client, found)
+    return str(found.experiment_id)
+
+
+def _tag(client: MlflowClient, experiment: Experiment) -> None:
+    """Add the tags that an experiment lacks; they matter only to the UI, so that failures are ignored."""
+    for key, value in TAGS.items():
+        if experiment.tags.get(key) != value:
+            with suppress(MlflowException):
+                client.set_experiment_tag(experiment.experiment_id, key, value)
+
+
+def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
+    """Print the link to the runs of ``mlflow.db`` in the current folder, at a server that shows them."""
+    experiment = Store.open(Tracking(None, None, "skin", True, None)).experiment
+    table = f"{address}/#/experiments/{experiment}/runs"
+    print(f"runs: {table}?workflowType=machine_learning&viewStateShareKey={_VIEW}")
+
+
+def _where() -> str:
+    """Return an identifier of the machine, or of the container with its own process numbers."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        space = ""
+    return f"{platform.node()} {space}"
+
+
+def _me() -> str:
+    """Return the tag of this process; its start time makes it unique."""
+    return json.dumps([_where(), os.getpid(), psutil.Process().create_time()])
+
+
+def _is_gone(process: str) -> bool | None:
+    """Return whether a tagged process no longer exists; None for those of other machines."""
+    try:
+        where, number, started = json.loads(process)
+        if where != _where():
+            return None
+        return abs(psutil.Process(number).create_time() - started) > _SET_CLOCK
+    except psutil.NoSuchProcess:
+        return True
+    except (ValueError, TypeError, psutil.Error):
+        return None
+
+
+def database_uri(path: Path) -> str:
+    """Return the URI of a SQLite database, in which ``%`` and ``?`` have a meaning."""
+    return "sqlite:///" + str(path).replace("%", "%25").replace("?", "%3F")
+
+
+def _database(uri: str) -> Path:
+    """Return the file of a SQLite database."""
+    return Path(unquote(uri.removeprefix("sqlite:///").partition("?")[0]))
+
+
+def _make(path: Path, artifacts: Path) -> None:
+    """Create a database atomically: an incomplete one could not be opened again."""
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore  # heavy, and seldom needed
+
+    with whole(path, "tracking.uri=sqlite:////FOLDER/runs.db") as partial:
+        SqlAlchemyStore(database_uri(partial), str(artifacts)).engine.dispose()
+
+
+@contextmanager
+def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
+    """Lock the creation of a SQLite database, which fails in two processes at the same time."""
+    if not uri.startswith("sqlite:///"):
+        yield
+        return
+    path = _database(uri)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = Path(uri.removeprefix("sqlite:///")).parent
+    existed = encoded.exists()
+    with FileLock(f"{path}.lock"):
+        if not path.exists() or not path.stat().st_size:
+            _make(path, artifacts)
+        with closing(sqlite3.connect(path)) as connection:
+            # Readers and writers at the same time; the mode stays with the file.
+            connection.execute("PRAGMA journal_mode=WAL")
+        yield
+        if not existed:  # MLflow makes the folder of the URI without decoding it, and leaves it empty
+            with suppress(OSError):
+                os.removedirs(encoded)
+
+
+_reused: dict[str, str] = {}  # id -> name of reused runs of other code
+
+
+def note_reuse(run: Run) -> None:
+    """Note that this command uses a finished run.
+
+    At exit, one warning counts the runs of other code: of another commit, or with files that differ from the
+    commit then or now. Runs that began after this process do not count.
+    """
+    if run.info.start_time < 1000 * psutil.Process().create_time():
+        note_source(run.info.run_id, run.info.run_name, run.data.tags)
+
+
+def note_source(identity: str, name: str, tags: Mapping[str, str]) -> None:
+    """Note that this command uses an earlier result with some tags (:func:`source_tags`)."""
+    code = source_tags()
+    same = tags.get("source_commit") == code["source_commit"]
+    if not same or "true" in (tags.get("source_dirty"), code["source_dirty"]):
+        _reused.setdefault(identity, name)
+
+
+@atexit.register
+def _warn() -> None:
+    """Print the warning that :func:`note_reuse` announces."""
+    if not _reused:
+        return
+    count, first = len(_reused), next(iter(_reused.values()))
+    what = f"finished run {first}" if count == 1 else f"{count} finished runs, such as {first}"
+    _log.warning(
+        "warning: reused %s, of other code (tags source_commit and source_dirty): "
+        "tracking.resume=false repeats them",
+        what,
+    )

@@ -1,0 +1,309 @@
+"""A sweep: one parent run in MLflow, one line of progress per job. The UI of MLflow compares its runs."""
+
+import atexit
+import os
+import re
+import sys
+import time
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from skin.core.messages import to_input_error
+from skin.errors import InputError
+from skin.runs.configuration import check_server, plain, validate_config
+from skin.runs.progress import SweepProgress, expected_seconds, format_duration
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from skin.runs.store import Store
+
+
+# Shards: parts of the jobs of a multirun or a study, for the tasks of a job array.
+
+
+LEFT_OUT = "SKIN_LEFT_OUT"
+"""Environment variable with the numbers of the jobs of a multirun that belong to other shards."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``number`` of ``count`` disjoint parts that together are complete.
+
+    Attributes:
+        number: of this part, from 1.
+        count: number of parts.
+    """
+
+    number: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> "Shard":
+        """Return the shard that a setting names, such as ``3/8``.
+
+        Raises:
+            InputError: the text names no shard.
+        """
+        found = re.fullmatch(r"([0-9]+)/([0-9]+)", text)
+        number, count = map(int, found.groups()) if found else (0, 0)
+        if not 1 <= number <= count:
+            raise InputError(
+                f"shard={text} names no part: give i/n with i from 1 to n, as in shard=3/8; an array that "
+                "counts from 0 needs i + 1"
+            )
+        return cls(number, count)
+
+    def part(self, names: Iterable[str]) -> set[str]:
+        """Return every ``count``-th of the different names, sorted, from this shard's number on.
+
+        The order of the names does not matter. Names that are fingerprints of runs mix cheap and expensive
+        ones, and runs that several jobs have in common are in one part.
+        """
+        return set(sorted(set(names))[self.number - 1 :: self.count])
+
+
+def left_out() -> bool:
+    """Return whether the running job of a multirun belongs to another shard."""
+    return str(HydraConfig.get().job.num) in os.environ.get(LEFT_OUT, "").split()
+
+
+def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return the overrides of each job of a multirun, in the order of Hydra's sweeper.
+
+    Args:
+        overrides: of the command line; of equal keys the last one counts.
+        parameters: ``hydra.sweeper.params``.
+
+    Raises:
+        InputError: an interval, which has no discrete values.
+    """
+    # glob(...) needs a loader to list options.
+    loader = GlobalHydra.instance().config_loader() if GlobalHydra.instance().is_initialized() else None
+    lines = [f"{key}={value}" for key, value in parameters.items()] + overrides
+    parsed = OverridesParser.create(loader).parse_overrides(lines)
+    for override in parsed:
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            key = override.get_key_element()
+            raise InputError(
+                f"{override.input_line} names no values to try: give {key}=1,2 or {key}=range(1,9,2)"
+            )
+    (found,) = BasicSweeper.split_arguments(parsed, None)
+    return [_chosen(job) for job in found]
+
+
+def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
+    """Return the swept settings, such as ``model.norm=none,layer × seed=0,1``, for the name of a run."""
+    values = {key: dict.fromkeys(job[key] for job in jobs) for key in swept}
+    text = " × ".join(f"{key.lstrip('+')}={','.join(tried)}" for key, tried in values.items())
+    return text if len(text) <= 250 else f"{text[:249]}…"
+
+
+def _chosen(overrides: Iterable[str]) -> dict[str, str]:
+    """Return the keys and values of overrides."""
+    return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
+
+
+def _words(config: DictConfig) -> list[str]:
+    """Return the overrides of a command line or a job, with interpolations as they were written."""
+    words: Any = OmegaConf.to_container(config.hydra.overrides.task)
+    return words
+
+
+class Sweep(Callback):
+    """Hydra's callback of every command: opens and closes the parent run, prints progress.
+
+    The parent exists before the first job, and with it database and experiment: jobs that start at once must
+    not race to make them. Hydra does not call ``on_multirun_end`` when a job has failed, so the parent is
+    closed at exit. A parent that has no children by then, because each job was finished before or refused, is
+    deleted.
+
+    Args:
+        parent: whether the jobs are runs; a command whose jobs run sweeps of their own has no parent run.
+        runs: fingerprints of the runs to train; None: those of the shard.
+    """
+
+    def __init__(self, parent: bool = True, runs: Collection[str] | None = None) -> None:
+        self._wanted, self._runs = parent, runs
+        self._store: Store | None = None
+        self._parent: Run | None = None
+        self._resume = True
+        self._jobs: list[dict[str, str]] = []
+        self._fingerprints: list[str] = []
+        self._own: list[int] = []
+        self._swept: list[str] = []
+        self._progress = SweepProgress([])
+        self._began = 0.0
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Refuse to divide a single job."""
+        if self._wanted and (shard := config.get("shard")) is not None:
+            _refuse(InputError(f"shard={shard} divides the jobs of a multirun or a study: add -m"))
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Open the parent run, and pass it to the jobs."""
+        if not self._wanted:
+            return
+        try:
+            self._open(config)
+        except Exception as error:
+            refused = to_input_error(error)
+            if refused is None:
+                raise
+            _refuse(refused)
+
+    def _open(self, config: DictConfig) -> None:
+        """Choose the jobs, and make the folder that Hydra writes to, and the parent run."""
+        # Swept or not, Hydra lists only what belongs to jobs here.
+        self._jobs = sweep_jobs(_words(config), config.hydra.sweeper.params or {})
+        self._swept = [key for key in self._jobs[0] if len({job[key] for job in self._jobs}) > 1]
+        if "tracking" not in config:
+            self._choose(config, [""] * len(self._jobs))
+            return
+        settings = validate_config(_without_hydra(config)).tracking
+        check_server(settings.uri)
+        composed = [_composed(config, job) for job in self._jobs]
+        Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
+
+        from skin.core.messages import PARENT
+        from skin.runs.store import Store
+        from skin.runs.train import SWEPT, tags
+
+        identities = [tags(job) if job else {} for job in composed]
+        self._fingerprints = [one.get("fingerprint", "") for one in identities]
+        self._choose(config, self._fingerprints)
+        self._store = store = Store.open(settings)
+        name = config.hydra.runtime.choices.get("sweep") or sweep_title(self._jobs, self._swept) or "sweep"
+        self._parent, self._resume = store.create(name, {"sweep": name}), settings.resume
+        atexit.register(self._close)
+        os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
+        _share_cores(config.hydra.launcher)
+        own = [(composed[number], identities[number]) for number in self._own]
+        self._progress = SweepProgress(
+            [expected_seconds(store, job, one) if job else None for job, one in own],
+            self._with_status("FINISHED"),
+            self._with_status("KILLED"),
+        )
+
+    def _with_status(self, status: str) -> set[int]:
+        """Return the jobs, by their places in this shard, that a run of this status did at least partly."""
+        if not self._resume or self._store is None:
+            return set()
+        prints = [self._fingerprints[number] for number in self._own]
+        known = {run.data.tags.get("fingerprint") for run in self._store.find(status)}
+        return {place for place, identity in enumerate(prints) if identity and identity in known}
+
+    def _choose(self, config: DictConfig, fingerprints: Sequence[str]) -> None:
+        """Choose the jobs of this shard, and tell the others that they have nothing to do."""
+        shard = Shard.parse(config.shard) if config.get("shard") is not None else Shard(1, 1)
+        # A job without a fingerprint is refused, or is no training; its overrides identify it.
+        names = [one or str(job) for one, job in zip(fingerprints, self._jobs, strict=True)]
+        chosen = shard.part(names) if self._runs is None else self._runs
+        self._own = [number for number, name in enumerate(names) if name in chosen]
+        os.environ[LEFT_OUT] = " ".join(str(number) for number in set(range(len(names))) - {*self._own})
+        if not self._own:
+            if self._runs is None:
+                print(f"shard {config.shard} has no job: the sweep has only {len(set(names))}")
+            sys.exit(0)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Print which job begins."""
+        self._began = time.monotonic()
+        if self._parent and config.hydra.job.num in self._own:
+            left = self._progress.left()
+            rest = "" if left is None else f" about {format_duration(left)} left"
+            print(f"{self._label(config)} …{rest}", flush=True)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Print how a job ended."""
+        if not self._parent or config.hydra.job.num not in self._own:
+            return
+        took, skipped = time.monotonic() - self._began, job_return._return_value is False
+        if job_return.status == JobStatus.FAILED:
+            print(f"{self._label(config)} failed: {job_return._return_value}", file=sys.stderr, flush=True)
+        elif skipped:
+            print(f"{self._label(config)} was finished before", flush=True)
+        else:
+            print(f"{self._label(config)} took {format_duration(took)}", flush=True)
+        self._progress.finish(self._own.index(config.hydra.job.num), took, skipped)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Close the parent run."""
+        self._close()
+
+    def _close(self) -> None:
+        """End the parent run, once: FINISHED only if every job of the shard came to its end."""
+        store, self._store = self._store, None
+        if store is None or self._parent is None:
+            return
+        # Errors of the database were reported before; the next start closes the run.
+        with suppress(Exception):
+            self._conclude(store, self._parent)
+
+    def _conclude(self, store: "Store", parent: "Run") -> None:
+        """End the parent: FAILED if a job of this shard has no finished run; delete one without children."""
+        from mlflow.utils.mlflow_tags import MLFLOW_PARENT_RUN_ID
+
+        from skin.runs.store import note_reuse
+
+        children = {MLFLOW_PARENT_RUN_ID: parent.info.run_id}
+        missing = False
+        for identity in {self._fingerprints[number] for number in self._own}:
+            # One that was finished before counts, unless it was to be repeated.
+            runs = store.find("FINISHED", fingerprint=identity, **{} if self._resume else children)
+            missing |= not runs
+            for run in runs[:1]:
+                note_reuse(run)  # jobs in other processes warn of nothing
+        store.client.set_terminated(parent.info.run_id, "FAILED" if missing else "FINISHED")
+        if not store.find(**children):
+            store.client.delete_run(parent.info.run_id)
+
+    def _label(self, config: DictConfig) -> str:
+        job = _chosen(_words(config))
+        chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
+        return f"[{self._own.index(config.hydra.job.num) + 1}/{len(self._own)}] {chosen}"
+
+
+def _refuse(error: InputError) -> NoReturn:
+    """End the command; Hydra passes only exits on from a callback."""
+    print(error, file=sys.stderr)
+    sys.exit(2)
+
+
+def _without_hydra(config: DictConfig) -> DictConfig:
+    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+
+
+def _composed(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
+    """Return the configuration of a job; None where it will be refused."""
+    words = [f"{key}={value}" for key, value in job.items()]
+    whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
+    try:
+        made = validate_config(_without_hydra(whole))
+        plain(made)
+    except InputError:
+        return None
+    return made
+
+
+def _share_cores(launcher: DictConfig) -> None:
+    """Give every job of a parallel launcher (joblib's, submitit's) its share of the cores.
+
+    Two jobs with two threads each are several times slower than two with one.
+    """
+    parallel = launcher.get("n_jobs") or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if parallel != 1:
+        count = cores if parallel < 0 else min(parallel, cores)
+        os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores // count)))

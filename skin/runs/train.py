@@ -1,0 +1,356 @@
+"""One run: build, train, evaluate, log."""
+
+import json
+import logging
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import torch
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from mlflow.entities import Param, Run
+from mlflow.exceptions import MlflowException
+from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.loggers import MLFlowLogger
+from pytorch_lightning.utilities import rank_zero_only
+from rich.console import Console
+
+from skin.core.files import unwritable
+from skin.core.messages import PARENT, quiet
+from skin.core.settings import import_target, option_name
+from skin.device.balance import report_balance
+from skin.errors import InputError
+from skin.evaluation.metrics import OUTCOMES
+from skin.evaluation.operating_point import choose_operating_point
+from skin.evaluation.report import Report, evaluate, metrics_table
+from skin.evaluation.report import print_report as show
+from skin.evaluation.settings import check_evaluation
+from skin.learning.learner.base import AbstractLearner
+from skin.learning.learner.network import LAST
+from skin.plot.figures import confusions, save_figure
+from skin.runs.alarm_threshold import threshold_device
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.configuration import MACHINE, Tracking, fingerprint, overrides, plain, source_tags
+from skin.runs.finished_run import TAG
+from skin.runs.store import Store, note_reuse
+from skin.touch.labels import Task
+
+_log = logging.getLogger(__name__)
+
+SWEPT = "SKIN_SWEPT"
+"""Environment variable with the settings that a sweep varies, for its jobs."""
+
+_STEERING = ("hydra", "shard", "tracking", "trust", "sweep")  # no result depends on them
+_NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a network consists of these
+# A run's name has the first ones in any case; the others choose the machine.
+_NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
+
+
+def train(config: DictConfig) -> bool:
+    """Train and evaluate a configuration; return False if a finished run has the results.
+
+    A run that finished with the same fingerprint is not repeated, and one that was killed is continued,
+    unless ``tracking.resume=false``.
+    """
+    quiet()
+    _limit_threads(config.tracking.threads)
+    if getattr(rank_zero_only, "rank", 0):
+        _join(config)
+        return True
+    store, identity = Store.existing(config.tracking), tags(config)
+    identity["threads"] = str(torch.get_num_threads())
+    if _is_finished(store, config, identity):
+        return False
+    check_evaluation(config.evaluation)
+    device = build_device(config)
+    judged = device if config.evaluation.profile is None else threshold_device(config, config)
+    data, learner = build_data(config, device), build_learner(config)
+    learner.check(data)
+    report_balance(device, shown=PARENT not in os.environ)
+    name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
+    store = Store.open(config.tracking)
+    with alone(config.tracking, identity["fingerprint"]):
+        if _is_finished(store, config, identity):  # by a process that began earlier
+            return False
+        again = find_unfinished(store, config.tracking, identity["fingerprint"])
+        with store.run(name, identity, os.environ.get(PARENT), again) as run:
+            learner.unfinished = _unfinished_folder(config.tracking, run)
+            describe(store, run.info.run_id, config, data.hash)
+            learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
+            point = choose_operating_point(learner, judged, config.evaluation)
+            report = evaluate(learner, device, config.evaluation, point)
+            values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
+            log_learner(store, run, learner)
+            log_report(store, run, report, device.task, values)
+        shutil.rmtree(learner.unfinished, ignore_errors=True)
+    if PARENT not in os.environ:
+        show(report, f"{name}, run {run.info.run_id}")
+    return True
+
+
+class RunLogger(MLFlowLogger):
+    """Logs a training to its run and leaves the run open.
+
+    Lightning's own calls a run FINISHED when the fit ends; one that is killed during its evaluation would
+    then count as finished without having any result.
+
+    Args:
+        store: of the run.
+        run: its id.
+        folder: for metrics that a server did not take, which the next logger of the run sends.
+    """
+
+    def __init__(self, store: Store, run: str, folder: Path) -> None:
+        super().__init__(tracking_uri=store.uri, run_id=run)
+        self._left = folder / "metrics.json"
+        if self._left.is_file():
+            super().log_metrics(**json.loads(self._left.read_text()))
+            self._left.unlink()
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log the metrics of an epoch; those of one that is in a checkpoint are not measured again."""
+        try:
+            super().log_metrics(metrics, step)
+        except MlflowException:
+            self._left.write_text(json.dumps({"metrics": dict(metrics), "step": step}))
+            raise
+
+    def finalize(self, status: str = "success") -> None:
+        """Do nothing: the run ends with its evaluation."""
+
+
+@contextmanager
+def alone(settings: Tracking, identity: str) -> Iterator[None]:
+    """Keep other processes from the same training; the system frees the lock of a process that was killed.
+
+    Args:
+        settings: whose folder of artifacts all these processes share.
+        identity: fingerprint of the run.
+
+    Raises:
+        InputError: another process trains it, or the folder cannot be written.
+    """
+    folder = _unfinished(settings)
+    lock = FileLock(folder / f"{identity}.lock")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(
+            f"a training with the same configuration ({identity}) is in progress in another process: "
+            "wait for it"
+        ) from None
+    except OSError as error:
+        raise unwritable(folder, error, "tracking.artifacts=FOLDER") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def find_unfinished(store: Store, settings: Tracking, identity: str) -> Run | None:
+    """Return the last killed run that the same code on the same processor can continue; call it alone.
+
+    Args:
+        store: where.
+        settings: with ``resume=False``, no run is continued.
+        identity: fingerprint of the run.
+    """
+    for run in store.find("RUNNING", fingerprint=identity):
+        if (_unfinished(settings) / run.info.run_id).is_dir():  # else of a process with another folder
+            store.client.set_terminated(run.info.run_id, "KILLED")
+    source = source_tags()
+    for run in store.find("KILLED", fingerprint=identity) if settings.resume else ():
+        same = all(run.data.tags.get(key) == value for key, value in source.items())
+        if same and (_unfinished(settings) / run.info.run_id / LAST).is_file():
+            _log.info(
+                "run %s was interrupted and continues: tracking.resume=false repeats it", run.info.run_id
+            )
+            return run
+    return None
+
+
+def _unfinished_folder(settings: Tracking, run: Run) -> Path:
+    """Return the folder for the checkpoints of a run; it is made where it is missing.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = _unfinished(settings) / run.info.run_id
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error, "tracking.artifacts=FOLDER") from error
+    return folder
+
+
+def _unfinished(settings: Tracking) -> Path:
+    """Return the folder of the checkpoints and locks of all trainings."""
+    return Path(settings.artifacts or "mlartifacts").expanduser() / "unfinished"
+
+
+def _is_finished(store: Store, config: DictConfig, identity: dict[str, str]) -> bool:
+    """Return whether a run did a training before and may replace it; print its metrics."""
+    if not config.tracking.resume:
+        return False
+    finished = store.find("FINISHED", fingerprint=identity["fingerprint"])
+    if finished:
+        _show_finished(finished[0])
+    return bool(finished)
+
+
+def _show_finished(run: Run) -> None:
+    """Print the metrics of a run that did a training before; a sweep prints those of all its runs."""
+    note_reuse(run)
+    if PARENT not in os.environ:
+        _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
+        Console().print(metrics_table(run.data.metrics, run.info.run_name))
+
+
+def _limit_threads(number: int | None) -> None:
+    """Set the number of threads of torch; None: its default."""
+    if number is not None:
+        if number < 1:
+            raise InputError(f"tracking.threads={number} must be at least 1, or null")
+        torch.set_num_threads(number)
+
+
+def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
+    """Log what a learner has learned, for :meth:`skin.runs.finished_run.FinishedRun.load_weights`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = learner.save(Path(folder))
+        store.client.log_artifact(run.info.run_id, str(path))
+        store.client.set_tag(run.info.run_id, "learned", path.name)
+
+
+def _join(config: DictConfig) -> None:
+    """Train in one of several processes (``trainer.devices``); the first one does all the rest."""
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        data, learner = build_data(config, build_device(config)), build_learner(config)
+        learner.fit(data)
+
+
+def tags(config: DictConfig) -> dict[str, str]:
+    """Return the tags that identify a run."""
+    return {
+        "fingerprint": fingerprint(config),
+        "row": config.row,
+        "simulator": simulator(config),
+        "seed": str(config.seed),
+    }
+
+
+def simulator(config: DictConfig) -> str:
+    """Return the name of the simulator that touches come from; without one, of the device."""
+    name = "simulator" if "simulator" in config.device else "device"
+    return _option(config.device.simulator if name == "simulator" else config.device, name)
+
+
+def _option(part: DictConfig, name: str) -> str:
+    """Return the name of the option that a part of a configuration builds."""
+    if "_target_" not in part:
+        raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
+    return option_name(import_target(part["_target_"], name))
+
+
+def describe(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
+    """Log the configuration of a run before it starts.
+
+    Args:
+        store: where.
+        run: its id.
+        config: its configuration; unused groups may be left out.
+        data_hash: of the touches of its training.
+    """
+    chosen = {key: value for key, value in plain(config).items() if value is not None}
+    store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(chosen)), "config.yaml")
+    store.client.set_tag(run, "data_hash", data_hash)
+    groups = ("simulator", "device", "representation", "model", "fusion", "learner")
+    unused = _unused(config)
+    used = [group for group in groups if group in config and group not in unused]
+    choices = {group: _option(config[group], group) for group in used}
+    scalars = {"seed": config.seed, "row": config.row}
+    if "simulator" in config.device:
+        scalars |= {
+            "gestures": config.data.gestures,
+            "fresh": config.data.fresh,
+            "stream": config.data.stream,
+            "direction": config.data.direction,
+        }
+    else:
+        choices.pop("simulator", None)
+    params = relevant_overrides(config) | choices | scalars
+    store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
+
+
+def _differences(config: DictConfig) -> list[str]:
+    """Return the overrides that distinguish this run: in a sweep, those that are swept."""
+    found = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
+    if SWEPT in os.environ:
+        found = {key: value for key, value in found.items() if key in os.environ[SWEPT].split()}
+    return [f"{key.split('.')[-1]}={value}" for key, value in found.items()]
+
+
+def relevant_overrides(config: DictConfig) -> dict[str, str]:
+    """Return the overrides of the running command that affect its result; empty without a command."""
+    if not HydraConfig.initialized():
+        return {}
+    parsed = OverridesParser.create().parse_overrides(overrides())
+    found = {one.key_or_group: one.get_value_element_as_str() for one in parsed if not one.is_delete()}
+    unused = _unused(config)
+    return {
+        key: value
+        for key, value in found.items()
+        if not key.startswith(_STEERING) and key.split(".")[0] not in unused
+    }
+
+
+def _unused(config: DictConfig) -> tuple[str, ...]:
+    """Return the groups that have no part in a run, because its learner holds no network."""
+    return () if _holds(plain(config).get("learner"), "model") else _NETWORK
+
+
+def _holds(value: Any, name: str) -> bool:
+    """Return whether a setting has this name, however deep."""
+    return isinstance(value, dict) and (name in value or any(_holds(one, name) for one in value.values()))
+
+
+def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:
+    """Log an evaluation, with its predictions and confusion matrices, and further values.
+
+    The operating point is stored as the tag ``TAG``; :attr:`skin.runs.finished_run.FinishedRun.point` reads
+    it.
+    """
+    point = report.point
+    if point is not None:
+        values = values | {"alarm/threshold": point.threshold, "alarm/safe_gestures": point.safe}
+        if point.warning():
+            _log.warning("warning: %s", point.warning())
+    store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
+    defined = {name: value for name, value in report.metrics.items() if not math.isnan(value)}
+    store.log_metrics(run, defined | values)
+    with tempfile.TemporaryDirectory() as folder:
+        _write(report, task, Path(folder))
+        store.client.log_artifacts(run.info.run_id, folder)
+    for column, reason in report.cannot.items():
+        store.client.set_tag(run.info.run_id, f"cannot_{column}", reason)
+
+
+def _write(report: Report, task: Task, folder: Path) -> None:
+    """Write predictions, and confusion matrices as a picture."""
+    pq.write_table(report.predictions, folder / "predictions.parquet")
+    if report.outcomes is not None:
+        np.save(folder / OUTCOMES, report.outcomes)
+    if report.confusion is not None:
+        named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
+        save_figure(confusions(named, ("no", "yes")), folder / "confusion.png")

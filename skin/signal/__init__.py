@@ -1,1 +1,0 @@
-"""Readings as signals: device imperfections, resampling, contact detection, features."""

@@ -1,0 +1,80 @@
+"""The contract of every layout."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from skin.body.layout.base import AbstractLayout
+from skin.body.layout.grid import Grid
+from skin.body.sensors import Sensors
+from skin.errors import InputError
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.naive import Naive
+
+CONF = Path(__file__).parents[3] / "conf"
+OPTIONS = sorted((CONF / "layout").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module", params=sorted((CONF / "body").glob("*.yaml")), ids=lambda path: path.stem)
+def body(request):
+    return instantiate(OmegaConf.load(request.param))
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda path: path.stem)
+def test_every_layout_places_sensors_in_the_body(option, body):
+    layout = instantiate(OmegaConf.load(option))
+    assert isinstance(layout, AbstractLayout)
+    sensors = layout.sensors(body)
+    assert isinstance(sensors, Sensors)
+    assert sensors.positions.shape == (len(sensors), 3) == (25, 3)
+    assert sensors.footprint == (0.01, 0.01)
+    assert ((sensors.positions >= 0) & (sensors.positions <= [*body.size, body.thickness])).all()
+    np.testing.assert_allclose(sensors.positions[:, 2], 0.005)
+    np.testing.assert_array_equal(sensors.positions, layout.sensors(body).positions)
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda path: path.stem)
+def test_every_layout_says_which_way_sensors_face(option, body):
+    sensors = instantiate(OmegaConf.load(option)).sensors(body)
+    np.testing.assert_array_equal(sensors.normals, [[0, 0, 1]] * 25)
+
+
+def test_one_normal_holds_for_all_sensors():
+    sensors = Sensors(np.zeros((3, 3)), (0.01, 0.01), np.array([0.6, 0.0, -0.8]))
+    np.testing.assert_array_equal(sensors.normals, [[0.6, 0, -0.8]] * 3)
+    assert sensors.tilted.all()
+    assert replace(sensors, footprint=(0.02, 0.01)).normals.shape == (3, 3)
+    with pytest.raises(ValueError, match="shape"):
+        Sensors(np.zeros((3, 3)), (0.01, 0.01), np.ones((2, 3)))
+
+
+@pytest.mark.parametrize("simulator", [Naive, PlatesAndBeams])
+def test_what_feels_no_shear_refuses_tilted_sensors(simulator):
+    body = instantiate(OmegaConf.load(CONF / "body" / "sheet.yaml"))
+    sensors = Grid(2, 2).sensors(body)
+    normals = sensors.normals.copy()
+    normals[2] = [0.6, 0.0, 0.8]
+    with pytest.raises(InputError, match=r"sensor 3 is tilted, but simulator=(naive|fem) .*simulator=solid"):
+        simulator(body, replace(sensors, normals=normals))
+
+
+def test_sensors_upside_down_read_the_same():
+    body = instantiate(OmegaConf.load(CONF / "body" / "sheet.yaml"))
+    sensors = Grid(2, 2).sensors(body)
+    assert len(Naive(body, replace(sensors, normals=-sensors.normals))(torch.ones(32, 32)).readings) == 4
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda path: path.stem)
+def test_shipped_layouts_run_from_the_upper_left_rightwards_and_down(option, body):
+    x, y, _ = instantiate(OmegaConf.load(option)).sensors(body).positions.T
+    if option.stem == "random":  # which has no rows
+        assert (np.diff(y) >= 0).all()
+        return
+    rows = y.reshape(5, 5)
+    assert (np.diff(x.reshape(5, 5), axis=1) > 0).all()
+    assert (rows[1:].min(axis=1) > rows[:-1].max(axis=1)).all()

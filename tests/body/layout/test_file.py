@@ -1,0 +1,155 @@
+"""Layout files: what a person may write, and what is refused by name."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin.body.layout.file import File
+from skin.body.layout.grid import Grid
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from tests.damage import DAMAGED_FILES, damaged, opened
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+
+
+FACING = "x_m,y_m,normal_x,normal_y,normal_z\n"
+
+
+@pytest.fixture
+def sensors(tmp_path):
+    """Write a layout file and read its sensors."""
+
+    def read(text: str | bytes):
+        path = tmp_path / "layout.csv"
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return File(str(path)).sensors(BODY)
+
+    return read
+
+
+def test_order_depth_and_other_columns(sensors):
+    """The rows keep their order; columns may come in any, with spaces, a byte order mark, blank lines."""
+    read = sensors("\ufeffname, depth_m, y_m, x_m\nb, 0, 0.02, 0.15\n\na, 0.005, 0.01, 0.03\n")
+    np.testing.assert_allclose(read.positions, [[0.15, 0.02, 0], [0.03, 0.01, 0.005]])
+
+
+def test_depth_defaults_to_the_interface_under_the_top_layer(sensors):
+    assert sensors("x_m,y_m\n0.1,0.1\n").positions[0, 2] == 0.005
+
+
+def test_normals_are_made_unit_vectors(sensors):
+    """3-4-5 triangles; one that faces outwards stays so."""
+    read = sensors(FACING + "0.1,0.1,0.3,0,0.4\n0.05,0.1,0,0,-7\n0.1,0.05,0,-4,3\n")
+    np.testing.assert_allclose(read.normals, [[0.6, 0, 0.8], [0, 0, -1], [0, -0.8, 0.6]], atol=1e-15)
+    assert read.tilted.tolist() == [True, False, True]
+
+
+def test_sensors_face_the_surface_where_the_file_does_not_say(sensors):
+    read = sensors("x_m,y_m\n0.1,0.1\n0.05,0.1\n")
+    np.testing.assert_array_equal(read.normals, [[0, 0, 1]] * 2)
+    assert not read.tilted.any()
+
+
+def test_the_shipped_tilted_file_is_the_shipped_layout_turned_by_30_degrees():
+    tilted, upright = (File(f"data/layouts/{name}_5x5.csv").sensors(BODY) for name in ("tilted", "jittered"))
+    np.testing.assert_array_equal(tilted.positions, upright.positions)
+    np.testing.assert_allclose(tilted.normals, Grid(5, 5, tilt=np.pi / 6).sensors(BODY).normals, atol=1e-6)
+
+
+def test_a_relative_path_is_looked_for_here_first(tmp_path, monkeypatch):
+    here = tmp_path / "data" / "layouts"
+    here.mkdir(parents=True)
+    (here / "jittered_5x5.csv").write_text("x_m,y_m\n0.1,0.1\n")
+    assert len(File("data/layouts/jittered_5x5.csv").sensors(BODY)) == 25
+    monkeypatch.chdir(tmp_path)
+    assert len(File("data/layouts/jittered_5x5.csv").sensors(BODY)) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no column x_m and y_m, found nothing"),
+        ("x_m,y_m\n", "no sensor below the header"),
+        ("x,y_m\n0.1,0.1\n", "no column x_m, found x, y_m"),
+        ("x_m,y_m\n0.1,0.1\n0.1,abc\n", "line 3: y_m must be a number in m, got 'abc'"),
+        ("x_m,y_m\n0.1,nan\n", "line 2: y_m must be a number in m, got 'nan'"),
+        ("x_m,y_m\n0.1,inf\n", "line 2: y_m must be a number"),
+        ("x_m,y_m\n0.1\n", "line 2: y_m must be a number in m, got None"),
+        ("x_m,y_m,depth_m\n0.1,0.1,\n", "line 2: depth_m must be a number in m, got ''"),
+        ("x_m,y_m\n0.1,0.1\n80,40\n", "1 of 2 sensors lie outside.*sensor 2 at x = 80 m.*in metres"),
+        ("x_m,y_m,depth_m\n0.1,0.1,0.02\n", "outside the body.*depth = 0.02 m"),
+        ("x_m,y_m\n0.1,0.1\n0.05,0.1\n0.1,0.1\n", "sensors 1 and 3 are at one place, x = 0.1 m, y = 0.1 m"),
+        ("x_m,y_m,depth_m\n0.1,0.1,0\n0.1,0.1,0.005\n", "sensors 1 and 2 are at one place"),
+        (
+            "x_m,y_m,normal_x,normal_z\n0.1,0.1,0,1\n",
+            "no column normal_y, found x_m, y_m, normal_x, normal_z",
+        ),
+        (FACING + "0.1,0.1,0,0,1\n0.1,0.05,0,0,0\n", "line 3: a normal of length 0 faces nowhere"),
+        (FACING + "0.1,0.1,0,up,1\n", "line 2: normal_y must be a number, got 'up'"),
+        (b"x_m,y_m\n\xff\xfe,0.1\n", "cannot read the layout"),
+    ],
+)
+def test_what_is_no_layout_is_refused_by_name(sensors, text, says):
+    with pytest.raises(InputError, match=says):
+        sensors(text)
+
+
+@pytest.mark.parametrize("path", ["nowhere.csv", "/", "data/layouts"])
+def test_a_missing_file_is_refused_with_where_it_was_looked_for(path):
+    with pytest.raises(InputError, match=r"no layout file .*: looked for .*layout.path=FILE.csv"):
+        File(path)
+
+
+def test_a_script_may_give_a_path(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("x_m,y_m\n0.1,0.1\n")
+    assert len(File(path).sensors(BODY)) == 1
+
+
+MINE = b"""x_m, y_m, depth_m, normal_x, normal_y, normal_z
+0.02, 0.03, 0.004, 0, 0, 1
+0.08, 0.031, 0.004, 0.5, 0, 1
+0.15, 0.12, 0.005, 0, -1, 2
+"""
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_every_file_works_or_is_refused(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "damaged.csv"
+    path.write_bytes(data.draw(damaged(MINE)))
+    read = opened(lambda: File(str(path)).sensors(BODY))
+    assert read is None or (np.isfinite(read.positions).all() and np.isfinite(read.normals).all())
+
+
+def test_more_sensors_than_any_skin_has_are_refused_before_they_take_memory(sensors):
+    rows = "".join(f"{0.00001 * number},0.1\n" for number in range(10_001))
+    with pytest.raises(InputError, match="it has more than 10000 sensors"):
+        sensors(f"x_m,y_m\n{rows}")
+    with pytest.raises(InputError, match="it has more than 4194304 bytes"):
+        sensors("x_m,y_m\n" + "0.1,0.1\n" * 600_000)
+    assert (
+        len(sensors("x_m,y_m\n" + "".join(f"{0.00001 * number},0.1\n" for number in range(10_000)))) == 10_000
+    )
+
+
+@pytest.mark.parametrize("number", ["1e300", "1e999", "nan", "-1e10"])
+def test_numbers_that_overflow_are_refused(sensors, number):
+    with pytest.raises(InputError, match="line 2: normal_x must be a number"):
+        sensors(f"{FACING}0.1,0.1,{number},0,1\n")
+
+
+def test_a_column_twice_is_refused(sensors):
+    with pytest.raises(InputError, match="the column x_m is there twice"):
+        sensors("x_m,y_m,x_m\n0.1,0.1,0.2\n")
+
+
+def test_a_normal_too_short_to_have_a_direction_is_refused(sensors):
+    with pytest.raises(InputError, match="a normal of length 0"):
+        sensors(f"{FACING}0.1,0.1,1e-300,0,0\n")

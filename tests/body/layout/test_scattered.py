@@ -1,0 +1,53 @@
+"""The scattered layout, and the file that holds the default one."""
+
+import numpy as np
+import pytest
+
+from skin.body.layout.file import File
+from skin.body.layout.grid import Grid
+from skin.body.layout.scattered import Scattered
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+
+
+def test_the_shipped_file_is_the_layout_of_seed_0():
+    shipped = File("data/layouts/jittered_5x5.csv").sensors(BODY)
+    np.testing.assert_array_equal(shipped.positions, Scattered(5, 5, 0.25, seed=0).sensors(BODY).positions)
+
+
+def test_no_sensor_moves_farther_than_the_jitter():
+    wide = Sheet([0.30, 0.16], [8, 8], LAYERS)
+    pitch = np.array([0.30 / 6, 0.16 / 4])
+    moves = np.concatenate(
+        [
+            Scattered(4, 6, 0.25, seed).sensors(wide).positions[:, :2]
+            - Grid(4, 6).sensors(wide).positions[:, :2]
+            for seed in range(20)
+        ]
+    )
+    assert (np.abs(moves) <= 0.25 * pitch + 1e-6).all()
+    assert (np.abs(moves).max(axis=0) > 0.24 * pitch).all()
+
+
+def test_moved_sensors_keep_their_tilt():
+    scattered, grid = (kind(4, 6, tilt=0.3).sensors(BODY).normals for kind in (Scattered, Grid))
+    np.testing.assert_array_equal(scattered, grid)
+    given = np.tile([0.6, 0.0, 0.8], (25, 1))
+    np.testing.assert_array_equal(Scattered(normals=given).sensors(BODY).normals, given)
+
+
+def test_seeds_differ():
+    first, second = (Scattered(seed=seed).sensors(BODY).positions for seed in (1, 2))
+    assert not np.allclose(first, second)
+
+
+@pytest.mark.parametrize("jitter", [-0.1, 0.5])
+def test_a_jitter_at_which_sensors_could_meet_is_refused(jitter):
+    with pytest.raises(InputError, match=r"layout\.jitter=.* must be .*: as in layout.jitter=0\.25"):
+        Scattered(jitter=jitter)

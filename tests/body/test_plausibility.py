@@ -1,0 +1,112 @@
+"""Values that are off by a unit, and skins whose mechanics do nothing."""
+
+import pytest
+import torch
+
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
+
+ONE = "body.layers=[{material: {name: rubber, young: 83e3, poisson: 0.45}, thickness: 0.012}]"
+SMALL = ("body.size=[0.08,0.08]", "body.cells=[4,4]", "layout=grid", "layout.rows=2", "layout.columns=2")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "body.layers.0.thickness=12",
+            r"body.layers.0.thickness=12 m is not plausible: .* from 1e-05 to 0.2 m",
+        ),
+        ("body.layers.1.thickness=5.0", r"body.layers.1.thickness=5 m"),
+        (
+            ONE.replace("83e3", "83"),
+            r"body.layers.0.material.young=83 Pa is not plausible: .* from 1000 to 1e\+12 Pa",
+        ),
+        (ONE.replace("83e3", "0.083"), r"material.young=0.083 Pa"),
+        ("body.size=[160,160]", r"body.size=160 m is not plausible: it is given in m, from 0.005 to 3 m"),
+        ("body.size=[0.16,16]", r"body.size=16 m"),
+        ("layout.footprint=[10,10]", r"layout.footprint=10 m is not plausible: .* from 0.0001 to 0.5 m"),
+        ("touch.safe_peak=[10,90.5]", r"touch.safe_peak=10 Pa is not plausible: .* from 100 to 1e\+08 Pa"),
+        ("touch.thresholds.pressure=90.5", r"touch.thresholds.pressure=90.5 Pa"),
+        ("touch.thresholds.travel=1", r"touch.thresholds.travel=1 m is not"),
+        ("touch.speed=[30,200]", r"touch.speed=30 m/s"),
+        ("touch.window=30", r"touch.window=30 s is not plausible"),
+        ("touch.press=[4,20]", r"touch.press=20 s"),
+        ("touch.spare=10", r"touch.spare=10 m"),
+        ("device.position_error=2", r"device.position_error=2 m"),
+        (ONE.replace("0.45", "45"), r"material.poisson=45 must be less than 1"),
+        (
+            "layout.depth=5",
+            r"depth = 5 m, on a surface of 0.16 x 0.16 m, 0.015 m thick: positions are in metres",
+        ),
+        ("layout.depth=deep", r"layout.depth=deep must be a valid number"),
+    ],
+)
+def test_a_value_off_by_a_unit_is_refused_with_the_range(configured, override, message):
+    with pytest.raises(Exception, match=message) as refused:
+        build_device(validate_config(configured(override)))
+    assert isinstance(refused.value, InputError) or isinstance(refused.value.__cause__, InputError)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["body.radius=50"], r"body.radius=50 m"),
+        (["body.length=160"], r"body.length=160 m"),
+        (["contact=rigid", "contact.relief=4"], r"contact.relief=4 m is not plausible"),
+    ],
+)
+def test_so_is_one_of_an_arm_or_a_rigid_object(configured, overrides, message):
+    with pytest.raises(InputError, match=message):
+        build_device(validate_config(configured("body=arm", "simulator=solid", *overrides)))
+
+
+def test_a_class_takes_what_a_proof_needs():
+    assert Sheet([1.0, 1.0], [2, 2], [{"material": "EcoFlex 00-30", "thickness": 1.0}]).thickness == 1
+
+
+def readings(configured, *overrides):
+    """Return what four sensors read of 100 kPa on one cell above the first."""
+    model = build_device(validate_config(configured(*SMALL, "body.cells=[8,8]", *overrides))).model
+    pressure = torch.zeros(8, 8)
+    pressure[2, 2] = 1e5
+    return model(pressure).readings
+
+
+@pytest.mark.parametrize("simulator", ["fem", "solid"])
+def test_sensors_on_the_surface_are_warned_of(configured, simulator):
+    config = validate_config(configured(f"simulator={simulator}", *SMALL, ONE))
+    with pytest.warns(
+        UserWarning, match=r"4 of 4 sensors lie on the surface.*layout.depth=0.004 simulator=solid"
+    ):
+        build_device(config)
+
+
+def test_without_mechanics_nobody_is_warned(configured):
+    build_device(validate_config(configured("simulator=naive", *SMALL, ONE)))
+
+
+STACK = (
+    "body.layers=[{material: {name: a, young: 560e3, poisson: 0.45}, thickness: 0.006},"
+    "{material: {name: b, young: YOUNG, poisson: 0.45}, thickness: 0.006}]"
+)
+
+
+def test_on_the_surface_of_plates_nothing_below_is_felt(configured):
+    """83 kPa and 83 MPa read the same, and so do 12 and 50 mm: what the warning says."""
+    layers = [ONE, ONE.replace("83e3", "83e6"), ONE.replace("0.012", "0.050")]
+    with pytest.warns(UserWarning, match="on the surface"):
+        first, *others = (readings(configured, "simulator=fem", one) for one in layers)
+    for other in others:
+        torch.testing.assert_close(other, first)
+
+
+@pytest.mark.parametrize(
+    "layers",
+    [(ONE, ONE.replace("0.012", "0.050")), (STACK.replace("YOUNG", "83e3"), STACK.replace("YOUNG", "83e6"))],
+)
+def test_at_a_depth_of_the_solid_thickness_and_stiffness_are_felt(configured, layers):
+    one, other = (readings(configured, "simulator=solid", "layout.depth=0.004", each) for each in layers)
+    assert (one - other).abs().max() > 0.05 * one.max()

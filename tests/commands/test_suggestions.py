@@ -1,0 +1,55 @@
+"""A mistyped override is answered with what to type."""
+
+import shlex
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from skin.commands._command import quote_value
+from skin.commands.train import main
+
+
+@pytest.mark.parametrize(
+    ("word", "answer"),
+    [
+        ("simulater=solid", "there is no setting or group simulater: did you mean simulator?"),
+        ("device.nois=3", "there is no setting or group device.nois: did you mean device.noise?"),
+        ("touch.rat=3", "there is no setting or group touch.rat: did you mean touch.rate?"),
+        ("simulator=solit", "there is no simulator=solit: did you mean solid? There are fem, naive, solid"),
+        ("simulator=xyz", "there is no simulator=xyz: there are fem, naive, solid\n"),
+        (
+            "out=bench (1).csv",
+            """out=bench (1).csv cannot be read: quote the value, as in 'out="bench (1).csv"'""",
+        ),
+        ("device.path=a=b.csv", """a=b.csv cannot be read: quote the value, as in 'device.path="a=b.csv"'"""),
+        ("data.name=a,b", """data.name=a,b cannot be read: quote the value, as in 'data.name="a,b"'"""),
+    ],
+)
+def test_the_answer_names_what_was_meant(word, answer, capsys, monkeypatch):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        main([word])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert answer in error
+    assert len(error.splitlines()) == 1
+
+
+def test_a_name_that_is_near_to_none_keeps_the_answer_of_hydra(capsys):
+    with pytest.raises(SystemExit):
+        main(["qqqq=3"])
+    assert "Could not override 'qqqq'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "value", ["bench (1).csv", "it's.csv", 'a "b".csv', "a,b.csv", "x=y.csv", "(a", "ü {1}.csv"]
+)
+def test_the_quoted_form_has_the_same_value(value):
+    (word,) = shlex.split(quote_value(f"device.path={value}"))
+    override = OverridesParser.create().parse_override(word)
+    assert (override.key_or_group, override.value()) == ("device.path", value)
+
+
+def test_what_quotes_do_not_mend_has_no_suggestion():
+    assert quote_value("out") is None
+    assert quote_value("a b=c") is None

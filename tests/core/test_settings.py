@@ -1,0 +1,195 @@
+"""Settings are refused by name where they have the wrong type, are out of range, or are unknown."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import pytest
+from annotated_types import Ge, Gt
+
+from skin.core.settings import ONCE, RISING, check_groups, check_settings, checked, configured
+from skin.errors import InputError
+from skin.hardware.live.engine_builder import LiveSettings
+from skin.runs.build import build_data, build_device, build_learner
+
+
+class Thing:
+    def __init__(
+        self,
+        made: Callable[..., Any],
+        count: Annotated[int, Ge(1)] = 1,
+        share: float = 0.5,
+        width: Annotated[float, Gt(0)] | None = None,
+        kind: Literal["a", "b"] = "a",
+        widths: Sequence[int] = (),
+        name: str = "",
+        on: bool = False,
+        copies: Mapping[str, int] | None = None,
+        span: Annotated[tuple[float, float], RISING] = (1, 10),
+        labels: Annotated[Sequence[str], ONCE] = (),
+    ) -> None:
+        pass
+
+
+FIT = {"count": 2, "share": 1, "width": None, "kind": "b", "widths": [1, 2], "name": "x", "copies": {"a": 1}}
+
+
+def test_what_fits_is_taken():
+    check_settings(Thing, {**FIT, "_partial_": True, "made": {"_target_": "anything"}}, "thing")
+    check_settings(lambda **settings: None, {"anything": 1}, "thing")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"count": 0}, "thing.count=0 must be greater than or equal to 1"),
+        ({"count": 0.5}, "thing.count=0.5 must be a valid integer"),
+        ({"count": "2"}, "thing.count=2 is text, and must be a number"),
+        ({"share": "abc"}, "thing.share=abc must be a valid number"),
+        ({"share": float("nan")}, "thing.share=nan must be a finite number"),
+        ({"share": float("inf")}, "thing.share=inf must be a finite number"),
+        ({"width": 0}, "thing.width=0 must be greater than 0"),
+        ({"kind": "c"}, "thing.kind=c must be 'a' or 'b'"),
+        ({"widths": 8}, "thing.widths=8 must be a list"),
+        ({"widths": ["x"]}, r"thing.widths=\['x'\] must be a valid integer"),
+        ({"name": 1}, "thing.name=1 must be a valid string"),
+        ({"count": 2.0}, "thing.count=2.0 must be a whole number"),
+        ({"count": True}, "thing.count=True must be a whole number"),
+        ({"widths": [1, "2"]}, r"thing.widths=\[1, '2'\] is text, and must be a number"),
+        ({"share": -1j}, "thing.share=.*: as in thing.share=0.5$"),
+        (
+            {"span": [2, 1]},
+            r"thing.span=\[2, 1\] must be a range .*: as in thing.span=\[1,10\]$",
+        ),
+        ({"span": [2]}, r"thing.span=\[2\] has too few entries"),
+        ({"span": [1, 2, 3]}, r"thing.span=\[1, 2, 3\] has too many entries"),
+        ({"labels": ["a", "b", "a"]}, r"thing.labels=\['a', 'b', 'a'\] must hold each name once"),
+        ({"widths": [0.5] * 50}, r"thing.widths=.{80}\.\.\. must be a valid integer"),
+        ({"shar": 1}, "thing has no setting shar: did you mean share[?] it has count, share, width"),
+        ({"zzz": 1}, "thing has no setting zzz: it has count"),
+        ({1: 2}, "thing has no setting 1: it has count"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(wrong, said):
+    with pytest.raises(InputError, match=f"^{said}"):
+        check_settings(Thing, FIT | wrong, "thing")
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ({"_target_": f"{__name__}.Thing", "count": 0}, "model.count=0 must be greater"),
+        (
+            {"_target_": "absent.Thing"},
+            "model._target_=absent.Thing cannot be imported: No module named 'absent'",
+        ),
+        (
+            {"_target_": "skin.learning.model.mlp.Mpl"},
+            "model._target_=skin.learning.model.mlp.Mpl cannot be imported",
+        ),
+    ],
+)
+def test_classes_of_others_are_checked_too(part, said):
+    with pytest.raises(InputError, match=f"^{said}"):
+        check_groups({"learner": {"model": part}})
+
+
+def test_classes_of_libraries_check_themselves():
+    check_groups({"learner": {"optimizer": {"_target_": "torch.optim.Adam", "no": "such setting"}}})
+
+
+def test_settings_that_are_all_are_missed_by_name():
+    with pytest.raises(InputError, match=r"^thing needs made, got count$"):
+        configured(Thing, {"count": 1}, "thing")
+    with pytest.raises(InputError, match=r"^thing has no setting mad: did you mean made"):
+        configured(Thing, {"mad": 1}, "thing")
+
+
+def test_a_checked_class_refuses_what_a_script_gives_it():
+    @checked("pair")
+    class Pair:
+        def __init__(self, first: Annotated[int, Ge(1)], second: float = 0.5) -> None:
+            self.sum = first + second
+
+    assert Pair(1, second=2).sum == 3
+    for given in ({"first": 0}, {"first": 1.5}, {"first": 1, "second": "x"}):
+        with pytest.raises(InputError, match=r"^pair[.]"):
+            Pair(**given)
+    with pytest.raises(TypeError, match="third"):
+        Pair(1, third=2)
+
+
+SMALL = ["simulator=naive", "data.gestures=20"]
+SERIAL = ["device=serial", "device.port=/dev/null"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["optimizer.lr=oops"], "optimizer.lr=oops is text"),
+        (["optimizer.lr=-1"], "the optimizer refuses its settings: Invalid learning rate: -1"),
+        (["+optimizer.lrr=1"], "the optimizer refuses its settings: .*lrr"),
+        (["model.channels=8"], "model.channels=8 must be a list"),
+        (["+model.channelz=3"], "model has no setting channelz: did you mean channels"),
+        (["fusion.hidden=x"], "fusion.hidden=x must be a valid integer"),
+        (["trainer.max_epochs=0"], "trainer.max_epochs=0 must be a whole number from 1 up"),
+        (["trainer.max_epochs=0.5"], "trainer.max_epochs=0.5 must be a whole number from 1 up"),
+        (["trainer.accelerator=gpus"], "Trainer refuses trainer: .*gpus"),
+        (["+trainer.typo=1"], "Trainer refuses trainer: .*typo"),
+        (["learner=boosted_trees", "learner.rounds=0"], "learner.rounds=0 must be greater than or equal"),
+        (
+            ["representation=interp", "representation.pixels=x"],
+            "representation.pixels=x must be a valid integer",
+        ),
+        (["device.noise=abc"], "device.noise=abc must be a valid number"),
+        (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
+        (["device.clip=0"], "device.clip=0 must be greater than 0"),
+        (["device.stuck=0.5"], "device.stuck=0.5 must be a valid integer"),
+        (["device.dead=[4,2]"], "device.dead must be a number from 0 up or a range"),
+        (
+            ["+device.noize=1"],
+            "device has no setting noize: did you mean noise[?] it has .*gain_spread, offset",
+        ),
+        (["layout=grid", "layout.rows=1.5"], "layout.rows=1.5 must be a valid integer"),
+        (["body.cells=9"], "body.cells=9 must be a list"),
+        (["simulator=solid", "simulator.divisions=x"], "simulator.divisions=x must be a valid integer"),
+        ([*SERIAL, "device.scale=abc"], "device.scale=abc must be a valid number"),
+        ([*SERIAL, "device.tare=inf"], "device.tare=inf must be a finite number"),
+        ([*SERIAL, "device.limits=[a,b]"], "device.limits=.* must be a valid number"),
+        ([*SERIAL, "device.limits=[1023,0]"], r"device.limits=\[1023, 0\] must be \[smallest, largest\]"),
+        ([*SERIAL, "device.limits=[1]"], r"device.limits=\[1\] has too few entries"),
+    ],
+)
+def test_a_group_refuses_a_setting_before_anything_is_made(configured, overrides, said):
+    config = configured(*SMALL, *overrides)
+    with pytest.raises(InputError, match=said):
+        build_learner(config).check(build_data(config, build_device(config)))
+
+
+LIVE = {"web_port": 8765, "top": 4.0, "touch": None, "drift": 0.2, "verdicts": None, "log": None,
+        "selftest": True, "patience": {"label": 0.15}}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"web_port": "abc"}, "live.web_port=abc must be a valid integer"),
+        ({"web_port": 70000}, "live.web_port=70000 must be less than or equal to 65535"),
+        ({"top": 0}, "live.top=0 must be greater than 0"),
+        ({"top": float("nan")}, "live.top=nan must be a finite number"),
+        ({"touch": -1}, "live.touch=-1 must be greater than 0"),
+        ({"drift": -1}, "live.drift=-1 must be greater than or equal to 0"),
+        ({"patience": {"alarm": "abc"}}, "live.patience.alarm=abc must be a valid number"),
+        ({"patience": {"alarms": 0.1}}, "live.patience has no setting alarms: did you mean alarm"),
+        ({"tuoch": 1}, "live has no setting tuoch: did you mean touch"),
+    ],
+)
+def test_the_live_view_refuses_a_setting_by_name(wrong, said):
+    assert LiveSettings.of(LIVE).patience.label == 0.15
+    with pytest.raises(InputError, match=said):
+        LiveSettings.of(LIVE | wrong)
+
+
+def test_a_command_ends_with_code_2_and_logs_nothing(run, tmp_path):
+    done = run(tmp_path, "train", *SMALL, "trainer.max_epochs=0.5")
+    assert done.returncode == 2
+    assert done.stderr == "trainer.max_epochs=0.5 must be a whole number from 1 up\n"

@@ -1,0 +1,85 @@
+"""A stored run builds every shipped option, and nothing that only looks like one."""
+
+import pytest
+
+from skin.core.files import CONF
+from skin.core.settings import GROUPS, check_targets
+from skin.errors import InputError
+from skin.runs.configuration import plain, validate_config
+
+OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+
+
+def refuse(name):
+    with pytest.raises(InputError, match=r"a run: learner\._target_ names .*trust=true"):
+        check_targets({"learner": {"_target_": name}}, "a run")
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_may_be_built(configured, group, option):
+    check_targets(plain(validate_config(configured(f"{group}={option}"))), "a run")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "torch.optim.AdamW",
+        "torch.optim.adamw.AdamW",
+        "torch_geometric.nn.aggr.Set2Set",
+        "torch_geometric.nn.GCNConv",
+    ],
+)
+@pytest.mark.filterwarnings("ignore:`torch.jit")  # of PyTorch Geometric's import
+def test_parts_of_libraries_may_be_built(name):
+    check_targets({"model": [{"_target_": name, "_partial_": True}]}, "a run")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pandas.read_pickle",
+        "shutil.copyfile",
+        "torch.load",
+        "torch.nn.Linear",
+        "torch.optim.optimizer.torch.load",
+        "torch.optim.optimizer.torch.nn.Linear",
+        "torch_geometric.nn.Sequential",
+        "torch_geometric.nn.models.BasicGNN.from_pretrained",
+        "torch_geometric.nn.aggr.base.Path",
+        "hydra.utils.get_object",
+        "skin",
+        "skin.",
+        "skin..learner",
+        "skin.x.os.system",
+        "skin.device.files.read_recording",
+        "skin.device.files.os.system",
+        "skin.device.files.Path",
+        "skin.learning.learner.network.torch.load",
+        "skin.learning.learner.network.torch.optim.Adam",
+        "skin.learning.learner.base.AbstractLearner",
+        "skin.learning.learner.rules.Rules.load",
+        "skin.hardware.emulator.emulator.AbstractPort",
+        "skinny.Learner",
+        "experiments.peers.rocket.AbstractLearner",
+        "experiments.peers.rocket.subprocess.Popen",
+        "experiments.studies.study.Study",
+        None,
+        ["skin.learning.learner.rules.Rules"],
+    ],
+)
+def test_nothing_else_may_be_built(name):
+    refuse(name)
+
+
+def test_names_are_resolved_only_inside_the_package(tmp_path, monkeypatch):
+    """To import a module is to run it."""
+    (tmp_path / "bait.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    refuse("bait.Learner")
+
+
+@pytest.mark.parametrize("value", ["${oc.env:HOME}", "x${row}", "\\${row}"])
+@pytest.mark.parametrize("place", [lambda value: {"a": [{"b": value}]}, lambda value: {"a": {value: 1}}])
+def test_values_are_final(place, value):
+    with pytest.raises(InputError, match="interpolation"):
+        check_targets(place(value), "a run")

@@ -1,0 +1,345 @@
+"""Recordings in files: equal to the last bit, or refused by name."""
+
+import json
+import random
+import resource
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin.device.files import read_description, read_recording, write_recording
+from skin.device.touches import Recording, Touches
+from skin.errors import InputError
+from skin.touch.labels import TOUCH, Task
+from tests.damage import DAMAGED_FILES, damaged, mutated, opened
+
+BATCH, TIME, SENSORS = 7, 5, 3
+
+
+def recording(**changes) -> Recording:
+    generator = torch.Generator().manual_seed(0)
+    # From 1e-10 to 1e10: a file that rounds would show it.
+    readings = torch.randn(BATCH, TIME, SENSORS, generator=generator) * 10 ** torch.linspace(-10, 10, SENSORS)
+    valid = torch.ones(BATCH, TIME, SENSORS, dtype=torch.bool)
+    valid[2, 1, 0], readings[2, 1, 0] = False, 0.0
+    touches = Touches(
+        readings,
+        valid,
+        torch.rand(SENSORS, 3, generator=generator),
+        (torch.rand(BATCH, 4, generator=generator) > 0.5).float(),
+        12.5,
+    )
+    parts = {
+        "touches": touches,
+        "task": TOUCH,
+        "size": (0.16, 0.1),
+        "footprint": (0.01, 0.02),
+        "force": torch.rand(BATCH, TIME, generator=generator),
+        "displacement": torch.rand(BATCH, TIME, SENSORS, 2, generator=generator),
+        "parameters": {"force": torch.rand(BATCH), "speed": torch.rand(BATCH)},
+        "metadata": {"seed": 3, "note": "ü"},
+    }
+    return Recording(**(parts | changes))
+
+
+def by_hand(path: Path) -> Path:
+    """Remove the checksums beside a CSV file, as a person does who changes it."""
+    beside = path.with_name(path.name + ".json")
+    about = json.loads(beside.read_text())
+    del about["sha256"]
+    beside.write_text(json.dumps(about))
+    return path
+
+
+def same(one, other) -> bool:
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other) and one.dtype == other.dtype
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, Recording | Touches):
+        return same(vars(one), vars(other))
+    return one == other
+
+
+def variants() -> dict[str, Recording]:
+    full = recording()
+    return {
+        "full": full,
+        "readings only": recording(force=None, displacement=None, parameters={}, metadata={}),
+        "unlabelled": replace(full, touches=replace(full.touches, labels=None)),
+        "direction": replace(
+            full,
+            task=Task(("dynamic", "cos", "sin"), direction=True),
+            touches=replace(
+                full.touches, labels=torch.cat([torch.rand(BATCH, 1).round(), torch.rand(BATCH, 2) - 0.5], 1)
+            ),
+        ),
+    }
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+@pytest.mark.parametrize("variant", variants())
+def test_reads_back_equal(tmp_path, suffix, variant):
+    kept = variants()[variant]
+    assert same(read_recording(write_recording(kept, tmp_path / f"x.{suffix}")), kept)
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_rows_are_the_reports(tmp_path, suffix):
+    """Read without this project's code."""
+    kept = recording()
+    path = write_recording(kept, tmp_path / f"x.{suffix}")
+    table = pa.csv.read_csv(path) if suffix == "csv" else pa.parquet.read_table(path)
+    readings = [f"reading_0{number}" for number in range(SENSORS)]
+    moves = [f"{name}_0{number}" for name in ("D_s", "D_t") for number in range(SENSORS)]
+    ids = ["simulation", "frame", *TOUCH.names]
+    assert table.column_names == [*ids, *readings, "force", *moves, "gesture_force", "gesture_speed"]
+    row = table.slice(4 * TIME + 3, 1).to_pylist()[0]
+    assert (row["simulation"], row["frame"]) == (4, 3)
+    assert [row[name] for name in TOUCH.names] == kept.touches.labels[4].tolist()
+    assert row["reading_02"] == pytest.approx(float(kept.touches.readings[4, 3, 2]))
+    assert row["D_t_01"] == pytest.approx(float(kept.displacement[4, 3, 1, 1]))
+    assert table["reading_00"][2 * TIME + 1].as_py() is None
+
+
+def test_units_and_layout_are_in_the_file(tmp_path):
+    kept = recording()
+    about = json.loads(
+        pa.parquet.read_schema(write_recording(kept, tmp_path / "x.parquet")).metadata[b"skin"]
+    )
+    beside = json.loads(write_recording(kept, tmp_path / "x.csv").with_name("x.csv.json").read_text())
+    assert set(beside.pop("sha256")) == {"table", "description"}
+    assert about == beside
+    assert about["units"]["reading"] == "N"
+    assert about["positions"] == kept.touches.positions.tolist()
+    assert about["metadata"]["seed"] == 3
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_touches_are_numbered_from_the_first(tmp_path, suffix):
+    kept = recording()
+    path = write_recording(kept, tmp_path / f"x.{suffix}", first=5000)
+    table = pa.csv.read_csv(path) if suffix == "csv" else pa.parquet.read_table(path)
+    assert table["simulation"].unique().to_pylist() == list(range(5000, 5000 + BATCH))
+    assert same(read_recording(path), kept)
+    assert read_description(path)["first"] == 5000
+
+
+def test_what_is_not_complete_has_the_touches_only(tmp_path):
+    kept = recording()
+    found = read_recording(write_recording(kept, tmp_path / "x.parquet"), complete=False)
+    assert same(found, replace(kept, force=None, displacement=None, parameters={}))
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = write_recording(recording(), tmp_path / "x.parquet")
+    before = path.read_bytes()
+
+    def fail(table, partial, **options):
+        partial.write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr("skin.device.files.write_parquet", fail)
+    with pytest.raises(InputError, match=r"cannot write .*disk full"):
+        write_recording(recording(force=None), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_files_that_are_no_recordings_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no recording .*x.parquet: skin generate"):
+        read_recording(tmp_path / "x.parquet")
+    with pytest.raises(InputError, match=r"a recording is a \.parquet or \.csv file, got x.txt"):
+        write_recording(recording(), tmp_path / "x.txt")
+    (tmp_path / "y.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"y.csv is damaged or no recording .*: it needs y.csv.json"):
+        read_recording(tmp_path / "y.csv")
+    pa.parquet.write_table(pa.table({"a": [1]}), tmp_path / "z.parquet")
+    with pytest.raises(InputError, match=r"z.parquet is damaged or no recording .* its schema has no units"):
+        read_recording(tmp_path / "z.parquet")
+    path = write_recording(recording(), tmp_path / "cut.parquet")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"cut.parquet is damaged"):
+        read_recording(path)
+
+
+def test_a_csv_without_some_rows_or_columns_is_refused(tmp_path):
+    path = by_hand(write_recording(recording(), tmp_path / "x.csv"))
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:-1]))
+    with pytest.raises(InputError, match=r"34 rows, not 7 touches of 5 frames"):
+        read_recording(path)
+    path.write_text("".join([*lines[:8], lines[9], lines[8], *lines[10:]]))
+    with pytest.raises(InputError, match=r"row 8: simulation and frame are \[1, 3\], expected \[1, 2\]"):
+        read_recording(path)
+    path.write_text("".join(lines).replace("reading_01", "reading_99"))
+    with pytest.raises(InputError, match=r"damaged or no recording.*reading_01"):
+        read_recording(path)
+
+
+def test_other_units_are_refused(tmp_path):
+    path = by_hand(write_recording(recording(), tmp_path / "x.csv"))
+    beside = path.with_name("x.csv.json")
+    beside.write_text(beside.read_text().replace('"reading": "N"', '"reading": "kgf"'))
+    with pytest.raises(InputError, match=r"has the units .*kgf"):
+        read_recording(path)
+
+
+def test_recordings_from_before_directions_are_read(tmp_path):
+    kept = recording()
+    path = by_hand(write_recording(kept, tmp_path / "x.csv"))
+    beside = path.with_name("x.csv.json")
+    about = json.loads(beside.read_text())
+    del about["task"]["direction"]
+    beside.write_text(json.dumps(about))
+    assert same(read_recording(path), kept)
+
+
+@contextmanager
+def memory(more: int = 1 << 30):
+    """Let this process allocate no more than ``more`` bytes on top of what it has."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + more, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="address space is read from /proc")
+JUNK = [None, True, -1, 0, 0.5, 3, 2**31, 2**62, 1e308, float("nan"), "", "x", [], [[]], [1], {}, {"x": [1]}]
+
+
+def altered(about: dict, chance: random.Random) -> dict:
+    """Return a description with one value, at whatever depth, replaced by junk or removed."""
+    about = json.loads(json.dumps(about))
+    inside, key = about, chance.choice(sorted(about.keys() - {"metadata"}))
+    while isinstance(inside[key], dict | list) and inside[key] and chance.random() < 0.5:
+        inside = inside[key]
+        key = chance.randrange(len(inside)) if isinstance(inside, list) else chance.choice(sorted(inside))
+    if chance.random() < 0.2:
+        del inside[key]
+    else:
+        inside[key] = chance.choice(JUNK)
+    return about
+
+
+def read_or_refused(path: Path) -> Recording | None:
+    """Return what a file holds, or None where it is refused in one sentence; all else is an error."""
+    try:
+        found = read_recording(path)
+    except InputError as error:
+        said = str(error)
+    else:
+        said = ""
+    if said:
+        assert path.name in said
+        assert "\n" not in said
+        return None
+    assert found.touches.readings.shape == found.touches.valid.shape
+    return found
+
+
+@linux
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_an_altered_description_is_refused_or_read(tmp_path, suffix):
+    path, chance = write_recording(recording(), tmp_path / f"x.{suffix}"), random.Random(0)
+    sidecar, refused = tmp_path / "x.csv.json", 0
+    table = pyarrow.parquet.read_table(path) if suffix == "parquet" else None
+    about = json.loads(table.schema.metadata[b"skin"] if table else sidecar.read_text())
+    with memory():
+        for _ in range(200):
+            text = json.dumps(altered(about, chance))
+            if table:
+                pyarrow.parquet.write_table(table.replace_schema_metadata({"skin": text}), path)
+            else:
+                sidecar.write_text(text)
+            refused += read_or_refused(path) is None
+    assert refused > 150
+
+
+@linux
+def test_altered_bytes_are_refused_or_mean_nothing(tmp_path):
+    kept = recording()
+    path, chance = write_recording(kept, tmp_path / "x.parquet"), random.Random(0)
+    whole, refused = path.read_bytes(), 0
+    footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+    with memory():
+        for number in range(200):
+            content = bytearray(whole)
+            for _ in range(chance.choice([1, 2, 8])):
+                content[chance.randrange(footer if number % 2 else 4, len(whole))] = chance.randrange(256)
+            path.write_bytes(content)
+            found = read_or_refused(path)
+            refused += found is None
+            assert found is None or same(found, kept)
+    assert refused > 100
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "null", '"x"', "[" * 5000, '{"format": 1}', "{", "\x00"])
+def test_a_sidecar_of_another_type_is_refused(tmp_path, content):
+    path = write_recording(recording(), tmp_path / "x.csv")
+    (tmp_path / "x.csv.json").write_text(content)
+    assert read_or_refused(path) is None
+
+
+@pytest.mark.parametrize("name", ["gestures", "frames"])
+def test_a_gesture_without_frames_is_refused(tmp_path, name):
+    path = write_recording(recording(), tmp_path / "x.csv")
+    about = json.loads((tmp_path / "x.csv.json").read_text())
+    (tmp_path / "x.csv.json").write_text(json.dumps(about | {name: 0}))
+    path.write_text(path.read_text().splitlines()[0] + "\n")
+    with pytest.raises(InputError, match=f"x.csv: description.{name}=0 must be greater than or equal to 1"):
+        read_recording(path)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return a folder with a recording in both formats."""
+    folder = tmp_path_factory.mktemp("recording")
+    for suffix in ("parquet", "csv"):
+        write_recording(recording(parameters={}), folder / f"x.{suffix}")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["x.parquet", "x.csv", "x.csv.json"])
+def test_damage_never_passes_for_readings(written, tmp_path, name):
+    for path in written.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+
+    @DAMAGED_FILES
+    @given(data=st.data())
+    def try_it(data):
+        (tmp_path / name).write_bytes(data.draw(damaged((written / name).read_bytes())))
+        known = opened(lambda: read_recording(tmp_path / name.removesuffix(".json")))
+        assert known is None or same(known, recording(parameters={}))
+
+    try_it()
+
+
+@DAMAGED_FILES
+@given(data=st.data())
+def test_a_description_by_hand_works_or_is_refused(written, data):
+    path = written / "y.csv"
+    path.write_bytes((written / "x.csv").read_bytes())
+    about = json.loads((written / "x.csv.json").read_text())
+    del about["sha256"]
+    (written / "y.csv.json").write_text(json.dumps(data.draw(mutated(about))))
+    opened(lambda: read_recording(path))
+
+
+def test_who_changes_a_csv_is_told_what_to_do(tmp_path):
+    path = write_recording(recording(), tmp_path / "x.csv")
+    path.write_text(path.read_text().replace("0.", "1.", 1))
+    with pytest.raises(InputError, match=r"remove sha256 from x\.csv\.json if you changed"):
+        read_recording(path)
+    assert len(read_recording(by_hand(path))) == BATCH

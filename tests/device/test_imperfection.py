@@ -1,0 +1,225 @@
+"""Imperfections, one by one."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.device.calibration import Calibration
+from skin.device.imperfection import Imperfection
+from skin.errors import InputError
+
+NONE = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0}
+
+
+def generator(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def apply(readings: torch.Tensor, seed: int = 0, **settings):
+    imperfection = Imperfection(**(NONE | settings))
+    constants = imperfection.constants(readings.shape[-1], generator(seed))
+    return imperfection.apply(readings, constants, generator(seed + 1000))
+
+
+def test_a_perfect_device_says_the_truth():
+    readings = torch.linspace(-3, 9, 24).view(2, 3, 4)
+    said, valid, _ = apply(readings)
+    torch.testing.assert_close(said, readings)
+    assert valid.all()
+
+
+def test_noise_and_offset_come_after_the_clip():
+    """So what is said passes the clip, as in the report (2.1.4)."""
+    said, *_ = apply(torch.full((400, 30, 25), 50.0), noise=0.05, offset=0.1)
+    assert said.max() > 10.05
+    frames, sensors = said.std(dim=(0, 1)), said.mean(dim=(0, 1)) - 10
+    torch.testing.assert_close(frames, torch.full((25,), 0.05), rtol=0.05, atol=0)
+    assert 0.05 < sensors.std() < 0.16
+
+
+def test_gain_comes_before_the_clip():
+    said, *_ = apply(torch.full((2, 3, 1000), 50.0), gain_spread=0.05)
+    assert (said == 10).all()
+    below, *_ = apply(torch.full((2, 3, 1000), 5.0), gain_spread=0.05)
+    assert 0.045 < below[0, 0].div(5).log().std() < 0.055
+    assert torch.equal(below[0], below[1])
+
+
+def test_constants_belong_to_the_device_and_noise_does_not():
+    idle = torch.zeros(5, 30, 25)
+    one, *_ = apply(idle, offset=0.1)
+    assert torch.equal(one[0, 0], one[4, 29])
+    other, *_ = apply(idle, seed=1, offset=0.1)
+    assert not torch.equal(one, other)
+
+
+def test_dead_sensors_read_zero_and_are_invalid():
+    said, valid, _ = apply(torch.full((5, 30, 25), 3.0), dead=4, offset=0.1, noise=0.05)
+    assert (~valid).sum(-1).eq(4).all()
+    assert (said[~valid] == 0).all()
+    assert (said[valid] > 2).all()
+    assert (valid == valid[0, 0]).all()
+
+
+def test_tare_removes_the_offset_but_for_the_noise_of_its_idle_frames():
+    idle = torch.zeros(1, 1, 4000)
+    with_offset, *_ = apply(idle, offset=0.1)
+    tared, *_ = apply(idle, offset=0.1, noise=0.05, tare=True)
+    assert with_offset.std() > 0.09
+    assert abs(float(tared.std()) - 0.05 * np.sqrt(1 + 1 / 30)) < 0.003
+
+
+def test_a_device_per_gesture():
+    imperfection = Imperfection(noise=0, dead=2)
+    constants = imperfection.constants(25, generator(), gestures=6)
+    said, valid, _ = imperfection.apply(torch.zeros(6, 30, 25), constants, generator(1))
+    assert (said == said[:, :1]).all()
+    assert not torch.equal(said[0], said[1])
+    assert (~valid).sum(-1).eq(2).all()
+
+
+def test_every_device_draws_its_own_number_of_dead_sensors():
+    """1 to 4 of 25, equally often: 3000 draws leave a share of a quarter within 0.03 (4 standard errors)."""
+    constants = Imperfection(dead=[1, 4]).constants(25, generator(), gestures=3000)
+    counts = constants.dead.sum(-1).flatten()
+    assert counts.unique().tolist() == [1, 2, 3, 4]
+    assert ((counts.bincount()[1:] / 3000 - 0.25).abs() < 0.032).all()
+    one = Imperfection(dead=[3, 3]).constants(25, generator())
+    assert all(
+        torch.equal(*both) for both in zip(one, Imperfection(dead=3).constants(25, generator()), strict=True)
+    )
+
+
+def test_living_sensors_at_their_limit_are_saturated():
+    imperfection = Imperfection(gain_spread=0, dead=1)
+    constants = imperfection.constants(2, generator())
+    readings = torch.zeros(3, 4, 2)
+    living = int((~constants.dead).nonzero())
+    readings[0, 2, living], readings[1, 2, 1 - living], readings[2, 0, living] = 11.0, 11.0, 9.9
+    said, valid, saturated = imperfection.apply(readings, constants, generator(1))
+    assert saturated.nonzero().tolist() == [[0, 2, living]]
+    assert valid[0, 2, living]
+    assert said[0, 2, living] == pytest.approx(10.0, abs=1.0)
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(InputError, match=r"device.noise=-1 must be greater than or equal to 0"):
+        Imperfection(noise=-1)
+    with pytest.raises(InputError, match=r"device.clip=0 must be greater than 0"):
+        Imperfection(clip=0)
+    with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
+        Imperfection(dead=25).constants(25, generator())
+    for dead in (-1, 2.5, [3], [4, 2], [0, 1.5], "two"):
+        with pytest.raises(InputError, match=r"device.dead must be a number from 0 up or a range"):
+            Imperfection(dead=dead)
+
+
+def test_the_default_device_is_what_it_was():
+    """Written down again: clip the force, add noise and offset; the order of the draws is part of it."""
+    true = 8 * torch.randn(40, 30, 25, generator=torch.Generator().manual_seed(0)).abs()
+    imperfection, draws, again = Imperfection(dead=2), generator(5), generator(5)
+    constants = imperfection.constants(25, draws)
+    said, valid, _ = imperfection.apply(true, constants, draws)
+    gain = torch.from_numpy(np.exp(0.05 * again.standard_normal(25))).float()
+    offset = torch.from_numpy(0.1 * again.standard_normal(25)).float()
+    dead = torch.from_numpy(again.random(25).argsort().argsort() < 2)
+    again.standard_normal(25)
+    noise = torch.from_numpy(again.standard_normal(true.shape, dtype=np.float32))
+    expected = (true * gain).clamp(-10, 10) + (0.05 * noise + offset)
+    assert torch.equal(said, torch.where(dead, 0, expected))
+    assert torch.equal(valid, (~dead).expand(true.shape))
+
+
+def test_stuck_and_saturated_sensors_are_invalid_and_say_one_thing():
+    imperfection = Imperfection(dead=1, stuck=2, saturated=3)
+    constants = imperfection.constants(25, generator())
+    readings = torch.rand(2, 30, 25)
+    said, valid, _ = imperfection.apply(readings, constants, generator(1))
+    assert (~valid).sum(-1).eq(6).all()
+    assert (said[~valid] == 0).all()
+    raw = imperfection.raw(readings, constants, generator(1))
+    levels = raw[0, 0, ~valid[0, 0]]
+    assert (raw[..., ~valid[0, 0]] == levels).all()
+    assert (levels == 0).sum() == 1
+    assert (levels == 10).sum() == 3
+    assert ((levels > 0) & (levels < 10)).sum() == 2
+
+
+def test_drift_grows_with_time():
+    said, *_ = apply(torch.zeros(1, 301, 1000), drift=0.02)
+    assert (said[0, 0] == 0).all()
+    assert float(said[0, 300].std()) == pytest.approx(0.02 * 30, rel=0.1)
+    torch.testing.assert_close(said[0, 100] * 3, said[0, 300])
+
+
+def test_a_tare_is_taken_after_the_converter():
+    said, *_ = apply(torch.zeros(1, 50, 200), quantum=0.5, offset=2.0, tare=True, noise=0.01)
+    steps = (said - said[:, :1]) / 0.5
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-4)
+
+
+CALIBRATION = Calibration(
+    {"gain": [0.8, 1.2, None], "offset": [0.1, -0.2, 0.3], "clip": [9.0, 5.0, None]},
+    {"stuck": [2]},
+    {"gain": [0.5, 1.5], "dead": [0, 2]},
+)
+
+
+def test_a_calibrated_device_is_the_real_one_whatever_the_seed():
+    imperfection = Imperfection(gain_spread=3, noise=3, offset=3, dead=0, calibration=CALIBRATION)
+    for seed in (0, 1):
+        said, valid, _ = imperfection.apply(
+            torch.full((1, 2, 3), 10.0), imperfection.constants(3, generator(seed)), generator()
+        )
+        torch.testing.assert_close(said[0, 0], torch.tensor([8.1, 4.8, 0]))
+        assert valid[0, 0].tolist() == [True, True, False]
+
+
+def test_ranges_give_every_gesture_another_device():
+    constants = Imperfection(calibration=CALIBRATION).constants(3, generator(), gestures=3000)
+    assert constants.gain.min() >= 0.5
+    assert constants.gain.max() <= 1.5
+    assert abs(float(constants.gain.mean()) - 1) < 0.02
+    assert torch.equal(constants.offset[7], torch.tensor([[0.1, -0.2, 0.3]]))
+    counts = constants.dead.sum(-1).flatten().bincount(minlength=4)
+    assert counts[3] == 0
+    assert (counts[:3] > 900).all()
+
+
+def test_further_sensors_of_a_calibrated_device_may_die():
+    imperfection = Imperfection(dead=1, calibration=CALIBRATION)
+    alive = {int((~imperfection.constants(3, generator(seed)).dead).sum()) for seed in range(20)}
+    assert alive == {1, 2}
+    with pytest.raises(InputError, match=r"device.dead=3 of 3 sensors leaves none alive"):
+        Imperfection(dead=3, calibration=CALIBRATION).constants(3, generator())
+    with pytest.raises(InputError, match=r"the calibration has 3 sensors, the layout 25"):
+        imperfection.constants(25, generator())
+
+
+def test_a_device_takes_one_share_of_all_its_ranges():
+    ranges = {"noise": [0.05, 0.2], "time_constant": (0.0, 0.2), "hysteresis": [0.0, 0.1], "offset": 0.0}
+    drawn = Imperfection(**ranges).constants(5, generator(), gestures=2000)
+    share = (drawn.noise - 0.05) / 0.15
+    assert share.shape == (2000, 1, 1)
+    assert 0 <= share.min() < 0.01 < 0.99 < share.max() <= 1
+    assert share.mean() == pytest.approx(0.5, abs=0.03)
+    torch.testing.assert_close(drawn.time_constant, 0.2 * share)
+    torch.testing.assert_close(drawn.hysteresis, 0.1 * share)
+    one = Imperfection(**ranges).constants(5, generator(1))
+    assert 0.05 <= one.noise.item() <= 0.2
+
+
+def test_spreads_grow_with_the_share_of_a_device():
+    drawn = Imperfection(noise=[0.0, 1.0], gain_spread=[0.0, 0.4], drift=[0.0, 0.1]).constants(
+        25, generator(), gestures=2000
+    )
+    share = drawn.noise[:, 0, 0]
+    for value, most in ((drawn.gain.log(), 0.4), (drawn.drift, 0.1)):
+        spread = value[:, 0].std(dim=1)
+        assert (spread / (most * share)).median().item() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("given", [[0.2, 0.1], [-0.1, 0.1], [0.1], "much"])
+def test_what_is_no_range_is_refused(given):
+    with pytest.raises(InputError, match=r"device\.noise"):
+        Imperfection(noise=given)

@@ -1,0 +1,75 @@
+"""Touches and recordings hold together or are refused."""
+
+import pytest
+import torch
+
+from skin.device.touches import Recording, Touches, concatenate
+from skin.touch.labels import TOUCH
+
+
+def touches(count: int = 4, moving: bool = False) -> Touches:
+    positions = torch.rand(count, 6, 3, 3) if moving else torch.rand(3, 3)
+    readings = torch.arange(count * 18.0).view(count, 6, 3)
+    return Touches(readings, readings > 2, positions, torch.eye(4)[:count], 10.0)
+
+
+def recording(count: int = 4) -> Recording:
+    extra = {"force": torch.rand(count, 6), "displacement": torch.rand(count, 6, 3, 2)}
+    return Recording(
+        touches(count), TOUCH, (0.1, 0.1), (0.01, 0.01), **extra, parameters={"speed": torch.rand(count)}
+    )
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("index", [slice(1, 3), torch.tensor([3, 0])])
+def test_selected_touches(moving, index):
+    every = touches(moving=moving)
+    some = every[index]
+    assert len(some) == 2
+    assert torch.equal(some.readings, every.readings[index])
+    assert torch.equal(some.labels, every.labels[index])
+    assert torch.equal(some.positions, every.positions[index] if moving else every.positions)
+
+
+def test_touches_move_to_a_device():
+    moved = touches().to("meta")
+    assert moved.readings.device.type == moved.labels.device.type == "meta"
+    assert moved.rate == 10.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"valid": torch.ones(4, 6, 2, dtype=torch.bool)},
+        {"valid": torch.ones(4, 6, 3)},
+        {"positions": torch.zeros(2, 3)},
+        {"labels": torch.zeros(3, 4)},
+    ],
+)
+def test_touches_that_disagree_are_refused(wrong):
+    good = vars(touches())
+    with pytest.raises(ValueError, match=r"must"):
+        Touches(**(good | wrong))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"touches": touches(moving=True)},
+        {"force": torch.zeros(4, 5)},
+        {"displacement": torch.zeros(4, 6, 3)},
+        {"parameters": {"speed": torch.zeros(3)}},
+    ],
+)
+def test_recordings_that_disagree_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"must"):
+        Recording(**(vars(recording()) | wrong))
+
+
+def test_parts_join_to_the_whole():
+    whole = recording()
+    again = concatenate([whole[:1], whole[1:]])
+    assert torch.equal(again.touches.readings, whole.touches.readings)
+    assert torch.equal(again.touches.valid, whole.touches.valid)
+    assert torch.equal(again.displacement, whole.displacement)
+    assert torch.equal(again.parameters["speed"], whole.parameters["speed"])

@@ -1,0 +1,64 @@
+"""Boosted trees."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from skin.device.touches import Touches
+from skin.errors import InputError
+from skin.learning.data import TouchData
+from skin.learning.learner.boosted_trees import BoostedTrees
+from skin.learning.representation.readings import Readings
+from skin.touch.labels import Task
+
+
+def test_exclusive_probabilities_sum_to_one(made_up_device):
+    made_up_device.task = Task(("a", "b", "c", "d"), "exclusive")
+    features = BoostedTrees(rounds=5)
+    features.fit(TouchData(made_up_device, Readings))
+    total = features.probabilities(made_up_device.touches("test")).sum(dim=1)
+    torch.testing.assert_close(total, torch.ones(40))
+
+
+def test_validation_chooses_the_number_of_trees(made_up_device):
+    few, many = BoostedTrees(rounds=4), BoostedTrees(rounds=400)
+    for features in (few, many):
+        features.fit(TouchData(made_up_device, Readings))
+    assert few.parameters < many.parameters
+    assert all(model.n_iter_ < 400 for model in many._models)
+
+
+def test_a_label_that_never_changes_is_refused(made_up_device):
+    touches = made_up_device.touches
+
+    def constant(split, epoch=0):
+        one = touches(split)
+        labels = one.labels.clone()
+        labels[:, 2] = 1
+        return Touches(one.readings, one.valid, one.positions, labels, one.rate)
+
+    made_up_device.touches = constant
+    with pytest.raises(InputError, match="the same label press"):
+        BoostedTrees(rounds=2).fit(TouchData(made_up_device, Readings))
+
+
+def test_what_is_stored_predicts_the_same_bits_without_a_pickle(made_up_device, tmp_path):
+    features, again = BoostedTrees(rounds=20), BoostedTrees()
+    data = TouchData(made_up_device, Readings)
+    features.fit(data)
+    path = features.save(tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        assert {Path(name).suffix for name in archive.namelist()} == {".json", ".npy"}
+    again.load(data, path)
+    assert again.parameters == features.parameters
+    touches = made_up_device.touches("test")
+    assert torch.equal(again.probabilities(touches), features.probabilities(touches))
+
+
+def test_trees_of_an_earlier_version_are_refused(made_up_device, tmp_path):
+    np.savez(tmp_path / "features.npz", train=np.zeros(3))
+    with pytest.raises(InputError, match=r"features.npz holds the training data .*: train the run again"):
+        BoostedTrees().load(TouchData(made_up_device, Readings), tmp_path / "features.npz")

@@ -1,0 +1,147 @@
+"""Training by gradient descent."""
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from pytorch_lightning.loggers import CSVLogger
+
+from skin.body.layout.scattered import Scattered
+from skin.errors import InputError
+from skin.learning.data import TouchData
+from skin.runs.build import build_data, build_device, build_learner
+
+
+def curve(folder):
+    """Return the logged losses of validation and training by epoch."""
+    lines = (folder / "lightning_logs" / "version_0" / "metrics.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[1:]]
+    return ([float(row[name]) for row in rows if row[name]] for name in ("val_loss", "train_loss"))
+
+
+@pytest.mark.slow
+def test_it_learns_touches_of_the_naive_skin_and_takes_another_layout(configured, tmp_path):
+    config = configured(
+        "experiment=temporal_graph", "simulator=naive", "data.gestures=600", "device.test_gestures=300",
+        "trainer.max_epochs=12",
+    )  # fmt: skip
+    device = build_device(config)
+    data, learner = build_data(config, device), build_learner(config)
+    learner.fit(data, CSVLogger(tmp_path))
+    validation, train = curve(tmp_path)
+    assert len(train) == 12
+    assert train[-1] < 0.75 * train[0]
+    assert min(validation) < 0.9 * validation[0]
+    for tried in (device, device.replace(layout=Scattered(6, 4, seed=3))):
+        touches = tried.touches("test")
+        right = (learner.probabilities(touches) > 0.5) == (touches.labels > 0.5)
+        assert right.float().mean() > 0.65
+
+
+def test_the_weights_of_the_best_validation_loss_are_kept(configured, made_up_device, tmp_path):
+    config = configured(
+        "representation=readings", "model=mlp", "fusion=early", "optimizer.lr=0.1", "trainer.max_epochs=12"
+    )
+    data = TouchData(made_up_device, instantiate(config.representation), 32)
+    learner = build_learner(config)
+    learner.fit(data, CSVLogger(tmp_path))
+    validation, _ = curve(tmp_path)
+    assert min(validation) < validation[-1]  # a rate so high that the last epoch is not the best
+    touches = made_up_device.touches("validation")
+    chance = learner.probabilities(touches)
+    loss = torch.nn.functional.binary_cross_entropy(chance, touches.labels)
+    assert loss.item() == pytest.approx(min(validation), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["model=gcn"], "model=gcn needs representation=graph, got image: add representation=graph"),
+        (
+            ["representation=graph"],
+            "model=cnn needs representation=image, got graph: add representation=image",
+        ),
+        (["fusion=linked"], "fusion=linked needs representation=graph, got image: add representation=graph"),
+        (["model.channels=[8,8,8,8,8,8]"], "6 blocks from an image of 64 x 64 pixels"),
+        (["learner.activation=sine"], "activation=relu, elu or silu"),
+        (["fusion.head=sum"], "fusion.head=sum must be 'mean'"),
+        (["learner.hidden=[8,0]"], r"learner.hidden=\[8, 0\] must be greater than or equal to 1"),
+        (["learner.hidden=8"], "learner.hidden=8 must be a list"),
+        (["learner.dropout=1"], "learner.dropout=1 must be less than 1"),
+        (["learner.warmup=-0.1"], "learner.warmup=-0.1 must be greater than or equal to 0"),
+        (["trainer.max_epochs=1.5"], "trainer.max_epochs=1.5 must be a whole number from 1 up"),
+        (["trainer.precision=bf16-true"], "give 32-true, 16-mixed or bf16-mixed"),
+    ],
+)
+def test_choices_that_do_not_fit_are_refused(overrides, words, configured, made_up_device):
+    config = configured(*overrides)
+    data = TouchData(made_up_device, instantiate(config.representation))
+    with pytest.raises(InputError, match=words):
+        build_learner(config).fit(data)
+
+
+def test_readings_of_another_number_of_sensors_are_refused(configured, made_up_device):
+    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1")
+    data = TouchData(made_up_device, instantiate(config.representation))
+    learner = build_learner(config)
+    learner.fit(data)
+    touches = made_up_device.touches("test")
+    fewer = type(touches)(
+        touches.readings[..., :9], touches.valid[..., :9], touches.positions[:9], touches.labels, 10.0
+    )
+    with pytest.raises(
+        InputError, match="12 readings per frame, got 9: train with representation=graph or image"
+    ):
+        learner.probabilities(fewer)
+
+
+def test_probabilities_are_the_dense_layers_on_the_embedding(configured, made_up_device):
+    config = configured("representation=graph", "model=gcn", "fusion.hidden=24", "trainer.max_epochs=1")
+    data = TouchData(made_up_device, instantiate(config.representation))
+    learner = build_learner(config)
+    with pytest.raises(RuntimeError, match="fit or load"):
+        learner.embeddings(made_up_device.touches("test"))
+    classifier = learner.build(data)
+    touches = made_up_device.touches("train")  # more than one chunk
+    found = learner.embeddings(touches)
+    assert found.shape == (160, 24)
+    with torch.inference_mode():
+        expected = classifier.head(found).sigmoid()
+    assert torch.allclose(learner.probabilities(touches), expected, atol=1e-6)
+
+
+def test_callbacks_and_loggers_of_the_trainer_join_ours(configured, made_up_device, tmp_path):
+    stop = "{_target_: pytorch_lightning.callbacks.EarlyStopping, monitor: val_loss, stopping_threshold: 100}"
+    log = f"{{_target_: pytorch_lightning.loggers.CSVLogger, save_dir: {tmp_path}, name: theirs}}"
+    config = configured(
+        "representation=readings", "model=mlp", f"+trainer.callbacks=[{stop}]", f"+trainer.logger={log}"
+    )
+    data = TouchData(made_up_device, instantiate(config.representation))
+    build_learner(config).fit(data, CSVLogger(tmp_path, name="ours"))
+    for name in ("ours", "theirs"):
+        lines = next((tmp_path / name).rglob("metrics.csv")).read_text().splitlines()
+        assert len(lines) == 3  # validation and training of the first epoch, in which it stops
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["representation=image", "model=cnn"],
+        ["representation=graph", "model=gcn", "model.norm=batch", "fusion=early"],
+        ["representation=graph", "model=pyg"],
+        ["representation=features", "model=mlp", "fusion.head=residual"],
+        ["representation=graph", "model=transformer", "fusion.head=transformer"],
+    ],
+)
+def test_it_trains_with_half_of_the_bits(configured, made_up_device, overrides):
+    config = configured(*overrides, "trainer.max_epochs=1", "trainer.precision=bf16-mixed")
+    learner = build_learner(config)
+    learner.fit(TouchData(made_up_device, instantiate(config.representation), 32))
+    found = learner.probabilities(made_up_device.touches("test"))
+    assert found.dtype == torch.float32
+    assert found.isfinite().all()
+
+
+def test_a_learning_rate_may_fall_from_the_start(configured, made_up_device):
+    config = configured("representation=readings", "model=mlp", "trainer.max_epochs=1", "learner.warmup=0")
+    build_learner(config).fit(TouchData(made_up_device, instantiate(config.representation)))

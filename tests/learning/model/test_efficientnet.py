@@ -1,0 +1,225 @@
+"""EfficientNet-B0 against torchvision's, and the door for files of weights.
+
+torchvision itself cannot be imported beside this torch. What its ``efficientnet_b0`` (release 0.29.2) holds
+and returns was written down once; its numbers are the literals below.
+"""
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.learning.model.efficientnet import HEAD, EfficientNet
+
+STAGES = [928, 1448, 16714, 46640, 242930, 543148, 2026348, 717232, 412160]  # parameters of torchvision's
+EMBEDDINGS = [  # every 160th of the 1280, in double precision
+    [-0.118828, -0.090470, 0.373448, 1.135036, -0.147856, 0.274990, -0.172690, -0.103287],
+    [-0.121774, 0.240244, 0.172235, 1.077277, -0.120227, 0.137239, -0.099206, 0.012885],
+]
+SUMS = [1102.371007, 803.640291]
+
+
+def noise(shape, number):
+    return torch.as_tensor(2 * np.random.default_rng(number).random(shape) - 1)
+
+
+def value(name, shape, number):
+    """Return weights that carry a signal through all layers."""
+    if name.endswith("num_batches_tracked"):
+        return torch.tensor(0)
+    drawn = noise(shape, number)
+    if name.endswith("running_var"):
+        return (1 + 0.5 * drawn).float()
+    if len(shape) == 4:
+        return (math.sqrt(6 / math.prod(shape[1:])) * drawn).float()
+    return (1 + 0.3 * drawn if name.endswith("weight") and len(shape) == 1 else 0.1 * drawn).float()
+
+
+@pytest.fixture(scope="module")
+def official():
+    """A full state dict as torchvision writes it, with made-up numbers."""
+    own = EfficientNet("image", (1, 64, 64), weights="random").state_dict()
+    shapes = {name: tuple(tensor.shape) for name, tensor in own.items()}
+    shapes |= dict(zip(HEAD, [(1000, 1280), (1000,)], strict=True))
+    return {name: value(name, shapes[name], number) for number, name in enumerate(sorted(shapes))}
+
+
+@pytest.fixture
+def file(official, tmp_path):
+    path = tmp_path / "weights.pth"
+    torch.save(official, path)
+    return path
+
+
+def loaded(path, shape=(1, 64, 64), **options):
+    return EfficientNet("image", shape, weights=str(path), **options)
+
+
+def test_names_and_shapes_are_those_of_torchvision(official):
+    lines = "\n".join(f"{name} {tuple(official[name].shape)}" for name in sorted(official))
+    assert len(official) == 360
+    assert hashlib.sha256(lines.encode()).hexdigest().startswith("98a6d92c040c4bca")
+
+
+def test_parameters_are_those_of_torchvision():
+    model = EfficientNet("image", (1, 64, 64), weights="random")
+    sizes = [sum(parameter.numel() for parameter in stage.parameters()) for stage in model.features]
+    assert sizes == STAGES
+    assert sum(sizes) + 1280 * 1000 + 1000 == 5_288_548
+
+
+def test_the_file_gives_the_embeddings_of_torchvision(file):
+    images = noise((2, 1, 64, 64), 1000).float()
+    with torch.inference_mode():
+        embeddings = loaded(file).eval()(images, None)
+    torch.testing.assert_close(embeddings[:, ::160], torch.tensor(EMBEDDINGS), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(embeddings.sum(dim=1), torch.tensor(SUMS), atol=1e-2, rtol=1e-5)
+
+
+def test_one_channel_is_fed_three_times(file):
+    images = noise((2, 1, 48, 48), 0).float()
+    three = loaded(file, (3, 48, 48)).eval()(images.repeat(1, 3, 1, 1), None)
+    torch.testing.assert_close(loaded(file, (1, 48, 48)).eval()(images, None), three)
+
+
+def test_many_images_are_encoded_in_parts(file, monkeypatch):
+    images, model = noise((7, 1, 32, 32), 0).float(), loaded(file).eval()
+    whole = model(images, None)
+    monkeypatch.setattr("skin.learning.model.efficientnet.CHUNK", 3)
+    torch.testing.assert_close(model(images, None), whole)
+
+
+def test_a_frozen_encoder_stays_as_it_is(file, official):
+    model = loaded(file, frozen=True).train()
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+    model(noise((4, 1, 32, 32), 0).float(), None)
+    assert all(torch.equal(now, official[name]) for name, now in model.state_dict().items())
+
+
+def test_training_draws_which_images_skip_a_block(file):
+    # torchvision: of the 16 blocks number i is skipped with probability 0.2 i / 16
+    model = loaded(file, dropout=0.0)
+    blocks = [block for stage in model.features[1:-1] for block in stage]
+    assert [block.skipped for block in blocks] == [0.2 * number / 16 for number in range(16)]
+    block = blocks[10].train()
+    assert block.residual
+    x = torch.randn(400, 112, 2, 2)
+    skipped = (block(x) == x).flatten(1).all(dim=1).float().mean()
+    assert 0.06 < skipped < 0.19  # of 0.125
+
+
+def test_dropout_takes_shares_of_the_embedding_in_training_only(file):
+    model, images = loaded(file, frozen=True), noise((4, 1, 32, 32), 0).float()
+    kept = model.eval()(images, None)
+    dropped = model.train()(images, None)
+    gone = dropped == 0
+    assert 0.15 < gone.float().mean() < 0.25
+    torch.testing.assert_close(dropped[~gone], kept[~gone] / 0.8)
+
+
+@pytest.mark.parametrize(
+    "name", ["efficientnet_b0_rwightman-7f5810bc.pth", "efficientnet_b0_rwightman-3dd342df.pth"]
+)
+def test_imagenet_is_looked_for_where_torchvision_keeps_it(name, official, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    torch.save(official, folder / name)
+    found = EfficientNet("image", (1, 64, 64)).state_dict()
+    assert torch.equal(found["features.0.0.weight"], official["features.0.0.weight"])
+
+
+def test_without_imagenet_a_sentence_says_where_to_put_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(InputError) as error:
+        EfficientNet("image", (1, 64, 64))
+    for words in (
+        f"efficientnet_b0_rwightman-7f5810bc.pth in {tmp_path}/hub/checkpoints",
+        "model.weights=FILE.pth",
+        "model.weights=random trains from scratch",
+    ):
+        assert words in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=r"no weights file .*none\.pth: looked for .*model\.weights=FILE\.pth"
+    ):
+        loaded(tmp_path / "none.pth")
+
+
+def test_a_truncated_file_is_refused(file):
+    file.write_bytes(file.read_bytes()[:1_000_000])
+    with pytest.raises(
+        InputError, match=rf"cannot read the weights file {file}: it is damaged, .*get it again"
+    ):
+        loaded(file)
+
+
+def test_a_file_that_is_something_else_is_refused(file):
+    file.write_text("<html>404: no such file</html>")
+    with pytest.raises(InputError, match=rf"cannot read the weights file {file}") as error:
+        loaded(file)
+    assert "weights_only" not in str(error.value)
+
+
+class Code:
+    """An object whose unpickling runs code."""
+
+    def __reduce__(self):
+        return exec, ("raise SystemExit('ran')",)
+
+
+def test_a_file_with_code_in_it_is_refused_unrun(file):
+    torch.save({"features.0.0.weight": Code()}, file)
+    with pytest.raises(InputError, match="cannot read the weights file"):
+        loaded(file)
+
+
+def lacking(state):
+    return {name: tensor for name, tensor in state.items() if not name.startswith("features.7")}
+
+
+def altered(name, tensor):
+    return lambda state: state | {name: tensor}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lacking, r"lacks features\.7.*and 1\d more"),
+        (altered("layer4.bias", torch.zeros(3)), r"has the unknown layer4\.bias"),
+        (lambda state: {"state_dict": state}, "is no state dict"),
+        (lambda state: list(state), "is no state dict"),
+        (lambda state: {}, "lacks features"),
+        (
+            altered("features.0.0.weight", torch.zeros(40, 3, 3, 3)),
+            r"shape \(40, 3, 3, 3\) where \(32, 3, 3, 3\) is needed",
+        ),
+        (altered("features.0.1.bias", torch.full((32,), math.nan)), r"features\.0\.1\.bias.* not finite"),
+    ],
+    ids=["missing", "foreign", "wrapped", "list", "empty", "shape", "nan"],
+)
+def test_other_weights_are_refused_by_name(change, words, official, file):
+    torch.save(change(official), file)
+    with pytest.raises(InputError, match=rf"{file} .*{words}.*model\.weights=random"):
+        loaded(file)
+
+
+@pytest.mark.parametrize("channels", [2, 30])
+def test_other_channels_are_refused(channels):
+    with pytest.raises(InputError, match=f"1 or 3 channels, got {channels}: set fusion=late"):
+        EfficientNet("image", (channels, 64, 64), weights="random")
+
+
+@pytest.mark.slow
+def test_the_command_line_ends_with_code_2_and_the_sentence(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    few = ["simulator=naive", "data.gestures=20", "device.test_gestures=20"]
+    done = run(tmp_path, "train.py", "model=efficientnet", *few)
+    assert done.returncode == 2, done.stderr
+    assert "put it there from https://download.pytorch.org/models/" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,118 @@
+"""Graph networks against the laws of graphs and against PyTorch Geometric."""
+
+import warnings
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+
+from skin.errors import InputError
+from skin.learning.model.base import POOLINGS
+from skin.learning.model.gcn import Gcn, _InstanceNorm
+from skin.learning.representation.graph import adjacency, neighbours, normalised
+
+PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
+EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")
+MATRIX = torch.from_numpy(normalised(EDGES)).float()
+
+
+@contextmanager
+def quiet():
+    """Bear the warnings that PyTorch Geometric gives when it is imported."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit.script", DeprecationWarning)
+        yield
+
+
+def gcn(**options):
+    torch.manual_seed(0)
+    return Gcn("graph", (8, 2), **({"widths": [16, 5]} | options)).eval()
+
+
+@pytest.mark.parametrize("pooling", POOLINGS)
+def test_the_order_of_the_sensors_does_not_matter(pooling):
+    model = gcn(pooling=pooling)
+    x = torch.randn(4, 8, 2)
+    order = torch.randperm(8)
+    torch.testing.assert_close(model(x[:, order], MATRIX[order][:, order]), model(x, MATRIX))
+
+
+def test_the_edges_matter():
+    x = torch.randn(4, 8, 2)
+    assert not torch.allclose(gcn()(x, MATRIX), gcn()(x, torch.eye(8)), atol=1e-3)
+
+
+@pytest.mark.parametrize("widths", [[16, 5], [5, 16, 3]])
+def test_a_graph_per_frame_gives_the_same_as_one_for_all(widths):
+    x = torch.randn(4, 8, 2)
+    model = gcn(widths=widths)
+    torch.testing.assert_close(model(x, MATRIX.expand(4, 8, 8)), model(x, MATRIX))
+
+
+@pytest.mark.parametrize(("features", "width"), [(3, 7), (7, 3)])
+def test_one_convolution_is_that_of_pytorch_geometric(features, width):
+    with quiet():
+        from torch_geometric.nn import GCNConv
+    model = Gcn("graph", (8, features), widths=[width], activation="relu", pooling="max")
+    theirs = GCNConv(features, width)
+    theirs.lin.weight.data = model.convolutions[0].linear.weight.data
+    theirs.bias.data = model.convolutions[0].bias.data.normal_()
+    x = torch.randn(8, features)
+    weights = torch.from_numpy(EDGES).float()
+    index = weights.nonzero().T
+    wanted = theirs(x, index, weights[index[0], index[1]]).relu().amax(dim=0)
+    torch.testing.assert_close(model(x[None], MATRIX)[0], wanted)
+
+
+def plain(nodes):
+    """Return nodes (S, N, F) as PyTorch Geometric lists them, (N S, F), and the graph of each."""
+    return nodes.transpose(0, 1).flatten(0, 1), torch.arange(nodes.shape[1]).repeat_interleave(len(nodes))
+
+
+def test_instance_norm_is_that_of_pytorch_geometric():
+    with quiet():
+        from torch_geometric.nn import InstanceNorm
+    torch.manual_seed(0)
+    ours, theirs = _InstanceNorm(5), InstanceNorm(5, affine=True)
+    theirs.weight.data, theirs.bias.data = ours.weight.data.normal_(), ours.bias.data.normal_()
+    nodes = 3 + 2 * torch.randn(8, 4, 5)
+    wanted = theirs(*plain(nodes)).unflatten(0, (4, 8)).transpose(0, 1)
+    torch.testing.assert_close(ours(nodes), wanted)
+
+
+@pytest.mark.parametrize("name", POOLINGS)
+def test_a_pooling_is_that_of_pytorch_geometric(name):
+    with quiet():
+        from torch_geometric.nn import aggr
+    ours = POOLINGS[name](5)
+    if name == "set2set":
+        theirs = aggr.Set2Set(5, processing_steps=3)
+        weights = {f"{key}_l0": value for key, value in ours.lstm.state_dict().items()}
+        theirs.lstm.load_state_dict(weights)
+    elif name == "attention":
+        theirs = aggr.AttentionalAggregation(ours.gate)
+    else:
+        theirs = {"max": aggr.MaxAggregation, "mean": aggr.MeanAggregation}[name]()
+    nodes = torch.randn(8, 4, 5)
+    assert ours(nodes).shape == (4, ours.width)
+    torch.testing.assert_close(theirs(*plain(nodes), dim_size=4), ours(nodes))
+
+
+def test_a_graph_of_one_sensor_can_be_normed():
+    model = gcn(norm="instance").train()
+    assert torch.isfinite(model(torch.randn(4, 1, 2), torch.ones(1, 1))).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"widths": []}, "model.widths="),
+        ({"pooling": "set3set"}, "model.pooling=set3set must be 'max', 'mean', 'attention' or 'set2set'"),
+        ({"norm": "group"}, "model.norm=group must be 'none', 'layer', 'batch' or 'instance'"),
+        ({"activation": "tanh"}, "activation=relu, elu or silu"),
+    ],
+)
+def test_bad_options_are_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        gcn(**options)

@@ -1,0 +1,74 @@
+"""Networks of PyTorch Geometric on the graph of sensors."""
+
+import pytest
+import torch
+from torch_geometric.nn import DenseGCNConv
+from torch_geometric.nn.models import GCN, GraphSAGE
+
+from skin.errors import InputError
+from skin.learning.data import TouchData
+from skin.learning.model.pyg import Pyg
+from skin.learning.representation.graph import Graph
+from skin.runs.build import build_data, build_learner
+
+
+def graphs(count=3):
+    generator = torch.Generator().manual_seed(0)
+    positions = 0.1 * torch.rand(9, 3, generator=generator)
+    return torch.randn(count, 9, 2, generator=generator), Graph(positions, (0.16, 0.16)).adjacency
+
+
+def test_one_layer_of_gcn_is_the_dense_product_with_the_adjacency():
+    x, adjacency = graphs()
+    model = Pyg("graph", (9, 2), GCN, width=4, layers=1, pooling="mean")
+    convolution = model.network.convs[0]
+    expected = (adjacency @ x @ convolution.lin.weight.T + convolution.bias).mean(dim=1)
+    torch.testing.assert_close(model(x, adjacency), expected)
+    assert not isinstance(convolution, DenseGCNConv)
+
+
+def test_a_graph_per_frame_is_the_same_as_one_for_all():
+    x, adjacency = graphs()
+    for network in (GCN, GraphSAGE):
+        model = Pyg("graph", (9, 2), network).eval()
+        torch.testing.assert_close(model(x, adjacency.expand(3, 9, 9)), model(x, adjacency))
+
+
+def test_neighbours_are_those_of_the_graph():
+    _, adjacency = graphs(1)
+    model = Pyg("graph", (9, 2), GraphSAGE, layers=1).eval()
+    edges, _ = model._edges(adjacency, 1)
+    assert set(map(tuple, edges.T.tolist())) == {
+        (a, b) for a in range(9) for b in range(9) if a != b and adjacency[a, b] != 0
+    }
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["+model.network.headz=4"], "model.network refuses its settings: .*headz"),
+        (["model.width=0"], "model.width=0 must be greater than or equal to 1"),
+        (["model.pooling=sum"], "model.pooling=sum must be 'max', 'mean'"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(configured, made_up_device, overrides, said):
+    config = configured("representation=graph", "model=pyg", *overrides)
+    with pytest.raises(InputError, match=said):
+        build_learner(config).check(build_data(config, made_up_device))
+
+
+def test_it_trains(configured, made_up_device):
+    config = configured(
+        "representation=graph",
+        "model=pyg",
+        "fusion.head=conv",
+        "trainer.max_epochs=12",
+        "optimizer.lr=0.01",
+        "data.batch_size=16",
+    )
+    data: TouchData = build_data(config, made_up_device)
+    learner = build_learner(config)
+    learner.fit(data)
+    touches = made_up_device.touches("test")
+    right = ((learner.probabilities(touches) > 0.5) == touches.labels.bool()).float().mean()
+    assert right > 0.75

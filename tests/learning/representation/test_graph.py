@@ -1,0 +1,263 @@
+"""Edges and weights of the sensor graph, typed out by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.layout.grid import Grid
+from skin.body.layout.scattered import Scattered
+from skin.body.sheet import Sheet
+from skin.device.touches import Touches
+from skin.errors import InputError
+from skin.learning.fusion.early import Early
+from skin.learning.fusion.late import Late
+from skin.learning.fusion.linked import Linked
+from skin.learning.model.gcn import Gcn
+from skin.learning.representation.graph import (
+    Graph,
+    adjacency,
+    neighbours,
+    normalised,
+    self_share,
+    typical_distance,
+)
+
+# a square of side 1, a point to its right, and one far away
+#   0---1
+#   |   |   4
+#   2---3             5
+POINTS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [1.9, 0.6], [5, 1.1]]) * 0.01
+POINTS = np.hstack([POINTS, np.zeros((6, 1))])
+
+
+def pairs(linked):
+    return {(int(i), int(j)) for i, j in np.argwhere(linked) if i < j}
+
+
+def test_the_nearest_neighbour_of_each():
+    # 3-4 is shorter than 1-4 and 2-3 than 0-2; point 5 is nobody's neighbour, but has one
+    tie_free = POINTS + 1e-4 * np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 3, 0], [0, 0, 0], [0, 0, 0]])
+    assert pairs(neighbours(tie_free, "knn", 1)) == {(0, 1), (2, 3), (3, 4), (4, 5)}
+
+
+def test_the_two_nearest_neighbours_of_each():
+    assert pairs(neighbours(POINTS, "knn", 2)) == {
+        (0, 1), (0, 2), (1, 3), (2, 3), (3, 4), (1, 4), (4, 5), (3, 5),
+    }  # fmt: skip
+
+
+def test_delaunay_edges():
+    tilted = POINTS.copy()
+    tilted[3, :2] += 0.001  # the diagonal 1-2 is then the Delaunay one
+    assert pairs(neighbours(tilted, "delaunay")) == {
+        (0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (1, 4), (3, 4), (3, 5), (4, 5), (1, 5),
+    }  # fmt: skip
+
+
+def test_more_neighbours_than_sensors_link_all():
+    linked = neighbours(POINTS, "knn", 6)
+    assert linked.sum() == 30
+    assert not linked.diagonal().any()
+
+
+def test_weights_of_edges():
+    points = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]]) * 0.01
+    linked = neighbours(points, "knn", 1)  # 0-1 and 1-2; the nearest are 1, 1 and 2 cm away: d0 = 1 cm
+    e = np.exp
+    np.testing.assert_allclose(
+        adjacency(points, linked, "exp"), [[0, e(-1), 0], [e(-1), 0, e(-2)], [0, e(-2), 0]]
+    )
+    np.testing.assert_allclose(adjacency(points, linked, "distance"), [[0, 1, 0], [1, 0, 2], [0, 2, 0]])
+    np.testing.assert_allclose(adjacency(points, linked, "none"), [[0, 1, 0], [1, 0, 1], [0, 1, 0]])
+    np.testing.assert_allclose(
+        adjacency(10 * points, linked, "distance"), adjacency(points, linked, "distance")
+    )
+
+
+def test_normalised_by_hand():
+    # rows of A + I sum to 3, 4 and 2
+    edges = np.array([[0, 2, 0], [2, 0, 1], [0, 1, 0]])
+    a, b = 2 / np.sqrt(12), 1 / np.sqrt(8)
+    np.testing.assert_allclose(normalised(edges), [[1 / 3, a, 0], [a, 1 / 4, b], [0, b, 1 / 2]])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"edges": "ring"}, "representation.edges=ring must be 'knn' or 'delaunay'"),
+        ({"count": 0}, "representation.count=6"),
+        (
+            {"weight": "density"},
+            "representation.weight=density must be 'exp', 'distance', 'stiff",
+        ),
+        ({"weight": "stiffness"}, "set representation.body="),
+        ({"positions": "moving"}, "representation.positions=moving must be 'layout' or 'deformed'"),
+        ({"positions": "deformed", "weight": "none"}, "changes nothing at representation.weight=none"),
+    ],
+)
+def test_bad_options_are_refused_with_the_override_that_mends_them(options, words):
+    with pytest.raises(InputError, match=words):
+        Graph(torch.from_numpy(POINTS), (0.16, 0.16), **options)
+
+
+def test_delaunay_of_sensors_in_a_line_is_refused():
+    line = torch.tensor([[0.01 * i, 0.02, 0.0] for i in range(5)])
+    with pytest.raises(InputError, match=r"got 5: set representation\.edges=knn"):
+        Graph(line, (0.16, 0.16), edges="delaunay")
+
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+BODY = Sheet([0.16, 0.16], [32, 32], LAYERS)
+
+
+def test_stiffness_of_a_uniform_skin_falls_as_one_over_distance():
+    places = Scattered(seed=3).sensors(BODY).positions
+    linked = neighbours(places, "knn", 6)
+    weights = adjacency(places, linked, "stiffness", BODY)
+    np.testing.assert_allclose(weights[linked], 1 / adjacency(places, linked, "distance")[linked])
+    assert not weights[~linked].any()
+
+
+def test_stiffness_takes_the_modulus_between_two_sensors():
+    """Three cells of one layer along x; two sensors in the outer ones, at a quarter of the sheet each."""
+    body = Sheet([0.12, 0.08], [3, 2], LAYERS[1:], variation=0.3, variation_seed=4)
+    places = np.array([[0.03, 0.02, 0.0], [0.09, 0.02, 0.0]])
+    left, middle, right = body.moduli[0, 0]
+    # 10 mm lie in the left cell, 40 in the middle one, 10 in the right one; d = d0.
+    expected = (10 * left + 40 * middle + 10 * right) / 60
+    weights = adjacency(places, neighbours(places, "knn", 1), "stiffness", body)
+    np.testing.assert_allclose(weights, [[0, expected], [expected, 0]])
+
+
+def test_stiffness_is_a_pure_number():
+    """Neither a stiffer material nor a larger sheet changes it: only where the skin is stiffer than else."""
+    places = Scattered(seed=3).sensors(BODY).positions
+    linked = neighbours(places, "knn", 6)
+    varied = replace(BODY, variation=0.2)
+    firm = replace(
+        varied, layers=tuple(replace(layer, thickness=2 * layer.thickness) for layer in BODY.layers)
+    )
+    large = replace(varied, size=(1.6, 1.6))
+    expected = adjacency(places, linked, "stiffness", varied)
+    nominal = adjacency(places, linked, "stiffness", BODY)
+    assert np.abs(expected[linked] / nominal[linked] - 1).max() > 0.01
+    np.testing.assert_allclose(adjacency(places, linked, "stiffness", firm), expected)
+    np.testing.assert_allclose(adjacency(10 * places, linked, "stiffness", large), expected)
+
+
+def test_coordinates_are_the_last_two_features():
+    places = torch.tensor([[0.04, 0.03, 0.005], [0.16, 0.12, 0.005], [0.0, 0.06, 0.005]])
+    readings = torch.rand(2, 4, 3, generator=torch.Generator().manual_seed(0))
+    valid = torch.ones_like(readings, dtype=torch.bool)
+    x = Graph(places, (0.16, 0.12), coordinates=True, mask=True)(readings, valid).x
+    assert x.shape == (2, 4, 3, 4)
+    torch.testing.assert_close(x[..., 0], readings / 10)
+    torch.testing.assert_close(x[..., 2:], torch.tensor([[0.25, 0.25], [1, 1], [0, 0.5]]).expand(2, 4, 3, 2))
+
+
+def test_share_of_a_row_that_is_the_node_itself():
+    """In the distance-weighted graph of the report's units, metres, a node is mostly itself; by hand else."""
+    two = torch.from_numpy(normalised(np.array([[0.0, 3.0], [3.0, 0.0]])))
+    assert self_share(two) == pytest.approx(1 / 4)
+    assert self_share(torch.eye(5)) == 1
+    places = Scattered(seed=0).sensors(BODY).positions
+    linked = neighbours(places, "knn", 6)
+    metres = adjacency(places, linked, "distance") * typical_distance(places)
+    assert 0.7 < self_share(torch.from_numpy(normalised(metres))) < 0.85
+    assert self_share(torch.from_numpy(normalised(adjacency(places, linked, "exp")))) < 0.45
+
+
+PLACES = torch.from_numpy(Grid(3, 3).sensors(BODY).positions).float()
+
+
+def touches(motion=None, places=PLACES):
+    generator = torch.Generator().manual_seed(0)
+    readings = torch.rand(2, 5, len(places), generator=generator)
+    return Touches(readings, readings >= 0, places, torch.zeros(2, 4), 10.0, motion)
+
+
+def moves(scale=0.004):
+    return scale * torch.randn(2, 5, 9, 3, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("weight", ["exp", "distance", "stiffness"])
+def test_a_frame_whose_sensors_moved_has_the_graph_of_where_they_are(weight):
+    """Independent answer: the graph of each frame's places, made anew, with the layout's edges and d0."""
+    body = replace(BODY, variation=0.2)
+    graph = Graph(PLACES, BODY.size, positions="deformed", weight=weight, count=3, body=body)
+    motion = moves()
+    x, matrices = graph.show(touches(motion))[:2]
+    assert x.shape == (2, 5, 9, 1)
+    assert matrices.shape == (2, 5, 9, 9)
+    rest = PLACES.double().numpy()
+    linked, unit = neighbours(rest, "knn", 3), typical_distance(rest)
+    stiff = adjacency(rest, linked, "stiffness", body)
+    for gesture in range(2):
+        for frame in range(5):
+            places = rest + motion[gesture, frame].double().numpy()
+            distance = np.linalg.norm(places[:, None] - places[None], axis=-1)
+            before = np.linalg.norm(rest[:, None] - rest[None], axis=-1)
+            ratio = np.divide(before, distance, out=np.zeros_like(before), where=linked)
+            law = {"exp": np.exp(-distance / unit), "distance": distance / unit, "stiffness": stiff * ratio}
+            expected = normalised(linked * law[weight])
+            np.testing.assert_allclose(matrices[gesture, frame].numpy(), expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("weight", ["exp", "distance", "stiffness"])
+def test_sensors_that_stay_have_the_graph_of_the_layout(weight):
+    options = {"weight": weight, "body": BODY}
+    still = touches(torch.zeros(2, 5, 9, 3))
+    x, matrices = Graph(PLACES, BODY.size, positions="deformed", **options).show(still)[:2]
+    plain = Graph(PLACES, BODY.size, **options).show(still)
+    assert plain.adjacency.shape == (9, 9)
+    torch.testing.assert_close(matrices, plain.adjacency.expand_as(matrices))
+    assert torch.equal(x, plain.x)
+
+
+def test_coordinates_follow_the_motion():
+    motion = moves()
+    x = Graph(PLACES, (0.16, 0.08), positions="deformed", coordinates=True).show(touches(motion)).x
+    torch.testing.assert_close(x[..., 1:], (PLACES + motion)[..., :2] / torch.tensor([0.16, 0.08]))
+
+
+def test_motion_moves_the_gradient_too():
+    motion = moves().requires_grad_()
+    Graph(PLACES, BODY.size, positions="deformed").show(touches(motion)).adjacency.square().sum().backward()
+    assert (motion.grad != 0).all()
+
+
+def test_a_deformed_graph_needs_to_know_the_motion():
+    with pytest.raises(InputError, match=r"Touches\(motion=\.\.\.\), or set"):
+        Graph(PLACES, BODY.size, positions="deformed").show(touches())
+
+
+def test_one_sensor_may_move():
+    one = PLACES[:1]
+    graph = Graph(one, BODY.size, positions="deformed")
+    frames = graph.show(touches(torch.ones(2, 5, 1, 3), one))
+    assert torch.equal(frames.adjacency, torch.ones(2, 5, 1, 1))
+
+
+def test_late_fusion_takes_a_graph_per_frame():
+    """Every frame alone, encoded with its own graph, gives the same embedding."""
+    torch.manual_seed(0)
+    fusion = Late(lambda kind, shape: Gcn(kind, shape, [6, 7]), "graph", (9, 1), 5, head="max").eval()
+    frames = Graph(PLACES, BODY.size, positions="deformed").show(touches(moves(0.01)))
+    alone = torch.stack([fusion.model(frames.x[:, t], frames.adjacency[:, t]) for t in range(5)], dim=1).amax(
+        dim=1
+    )
+    torch.testing.assert_close(fusion(frames), alone)
+    still = Graph(PLACES, BODY.size).show(touches())
+    assert not torch.allclose(fusion(still), alone, atol=1e-4)
+
+
+@pytest.mark.parametrize("fusion", [Early, Linked])
+def test_the_other_fusions_refuse_a_graph_per_frame(fusion):
+    built = fusion(lambda kind, shape: Gcn(kind, shape, [6]), "graph", (9, 1), 5)
+    with pytest.raises(InputError, match="one graph per frame needs fusion=late"):
+        built(Graph(PLACES, BODY.size, positions="deformed").show(touches(moves())))

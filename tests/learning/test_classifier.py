@@ -1,0 +1,207 @@
+"""The training step, and the sizes of the report's five systems."""
+
+import math
+
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from skin.body.layout.scattered import Scattered
+from skin.device.base import AbstractDevice
+from skin.device.touches import Touches
+from skin.learning.classifier import TouchClassifier, probabilities
+from skin.learning.data import TouchData
+from skin.learning.fusion.base import AbstractFusion
+from skin.learning.representation.base import Frames
+from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
+
+GESTURES = Task(("grab", "hit", "stroke"), "exclusive")
+
+
+class Flat(AbstractFusion):
+    """Passes readings (B, T, F) on as they are, flattened."""
+
+    width = 6
+
+    def forward(self, frames: Frames) -> torch.Tensor:
+        return frames.x.flatten(1)
+
+
+def classifier(task=TOUCH, hidden=(5,)):
+    torch.manual_seed(0)
+    return TouchClassifier(Flat(), task, hidden, "relu", torch.optim.Adam)
+
+
+@pytest.mark.parametrize(
+    ("row", "parameters"),
+    [
+        ("linked_graph", 196),
+        ("temporal_graph", 145_774),
+        ("temporal_image", 209_844),
+        ("sequence_graph", 105_621),
+        ("sequence_image", 1_634_341),
+    ],
+)
+def test_the_rows_have_the_parameters_of_the_report(row, parameters, configured):
+    config = configured(f"experiment={row}")
+    body = instantiate(config.body)
+    positions = torch.from_numpy(Scattered(5, 5, seed=1).sensors(body).positions).float()
+    readings = torch.zeros(1, 30, 25)
+
+    class Device(AbstractDevice):
+        task, size = TOUCH, body.size
+
+        def touches(self, split, epoch=0):
+            return Touches(readings, readings == 0, positions, torch.zeros(1, 4), 10.0)
+
+    learner = instantiate(config.learner)
+    network = learner.build(TouchData(Device(), instantiate(config.representation)))
+    assert sum(parameter.numel() for parameter in network.parameters()) == parameters
+    assert learner.parameters == parameters
+    if row == "sequence_image":
+        assert network.fusion.model.convolutions[0].weight.shape == (8, 3, 3, 3)
+
+
+def test_the_loss_of_binary_labels_by_hand():
+    loss = classifier().loss(torch.tensor([[0.0, 2.0, -1.0, 0.0]]), torch.tensor([[1.0, 1.0, 0.0, 0.0]]))
+    wanted = (2 * math.log(2) + math.log1p(math.exp(-2)) + math.log1p(math.exp(-1))) / 4
+    assert loss.item() == pytest.approx(wanted)
+
+
+def test_the_loss_of_exclusive_labels_by_hand():
+    logits = torch.tensor([[1.0, 0.0, 0.0]])
+    loss = classifier(GESTURES).loss(logits, torch.tensor([[0.0, 1.0, 0.0]]))
+    assert loss.item() == pytest.approx(math.log(math.e + 2))
+    assert probabilities(logits, GESTURES).sum().item() == pytest.approx(1)
+
+
+def test_without_touch_only_the_gate_learns():
+    logits = torch.tensor([[0.0, 2.0, -1.0, 0.0, 3.0], [5.0, -4.0, 3.0, 2.0, 1.0]], requires_grad=True)
+    labels = torch.tensor([[1.0, 1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    loss = classifier(TOUCH_OR_NOT).loss(logits, labels)
+    touched = 2 * math.log(2) + math.log1p(math.exp(-2)) + math.log1p(math.exp(-1))
+    gates = math.log1p(math.exp(-3)) + math.log1p(math.exp(1))
+    assert loss.item() == pytest.approx((touched + gates) / 6)
+    loss.backward()
+    assert logits.grad[1, :4].tolist() == [0.0] * 4
+    assert (logits.grad[0] != 0).all()
+    assert logits.grad[1, 4] > 0
+
+
+def test_accuracy_without_touch_is_the_gates_alone():
+    logits = torch.tensor([[1.0, 1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0, -1.0]])
+    labels = torch.tensor([[1.0, 0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    found = classifier(TOUCH_OR_NOT)._accuracy(logits, labels)
+    assert {name: value.item() for name, value in found.items()} == {
+        "accuracy": 0.5,
+        "accuracy_big": 1.0,
+        "accuracy_dynamic": 0.0,
+        "accuracy_press": 1.0,
+        "accuracy_dangerous": 0.0,
+        "accuracy_touch": 0.5,
+    }
+
+
+def test_binary_probabilities_are_independent():
+    torch.testing.assert_close(
+        probabilities(torch.tensor([[0.0, math.log(3)]]), TOUCH), torch.tensor([[0.5, 0.75]])
+    )
+
+
+def test_the_head_is_as_wide_as_the_task():
+    assert classifier(GESTURES)(Frames(torch.randn(2, 3, 2), None)).shape == (2, 3)
+
+
+def test_what_an_epoch_logs(monkeypatch):
+    network = classifier(hidden=())
+    logged = {}
+    monkeypatch.setattr(network, "log", lambda name, value, **_: logged.update({name: value.item()}))
+    with torch.no_grad():
+        network.head[0].weight.zero_()
+        network.head[0].bias.copy_(torch.tensor([1.0, 1.0, -1.0, -1.0]))
+    labels = torch.tensor([[1.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]])
+    for _ in range(2):
+        # Batches count by their size; the next epoch begins anew.
+        for batch in (labels[:2], labels[2:]):
+            network.validation_step((Frames(torch.randn(len(batch), 3, 2), None), batch), 0)
+        network.on_validation_epoch_end()
+        thirds = {"big": 2, "dynamic": 2, "press": 3, "dangerous": 1}
+        assert {name: 3 * logged.pop(f"val_accuracy_{name}") for name in thirds} == pytest.approx(thirds)
+        assert logged.pop("val_accuracy") == pytest.approx(8 / 12)
+        right, wrong = math.log1p(math.exp(-1)), math.log1p(math.exp(1))
+        assert logged.pop("val_loss") == pytest.approx((8 * right + 4 * wrong) / 12)
+        assert not logged
+
+
+def test_exclusive_accuracy_counts_the_largest(monkeypatch):
+    network = classifier(GESTURES)
+    values = network._accuracy(torch.tensor([[3.0, 1, 2], [0, 1, 2]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]]))
+    assert values["accuracy"].item() == 0.5
+
+
+def test_a_direction_is_learnt_as_mean_cosines():
+    """The least loss is where the answer is the mean of the labels; what has none pulls nowhere."""
+    network = classifier(TOUCH_SLIDING)
+    angle = torch.tensor([0.3, 0.9, 2.0, 0.0])
+    slides = torch.stack([angle.cos(), angle.sin()], 1) * torch.tensor([1.0, 1.0, 1.0, 0.0])[:, None]
+    labels = torch.cat([torch.tensor([[0.0, 1.0, 1.0, 0.0]]).repeat(4, 1), slides], dim=1)
+    logits = torch.zeros(6, requires_grad=True)
+    optimizer = torch.optim.LBFGS([logits], max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimizer.zero_grad()
+        # the four binary labels alone would run off to infinity
+        loss = network.loss(logits.expand(4, 6), labels) + 1e-3 * logits[:4].square().sum()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    said = probabilities(logits.detach()[None], TOUCH_SLIDING)[0]
+    torch.testing.assert_close(said[-2:], slides[:3].mean(dim=0), atol=1e-3, rtol=0)
+
+
+def test_a_summary_joins_the_embedding():
+    torch.manual_seed(0)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3).eval()
+    x, summary = torch.randn(2, 3, 2), torch.randn(2, 3)
+    assert network.embed(Frames(x, None, summary)).shape == (2, 12)
+    before = network(Frames(x, None, summary))
+    assert not torch.equal(network(Frames(x, None, summary + 1)), before)
+    with pytest.raises(ValueError, match="without"):
+        network(Frames(x, None))
+
+
+def test_numbers_of_any_unit_are_standardised():
+    torch.manual_seed(0)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    x, summary = torch.randn(64, 3, 2), torch.randn(64, 3)
+    scaled = network(Frames(x, None, 1e4 * summary + 7))
+    torch.testing.assert_close(scaled, network(Frames(x, None, summary)), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("step", "share"), [(0, 0.04), (19, 1.0), (99, 0.0)])
+def test_the_learning_rate_rises_and_falls(step, share):
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, warmup=0.2)
+    network._trainer = type("Trainer", (), {"estimated_stepping_batches": 100})()
+    chosen = network.configure_optimizers()
+    assert chosen["lr_scheduler"]["interval"] == "step"
+    for _ in range(step):
+        chosen["optimizer"].step()
+        chosen["lr_scheduler"]["scheduler"].step()
+    # it begins at a 25th of the optimizer's own rate
+    assert chosen["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-3 * share, abs=1e-6)
+
+
+def test_what_is_learnt_in_few_batches_holds_in_use_whatever_the_unit():
+    torch.manual_seed(0)
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    x, summary = torch.randn(512, 3, 2), 1e-3 * torch.randn(512, 3) + 5e-3
+    learning = torch.cat([network(Frames(x[i], None, summary[i])) for i in torch.arange(512).split(128)])
+    torch.testing.assert_close(network.eval()(Frames(x, None, summary)), learning, rtol=0.1, atol=0.1)
+
+
+def test_a_batch_of_one_touch_can_be_learnt_from():
+    network = TouchClassifier(Flat(), TOUCH, (5,), "relu", torch.optim.Adam, summary=3)
+    logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))
+    network.loss(logits, torch.ones(1, 4)).backward()
+    assert torch.isfinite(logits).all()

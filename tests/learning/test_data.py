@@ -1,0 +1,212 @@
+"""Batches: every gesture once an epoch, in an order that only the seed decides."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from skin.device.base import AbstractDevice
+from skin.device.touches import Part, Recording, Touches
+from skin.errors import InputError
+from skin.learning.data import Augmentation, TouchData
+from skin.learning.representation.readings import Readings
+from skin.runs.build import build_data, build_device
+from skin.runs.configuration import validate_config
+from skin.touch.labels import TOUCH_SLIDING
+
+
+class Numbered(AbstractDevice):
+    """Yields touches whose readings are their number, plus 1000 times the epoch."""
+
+    size, fresh = (0.16, 0.16), False
+
+    def __init__(self, task, count=23):
+        self.task, self.count, self.asked = task, count, []
+
+    def touches(self, split, epoch=0):
+        self.asked.append((split, epoch))
+        readings = (torch.arange(self.count) + 1000.0 * epoch)[:, None, None].repeat(1, 6, 2)
+        return Touches(readings, readings >= 0, torch.ones(2, 3), torch.zeros(self.count, 4), 10.0)
+
+
+class InParts(Numbered):
+    """Makes its touches in parts of 7, 12 and 4."""
+
+    def parts(self, split=None):
+        return [Part(stop - start, partial(self._part, slice(start, stop))) for start, stop in CUTS]
+
+    def _part(self, rows):
+        whole = Numbered.touches(self, "train")[rows]
+        return Recording(whole, self.task, self.size, (0.01, 0.01))
+
+    def touches(self, split, epoch=0):
+        raise AssertionError("its touches do not fit into memory")
+
+
+CUTS = [(0, 7), (7, 19), (19, 23)]
+
+
+class Trainer:
+    current_epoch, world_size, global_rank = 0, 1, 0
+
+
+@pytest.fixture
+def make(made_up_device):
+    def make(seed=0, fresh=False, kind=Numbered, **options):
+        device = kind(made_up_device.task)
+        device.fresh = fresh
+        data = TouchData(device, partial(Readings, scale=1.0), seed=seed, **({"batch_size": 5} | options))
+        data.trainer = Trainer()
+        return data
+
+    return make
+
+
+def numbers(batches):
+    return [batch.readings[:, 0, 0].long().tolist() for batch in batches]
+
+
+def flat(batches):
+    return [number for batch in numbers(batches) for number in batch]
+
+
+def test_processes_share_each_batch(make):
+    alone = numbers(make().train_dataloader())
+    parts = []
+    for rank in range(2):
+        data = make()
+        data.trainer.world_size, data.trainer.global_rank = 2, rank
+        parts.append(numbers(data.train_dataloader()))
+        assert flat(data.val_dataloader()) == list(range(23))
+    assert [sorted(one + other) for one, other in zip(*parts, strict=True)][:-1] == [
+        sorted(batch) for batch in alone[:-1]
+    ]
+    assert parts[0][-1] == parts[1][-1] == alone[-1]  # three gestures are too few for two processes
+
+
+def test_an_epoch_shows_every_gesture_once(make):
+    batches = make().train_dataloader()
+    assert sorted(flat(batches)) == list(range(23))
+    assert [len(batch) for batch in numbers(batches)] == [5, 5, 5, 5, 3]
+    assert len(batches) == 5
+
+
+def test_the_order_follows_from_seed_and_epoch(make):
+    data = make()
+    first = flat(data.train_dataloader())
+    assert flat(data.train_dataloader()) == first
+    assert first != list(range(23))
+    assert flat(make(seed=1).train_dataloader()) != first
+    data.trainer.current_epoch = 1
+    second = flat(data.train_dataloader())
+    assert second != first
+    assert flat(make(seed=1).train_dataloader()) != second
+
+
+def test_an_epoch_shows_every_gesture_of_every_part_once(make):
+    data = make(kind=InParts)
+    batches = data.train_dataloader()
+    assert len(batches) == len(numbers(batches)) == 2 + 3 + 1
+    first, again = flat(batches), flat(batches)
+    assert first == again
+    assert sorted(first) == list(range(23))
+    data.trainer.current_epoch = 1
+    second = flat(data.train_dataloader())
+    assert sorted(second) == list(range(23))
+    assert second != first
+
+
+def test_parts_come_in_another_order_each_epoch_and_one_after_the_other(make):
+    data, orders = make(kind=InParts), set()
+    for epoch in range(12):
+        data.trainer.current_epoch = epoch
+        part = [sum(number >= stop for _, stop in CUTS) for number in flat(data.train_dataloader())]
+        order = [one for one, before in zip(part, [None, *part], strict=False) if one != before]
+        assert sorted(order) == [0, 1, 2]
+        orders.add(tuple(order))
+    assert len(orders) > 2
+
+
+def test_validation_in_parts_keeps_its_order(make):
+    data = make(kind=InParts)
+    assert flat(data.val_dataloader()) == list(range(23))
+    assert len(data.val_dataloader()) == 6
+    assert data.window == 6
+
+
+def test_the_hash_is_of_all_parts(make, monkeypatch):
+    one = make(kind=InParts).hash
+    assert one == make(kind=InParts).hash
+    assert len(one) == 16
+    monkeypatch.setitem(globals(), "CUTS", [(0, 7), (7, 19)])
+    assert make(kind=InParts).hash != one
+
+
+def test_the_order_leaves_the_random_state_alone(make):
+    state = torch.get_rng_state()
+    flat(make().train_dataloader())
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_validation_keeps_its_order(make):
+    assert flat(make().val_dataloader()) == list(range(23))
+
+
+def test_a_device_with_fixed_gestures_is_asked_once_a_split(make):
+    data = make()
+    for epoch in range(3):
+        data.trainer.current_epoch = epoch
+        flat(data.train_dataloader())
+        flat(data.val_dataloader())
+    assert data.device.asked == [("train", 0), ("validation", 0)]
+
+
+def test_fresh_gestures_are_drawn_every_epoch(make):
+    data = make(fresh=True)
+    for epoch in range(3):
+        data.trainer.current_epoch = epoch
+        assert sorted(flat(data.train_dataloader())) == [1000 * epoch + i for i in range(23)]
+
+
+def test_a_batch_arrives_as_frames_and_labels(make):
+    data = make()
+    touches = next(iter(data.train_dataloader()))
+    frames, labels = data.on_after_batch_transfer(touches, 0)
+    assert torch.equal(frames.x, touches.readings)
+    assert labels.shape == (5, 4)
+    assert data.window == 6
+
+
+def test_a_layout_is_represented_once(make):
+    data = make()
+    positions = torch.rand(2, 3)
+    assert data.representation_for(positions) is data.representation_for(positions.clone())
+    assert data.representation_for(positions) is not data.representation_for(positions + 0.01)
+
+
+def test_what_cannot_be_batched_is_refused(make):
+    with pytest.raises(InputError, match=r"data\.batch_size=64"):
+        make(batch_size=0)
+    with pytest.raises(InputError, match="positions per frame"):
+        make().representation_for(torch.rand(4, 6, 2, 3))
+    readings = torch.zeros(1, 6, 2)
+    with pytest.raises(InputError, match="without labels"):
+        make().frames(Touches(readings, readings == 0, torch.rand(2, 3), None, 10.0))
+
+
+def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made_up_device):
+    made_up_device.task = TOUCH_SLIDING
+    with pytest.raises(InputError, match=r"set data.augment.reverse=false"):
+        TouchData(made_up_device, Readings, augmentation=Augmentation(reverse=True))
+
+
+def test_touches_without_geometry_get_that_of_the_configured_skin(configured):
+    config = validate_config(configured("representation=sites", "simulator=solid", "simulator.divisions=1"))
+    device = build_device(config)
+    touches, data = device.touches("test")[:8], build_data(config, device)
+    unknown = replace(touches, geometry=None)
+    torch.testing.assert_close(data.show(unknown).x, data.show(touches).x)
+    torch.testing.assert_close(data.show(unknown).summary, data.show(touches).summary)
+    other = build_data(validate_config(configured("representation=sites", "simulator=naive")), device)
+    assert not torch.allclose(other.show(unknown).x, data.show(touches).x)

@@ -1,0 +1,154 @@
+"""Features of touches made by hand."""
+
+from itertools import groupby
+
+import pytest
+import torch
+
+from skin.device.touches import Touches
+from skin.learning.features import above_idle, engineered_features, estimate_noise
+
+PLACES = torch.tensor([[0.02, 0.02, 0.0], [0.06, 0.02, 0.0], [0.10, 0.02, 0.0], [0.06, 0.08, 0.0]])
+
+
+def touch(*forces, offset=0.0):
+    """Return one touch of 10 frames; each of ``forces`` is (frame, sensor, N)."""
+    readings = torch.full((1, 10, 4), offset)
+    for frame, sensor, force in forces:
+        readings[0, frame, sensor] += force
+    return Touches(readings, torch.ones_like(readings, dtype=torch.bool), PLACES, None, 10.0)
+
+
+def value(name, *forces, **options):
+    return engineered_features(touch(*forces, **options))[name].item()
+
+
+def test_a_press_of_three_frames_then_one_more():
+    press = [(2, 0, 2.5), (3, 0, 2.5), (4, 0, 2.5), (7, 0, 2.5)]
+    assert value("longest run above 2.0 N", *press) == 3
+    assert value("frames above 2.0 N", *press) == 4
+    assert value("frames above 3.0 N", *press) == 0
+
+
+def test_an_offset_of_the_sensors_does_not_matter():
+    press = [(2, 0, 2.5), (3, 1, 1.5)]
+    plain, moved = engineered_features(touch(*press)), engineered_features(touch(*press, offset=0.8))
+    for name in plain:
+        if "raw" not in name:
+            assert moved[name].item() == pytest.approx(plain[name].item(), abs=1e-5), name
+
+
+def test_a_slide_has_a_path_and_a_press_none():
+    slide = [(2, 0, 2.0), (3, 1, 2.0), (4, 2, 2.0)]
+    assert value("path of the centre 1", *slide) == pytest.approx(0.08)
+    assert value("way of the centre 1", *slide) == pytest.approx(0.08)
+    assert value("extent of the centre 1", *slide) == pytest.approx(0.08)
+    assert value("reach of the centre 1", *slide) == pytest.approx(0.04)
+    assert value("sensors that were strongest", *slide) == 3
+    press = [(frame, 0, 2.0) for frame in (2, 3, 4)]
+    assert value("path of the centre 1", *press) == pytest.approx(0, abs=1e-6)
+
+
+def test_sensors_that_share_one_course_have_one_singular_value():
+    press = [
+        (frame, sensor, force * (sensor + 1)) for frame, force in ((2, 1.0), (3, 2.0)) for sensor in (0, 1)
+    ]
+    assert value("singular value 2 of the first", *press) == pytest.approx(0, abs=1e-5)
+    slide = [(2, 0, 2.0), (3, 1, 2.0)]
+    assert value("singular value 2 of the first", *slide) == pytest.approx(1, abs=1e-5)
+
+
+def test_active_sensors_are_counted():
+    wide = [(2, sensor, 1.5) for sensor in range(4)]
+    assert value("sensors above 1.0 N", *wide) == 4
+    assert value("most sensors above 1.0 N at once", *wide) == 4
+    one_by_one = [(2 + sensor, sensor, 1.5) for sensor in range(4)]
+    assert value("sensors above 1.0 N", *one_by_one) == 4
+    assert value("most sensors above 1.0 N at once", *one_by_one) == 1
+
+
+def test_the_order_of_sensors_does_not_matter_and_their_number_not_to_the_names():
+    generator = torch.Generator().manual_seed(0)
+    readings = 3 * torch.rand(5, 10, 4, generator=generator)
+    valid = torch.rand(5, 10, 4, generator=generator) > 0.1
+    order = torch.tensor([2, 0, 3, 1])
+    plain = engineered_features(Touches(readings, valid, PLACES, None, 10.0))
+    turned = engineered_features(Touches(readings[..., order], valid[..., order], PLACES[order], None, 10.0))
+    for name in plain:
+        torch.testing.assert_close(turned[name], plain[name], msg=name, atol=1e-4, rtol=1e-4)
+    one = engineered_features(Touches(readings[..., :1], valid[..., :1], PLACES[:1], None, 10.0))
+    assert list(one) == list(plain)
+    assert 120 <= len(plain) <= 140
+
+
+def test_an_idle_window_or_a_dead_sensor_gives_numbers():
+    idle = touch()
+    broken = touch((3, 1, 2.0))
+    broken.readings[0, :, 2] = float("nan")
+    broken.valid[0, :, 2] = False
+    for touches in (idle, broken):
+        for name, column in engineered_features(touches).items():
+            assert torch.isfinite(column.float()).all(), name
+
+
+def random_touches(count, seed=3):
+    """Return touches of which most frames are idle, with noise of up to 0.2 N."""
+    generator = torch.Generator().manual_seed(seed)
+    readings = 3 * torch.rand(count, 30, 4, generator=generator)
+    readings *= torch.rand(count, 30, 4, generator=generator) > 0.8
+    spread = 0.2 * torch.rand(count, 1, 1, generator=generator)
+    readings += spread * torch.randn(count, 30, 4, generator=generator)
+    valid = torch.rand(count, 30, 4, generator=generator) > 0.1
+    return Touches(readings, valid, PLACES, None, 10.0)
+
+
+def test_a_window_alone_gives_what_it_gives_in_a_batch():
+    touches = random_touches(20)
+    together = engineered_features(touches)
+    for place in range(len(touches)):
+        for name, alone in engineered_features(touches[place : place + 1]).items():
+            torch.testing.assert_close(alone[0], together[name][place], rtol=1e-6, atol=1e-6, msg=name)
+
+
+def test_runs_and_counts_are_those_that_plain_python_finds():
+    touches = random_touches(50)
+    found = engineered_features(touches)
+    raw, noises = touches.readings.where(touches.valid, 0), estimate_noise(touches)
+    idle = raw.quantile(0.2, dim=1, keepdim=True) + 0.8416 * noises[:, None, None]
+    for place, (rows, noise) in enumerate(zip((raw - idle) * touches.valid, noises, strict=True)):
+        peak, total, more = rows.amax(dim=1), rows.sum(dim=1), 3 * (noise - 0.05).clamp(min=0)
+        for series, level, name in (
+            (peak, 1.0 + more, "longest run above 1.0 N"),
+            (peak, torch.maximum(0.3 * peak.max(), 3 * noise), "longest run above 0.3 of the peak"),
+            (
+                total,
+                torch.maximum(0.7 * total.max(), 6 * noise),
+                "longest run of the sum above 0.7 of its peak",
+            ),
+        ):
+            runs = [len(list(run)) for on, run in groupby((series > level).tolist()) if on]
+            assert found[name][place] == max(runs, default=0), name
+        at_once = max(sum(force > 2.0 + more for force in row) for row in rows)
+        assert found["most sensors above 2.0 N at once"][place] == at_once
+        assert found["frames above 0.6 N"][place] == sum(force > 0.6 + more for force in peak)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.02, 0.05, 0.1, 0.2])
+def test_the_noise_of_a_device_is_found_beside_a_touch(spread):
+    generator = torch.Generator().manual_seed(5)
+    readings = spread * torch.randn(200, 30, 25, generator=generator)
+    readings[:, 8:20, :6] += 4 * torch.rand(200, 1, 6, generator=generator)  # a large touch
+    touches = Touches(readings, torch.ones_like(readings, dtype=torch.bool), torch.rand(25, 3), None, 10.0)
+    assert estimate_noise(touches).mean().item() == pytest.approx(spread, rel=0.2, abs=1e-6)
+    assert above_idle(touches)[:, :, 6:].mean().item() == pytest.approx(0, abs=0.1 * spread + 1e-6)
+
+
+def test_noise_alone_rarely_passes_a_level_of_any_device():
+    """However large the noise is, it passes the lowest level in one frame of thirty."""
+    shares = []
+    for spread in (0.05, 0.1, 0.2):
+        readings = spread * torch.randn(500, 30, 25, generator=torch.Generator().manual_seed(7))
+        valid = torch.ones_like(readings, dtype=torch.bool)
+        found = engineered_features(Touches(readings, valid, torch.rand(25, 3), None, 10.0))
+        shares.append(found["frames above 0.15 N"].float().mean().item())
+    assert shares == pytest.approx([1.0] * 3, abs=0.2)

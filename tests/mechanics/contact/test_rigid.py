@@ -1,0 +1,316 @@
+"""Gestures of rigid objects: their shape, their force, their labels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.arm import Arm
+from skin.body.layout.grid import Grid
+from skin.body.sheet import Sheet
+from skin.device.base import in_threads
+from skin.errors import InputError
+from skin.mechanics.contact.prescribed import Prescribed
+from skin.mechanics.contact.rigid import Rigid
+from skin.mechanics.simulator.base import AbstractSimulator, Response
+from skin.mechanics.simulator.naive import Naive
+from skin.touch.gesture import GestureSettings, Trajectories
+from skin.touch.movie import movie_labels
+from skin.touch.sampler import ContactProblem, TouchSampler
+from skin.touch.shapes import Shapes
+
+from .halfspace import love
+
+BODY = Sheet([0.16, 0.16], [20, 20], [{"material": "EcoFlex 00-30", "thickness": 0.015}])
+AREA = BODY.cell[0] * BODY.cell[1]
+SENSORS = Grid(5, 5).sensors(BODY)
+# A tenth as soft as the half-space, about as a layer glued to a table is.
+COMPLIANCE = torch.from_numpy(love(BODY.shape, BODY.cell, 10 * BODY.layers[0].material.young))
+
+
+class HalfSpace(AbstractSimulator):
+    """A surface of known compliance, and nothing below it."""
+
+    def forward(self, pressure: torch.Tensor, shear: torch.Tensor | None = None) -> Response:
+        """Read nothing."""
+        return Response(pressure.new_zeros(*pressure.shape[:-2], len(SENSORS)), None)
+
+    def compliance(self) -> torch.Tensor:
+        """Return that of a half-space, in closed form."""
+        return COMPLIANCE
+
+
+def rigid(**settings) -> Rigid:
+    return Rigid(BODY, HalfSpace(), **settings)
+
+
+def sampler(contact=None, **settings) -> TouchSampler:
+    return TouchSampler(BODY, BODY.footprints(SENSORS), contact or Prescribed(), settings, True)
+
+
+def problem(**settings) -> ContactProblem:
+    given = GestureSettings.of(settings)
+    shapes = Shapes(given.shapes, BODY, given.thresholds.contact)
+    return ContactProblem(shapes, torch.from_numpy(BODY.footprints(SENSORS)).float(), given)
+
+
+def still(
+    scale: float, place=(0.08, 0.08), peak: float = 50e3, shares=(1.0,), wanted=(0, 0, 0, 0)
+) -> Trajectories:
+    """Return one gesture of the first shape that stands still, at several shares of its force."""
+    count = len(shares)
+    return Trajectories(
+        np.zeros(count, int),
+        np.zeros(count, int),
+        np.zeros(count),
+        np.full(count, scale),
+        np.tile(place, (count, 1)),
+        np.array(shares),
+        torch.arange(count)[None],
+        torch.tensor([shares]),
+        np.array([peak]),
+        np.array([wanted], bool),
+    )
+
+
+@pytest.fixture(scope="module")
+def sampled():
+    source = sampler(rigid())
+    return source, source.sample(64, np.random.default_rng(5))
+
+
+def test_labels_are_what_the_movie_gives(sampled):
+    """All but sliding: more of an object comes down as force grows, and the centre of pressure moves."""
+    source, movie = sampled
+    labels = movie_labels(movie.pressure(), source.footprints, BODY.cell)
+    assert torch.equal(movie.labels[:, [0, 2, 3]], labels[:, [0, 2, 3]])
+    assert torch.equal(movie.labels[:, 1] > 0.5, movie.parameters["speed"] > 0)
+    counts = torch.unique(movie.labels, dim=0, return_counts=True)[1]
+    assert counts.tolist() == [4] * 16
+
+
+def test_frames_carry_the_total_force(sampled):
+    _, movie = sampled
+    totals = movie.pressure().sum((2, 3)) * AREA
+    torch.testing.assert_close(totals, movie.force, rtol=1e-4, atol=1e-4)
+    assert (movie.frames >= 0).all()
+
+
+def test_the_peak_is_the_highest_cell_and_within_its_range(sampled):
+    source, movie = sampled
+    peak = movie.pressure().amax((1, 2, 3))
+    torch.testing.assert_close(movie.parameters["peak"], peak, rtol=1e-5, atol=0)
+    dangerous = movie.labels[:, 3] > 0.5
+    settings = source.settings
+    for rows, (least, most) in ((dangerous, settings.dangerous_peak), (~dangerous, settings.safe_peak)):
+        assert (peak[rows] <= most).all()
+        assert (peak[rows] >= least).all()
+
+
+def test_every_frame_of_a_movie_is_at_rest(sampled):
+    """The surface under pressure follows the object: gaps differ from the picture's by one number."""
+    contact = sampled[0].contact
+    trajectories = still(0.05, shares=(1.0, 0.5, 0.2))
+    gap = contact.gap(trajectories, problem()).double()
+    surface = contact.compliance.double()
+    pressed = contact.press(trajectories, problem())
+    assert not pressed.refused.any()
+    pressure = (pressed.frames * torch.tensor([1.0, 0.5, 0.2])[:, None, None]).flatten(1).double()
+    height = pressure @ surface + gap
+    for one, heights in zip(pressure, height, strict=True):
+        touched = one > 0
+        deepest = (one @ surface).max()
+        assert np.ptp(heights[touched].numpy()) < 4e-4 * deepest
+        assert heights[~touched].min() > heights[touched].mean() - 2e-4 * deepest
+
+
+def test_a_flat_stamp_is_proportional_and_a_relief_is_not():
+    shares = (1.0, 0.25)
+    for contact, proportional in ((rigid(relief=0.0, fillet=0.0), True), (rigid(relief=0.01), False)):
+        frames = contact.press(still(0.03, shares=shares), problem(shapes=["fist"])).frames
+        assert torch.allclose(frames[0], frames[1], rtol=1e-2, atol=50) == proportional
+        assert (frames[1] > 0).sum() <= (frames[0] > 0).sum()
+
+
+def test_edges_of_a_flat_stamp_press_hardest_and_fillets_take_that_away():
+    place = problem(shapes=["disc"])
+    sharp, round_ = (
+        rigid(relief=0.0, fillet=fillet).press(still(0.045), place).frames[0] for fillet in (0, 0.02)
+    )
+    middle = sharp[8:12, 8:12].mean()
+    assert sharp.max() > 1.8 * middle
+    assert round_.max() / round_[8:12, 8:12].mean() < 0.7 * sharp.max() / middle
+
+
+def test_white_touches_first_and_the_outline_is_an_arc():
+    contact = rigid(relief=0.01, fillet=0.0)
+    shapes = problem(shapes=["blurred_disc"])
+    gap = contact.gap(still(0.06), shapes)[0]
+    grey = shapes.shapes.solids(
+        *(getattr(still(0.06), name) for name in ("shape", "angle", "scale", "place"))
+    )
+    inside = grey.inside[0].flatten()
+    expected = 0.01 * (1 - grey.grey[0].flatten()[inside])
+    torch.testing.assert_close(gap[inside], expected - expected.min())
+    assert gap[~inside].isinf().all()
+
+    square = problem(shapes=["square"])
+    trajectories = still(0.06)
+    gap = rigid(relief=0.0, fillet=0.02).gap(trajectories, square)[0].view(BODY.shape)
+    row = gap[10][gap[10].isfinite()]
+    rim = np.minimum(np.arange(len(row)), np.arange(len(row))[::-1]) * BODY.cell[0]
+    # The outline lies within a cell of the first one inside.
+    for start in (0.0, BODY.cell[0]):
+        arc = 0.02 - np.sqrt(0.02**2 - np.clip(0.02 - rim - start, 0, 0.02) ** 2)
+        assert ((row.numpy() <= arc + 1e-6) if start == 0 else (row.numpy() >= arc - 1e-6)).all()
+
+
+@pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (1, 0, 0, 1), (0, 0, 0, 1)])
+def test_the_force_is_raised_until_the_classes_hold(wanted):
+    """At a low drawn peak a ball is small and safe; it is pressed until it is what it should be."""
+    where = problem(shapes=["blurred_disc"])
+    low = (where.settings.dangerous_peak if wanted[3] else where.settings.safe_peak)[0]
+    pressed = rigid(relief=0.002).press(still(0.065 if wanted[0] else 0.03, peak=low, wanted=wanted), where)
+    assert not pressed.refused.any()
+    movie = pressed.frames[None]
+    labels = movie_labels(movie, where.footprints, BODY.cell)[0, [0, 3]]
+    assert labels.tolist() == [wanted[0], wanted[3]]
+
+
+def rounded(compliance: torch.Tensor, seed: int) -> torch.Tensor:
+    """Return what another processor may make of a compliance: noise of 1e-12 to 1e-7, or fewer digits."""
+    if seed < 4:  # so few that sums are exact, whatever their order
+        unit = 2.0 ** (torch.log2(compliance.max()).floor() - 8 - 2 * seed)
+        return (compliance / unit).round() * unit
+    noise = np.random.default_rng(seed).standard_normal(compliance.shape)
+    size = 10.0 ** (-12 + seed % 6)
+    return (compliance.double() * (1 + size * torch.from_numpy(noise + noise.T))).float()
+
+
+@pytest.mark.parametrize("wanted", [(1, 0, 0, 0), (1, 0, 0, 1), (0, 0, 0, 1)])
+def test_rounding_decides_nothing(wanted):
+    """The same force, class by class, on every processor; the fewest digits move it by their own size."""
+    where = problem(shapes=["blurred_disc"])
+    low = (where.settings.dangerous_peak if wanted[3] else where.settings.safe_peak)[0]
+    stroke = still(0.065 if wanted[0] else 0.03, peak=low, wanted=wanted)
+    contact = rigid(relief=0.002)
+    exact, forces = contact.compliance, []
+    for seed in range(28):
+        contact.compliance = rounded(exact, seed)
+        pressed = contact.press(stroke, where)
+        assert not pressed.refused.any(), seed
+        labels = movie_labels(pressed.frames[None], where.footprints, BODY.cell)[0, [0, 3]]
+        assert labels.tolist() == [wanted[0], wanted[3]], seed
+        forces.append(pressed.force.item())
+    assert forces == pytest.approx([forces[-1]] * 28, rel=0.02)
+    assert forces[4:] == pytest.approx([forces[-1]] * 24, rel=1e-4)
+
+
+@pytest.mark.parametrize("most", [82.7e3, 83.2e3, 83.4e3])
+def test_the_end_of_a_range_is_tried_itself(most):
+    """The ball is big from 82.5 kPa on: wherever the search begins, it must not stop a little below that."""
+    where, contact = problem(shapes=["blurred_disc"]), rigid(relief=0.002)
+    settings = replace(where.settings, safe_peak=(10e3, 1.03 * most))
+    for peak in np.linspace(10e3, 80e3, 9):
+        stroke = still(0.065, peak=peak, wanted=(1, 0, 0, 0))
+        assert not contact.press(stroke, where._replace(settings=settings)).refused.any(), peak
+
+
+def test_what_no_force_can_make_big_is_hopeless():
+    where = problem(shapes=["fingertip"])
+    pressed = rigid(relief=0.05).press(still(0.06, wanted=(1, 0, 0, 0)), where)
+    assert pressed.refused.all()
+    assert pressed.hopeless.all()
+    far = rigid().press(still(0.008, place=(0.096, 0.096), peak=120e3, wanted=(0, 0, 0, 1)), where)
+    assert far.refused.all()
+    assert not far.hopeless.any()
+
+
+def test_draws_that_fail_are_counted():
+    movie = sampler(rigid()).sample(64, np.random.default_rng(5))
+    assert movie.parameters["draws"].sum() > 64
+    assert movie.parameters["unconverged"].sum() == 0
+
+
+def test_frames_that_do_not_converge_are_reported_and_not_used():
+    hasty = sampler(rigid(iterations=5))
+    with pytest.warns(RuntimeWarning, match=r"\d+ frames did not converge to contact.tolerance"):
+        movie = hasty.sample(32, np.random.default_rng(5))
+    assert movie.parameters["unconverged"].sum() > 0
+
+
+def test_contact_that_never_converges_is_refused():
+    with (
+        pytest.warns(RuntimeWarning, match="did not converge"),
+        pytest.raises(InputError, match=r"contact\.relief"),
+    ):
+        sampler(rigid(iterations=1), redraws=1).sample(16, np.random.default_rng(5))
+
+
+def test_the_same_seed_gives_the_same_movies_on_any_number_of_threads(sampled):
+    source = sampled[0]
+
+    def draw(number: int):
+        return source.sample(16, np.random.default_rng(number))
+
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = in_threads(draw, 2)
+        torch.set_num_threads(2)
+        two = in_threads(draw, 2)
+    finally:
+        torch.set_num_threads(threads)
+    for first, second in zip(one, two, strict=True):
+        assert torch.equal(first.pressure(), second.pressure())
+        assert torch.equal(first.labels, second.labels)
+
+
+def test_prescribed_gestures_have_pictures_for_pressure():
+    where = problem(shapes=["hand"])
+    trajectories = still(0.06, peak=40e3)
+    pressed = Prescribed().press(trajectories, where)
+    poses = (getattr(trajectories, name) for name in ("shape", "angle", "scale", "place"))
+    picture = where.shapes.render(*poses)
+    torch.testing.assert_close(pressed.frames / pressed.frames.sum(), picture / picture.sum())
+    assert pressed.frames.max().item() == pytest.approx(40e3)
+    assert pressed.frames.sum().item() * AREA == pytest.approx(pressed.force[0], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"relief": -0.001}, r"contact\.relief=-0.001 must be"),
+        ({"fillet": float("nan")}, r"contact\.fillet"),
+        ({"tolerance": 1e-9}, r"contact\.tolerance=1e-09 must be greater than or equal to 0.00001"),
+        ({"iterations": 0}, r"contact\.iterations"),
+    ],
+)
+def test_bad_settings_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        rigid(**settings)
+
+
+def test_a_simulator_without_a_surface_is_refused():
+    with pytest.raises(InputError, match="simulator=naive: set simulator=solid"):
+        Rigid(BODY, Naive(BODY, SENSORS))
+
+
+def test_the_skin_of_an_arm_falls_away_below_a_stamp():
+    """By radius (1 - cos(x / radius)) at x around the arm from the middle of the contact."""
+    arm = Arm(radius=0.05, length=0.16, angle=3.2, cells=(20, 20), layers=BODY.layers)
+    flat = Rigid(arm, HalfSpace(), relief=0.0, fillet=0.0)
+    stamp = still(0.06)
+    given = problem(shapes=["square"])
+    shapes = Shapes(("square",), arm, given.settings.thresholds.contact)
+    gap = flat.gap(stamp, given._replace(shapes=shapes))[0].view(20, 20)
+    assert (gap == gap[10:11])[gap.isfinite()].all()
+    row = gap[10]
+    inside = row.isfinite().numpy()
+    away = (np.arange(20) + 0.5) * 0.008
+    away = np.abs(away - away[inside].mean())
+    expected = 0.05 * (1 - np.cos(away[inside] / 0.05))
+    assert inside.sum() >= 10
+    assert row[inside].numpy() == pytest.approx(expected - expected.min(), abs=1e-7)
+    assert flat.gap(stamp, given).isinf().sum() == gap.isinf().sum()

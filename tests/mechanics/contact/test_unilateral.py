@@ -1,0 +1,185 @@
+"""Pressure under rigid objects, against Hertz, Boussinesq, and a general solver of quadratic programs."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from skin.mechanics.contact.rigid import solve_contact
+
+from .halfspace import love
+
+MODULUS = 200e3
+EXTENT = 0.03
+
+
+def pressed(cells: int, gap, force: float):
+    """Press an object of the given gap(r) on a half-space, seen through cells x cells over EXTENT.
+
+    Returns the distance of the cells from the axis, the pressure, and how far the object sinks in.
+    """
+    side = EXTENT / cells
+    compliance = torch.from_numpy(love((cells, cells), (side, side), MODULUS))
+    middle = (np.arange(cells) + 0.5) * side - EXTENT / 2
+    radius = np.hypot(middle, middle[:, None]).ravel()
+    gaps = torch.from_numpy(gap(radius))[None]
+    state = solve_contact(compliance, gaps, torch.tensor([force / side**2]), tolerance=1e-7)
+    assert state.residual <= 1e-7
+    pressure = state.pressure[0]
+    touched = pressure > 0
+    sunk = (compliance @ pressure + gaps[0])[touched].mean().item()
+    return radius, pressure.numpy(), sunk
+
+
+def hertz_errors(cells: int) -> dict[str, float]:
+    """Return the relative errors of radius, depth and peak under a ball."""
+    ball, force = 0.03, 1.2
+    radius = (3 * force * ball / (4 * MODULUS)) ** (1 / 3)
+    depth, peak = radius**2 / ball, 3 * force / (2 * np.pi * radius**2)
+    assert radius < EXTENT / 2
+    _, pressure, sunk = pressed(cells, lambda r: r**2 / (2 * ball), force)
+    area = (pressure > 0).sum() * (EXTENT / cells) ** 2
+    found = {"radius": np.sqrt(area / np.pi), "depth": sunk, "peak": pressure.max()}
+    exact = {"radius": radius, "depth": depth, "peak": peak}
+    return {name: abs(found[name] / exact[name] - 1) for name in exact}
+
+
+def test_a_ball_is_that_of_hertz():
+    coarse, fine = hertz_errors(16), hertz_errors(48)
+    assert max(coarse.values()) < 0.05
+    assert max(fine.values()) < 0.02
+    assert fine["depth"] < coarse["depth"]
+
+
+def test_force_and_depth_of_a_ball_obey_the_power_of_three_halves():
+    ball = 0.03
+    for force in (0.3, 1.2):
+        _, _, sunk = pressed(40, lambda r: r**2 / (2 * ball), force)
+        assert 4 / 3 * MODULUS * np.sqrt(ball) * sunk**1.5 == pytest.approx(force, rel=0.05)
+
+
+def test_the_pressure_under_a_ball_is_half_an_ellipse():
+    ball, force = 0.03, 1.2
+    radius, pressure, _ = pressed(48, lambda r: r**2 / (2 * ball), force)
+    rim = (3 * force * ball / (4 * MODULUS)) ** (1 / 3)
+    inner = radius < 0.8 * rim
+    exact = 3 * force / (2 * np.pi * rim**2) * np.sqrt(1 - (radius[inner] / rim) ** 2)
+    np.testing.assert_allclose(pressure[inner], exact, rtol=0.02)
+
+
+def test_a_flat_punch_is_that_of_boussinesq():
+    """d = F / (2 a E*), p = F / (2 pi a^2) / sqrt(1 - r^2 / a^2), singular at the edge."""
+    rim, force = 0.01, 2.0
+    radius, pressure, sunk = pressed(48, lambda r: np.where(r < rim, 0.0, np.inf), force)
+    assert sunk == pytest.approx(force / (2 * rim * MODULUS), rel=0.05)
+    inner = radius < 0.8 * rim
+    exact = force / (2 * np.pi * rim**2) / np.sqrt(1 - (radius[inner] / rim) ** 2)
+    np.testing.assert_allclose(pressure[inner], exact, rtol=0.05)
+    assert pressure.max() > 2 * force / (np.pi * rim**2)
+
+
+def problems(count: int = 40, size: int = 12, seed: int = 0):
+    """Return a half-space, random gaps, some of them infinite, and totals."""
+    rng = np.random.default_rng(seed)
+    compliance = love((size, size), (0.005, 0.005), MODULUS)
+    gaps = 0.004 * rng.random((count, size**2))
+    gaps[rng.random(gaps.shape) < 0.4] = np.inf
+    totals = 10 ** rng.uniform(3, 7, count)
+    return tuple(torch.from_numpy(values) for values in (compliance, gaps, totals))
+
+
+def test_the_conditions_of_contact_hold():
+    compliance, gaps, totals = problems()
+    state = solve_contact(compliance, gaps, totals, tolerance=1e-6)
+    assert (state.residual <= 1e-6).all()
+    for gap, pressure, total in zip(gaps, state.pressure, totals, strict=True):
+        deflection = compliance @ pressure
+        touched = pressure > 0
+        height = deflection + gap
+        approach = height[touched].mean()
+        allowed = 1e-6 * deflection.max()
+        assert (pressure >= 0).all()
+        assert pressure.sum().item() == pytest.approx(total.item(), rel=1e-9)
+        assert (pressure[gap.isinf()] == 0).all()
+        assert (height[touched] - approach).abs().max() <= allowed
+        assert (height[~touched] >= approach - allowed).all()
+
+
+def test_a_general_solver_finds_the_same():
+    compliance, gaps, totals = (values.numpy() for values in problems(count=4, size=5))
+    state = solve_contact(*problems(count=4, size=5), tolerance=1e-9)
+    for gap, total, pressure in zip(gaps, totals, state.pressure.numpy(), strict=True):
+        free = np.isfinite(gap)
+        small, own = compliance[np.ix_(free, free)], gap[free]
+        unit = total * small.max()  # energies of order 1: the solver's tolerances are absolute
+        found = minimize(
+            lambda x, c=small, g=own, t=total, u=unit: (t * x @ c @ x / 2 + g @ x) / u,
+            np.full(free.sum(), 1 / free.sum()),
+            jac=lambda x, c=small, g=own, t=total, u=unit: (t * c @ x + g) / u,
+            bounds=[(0, None)] * int(free.sum()),
+            constraints={"type": "eq", "fun": lambda x: x.sum() - 1, "jac": np.ones_like},
+            method="SLSQP",
+            options={"ftol": 1e-15, "maxiter": 2000},
+        )
+        np.testing.assert_allclose(pressure[free] / total, found.x, atol=2e-5)
+
+
+def test_a_batch_is_its_problems_one_by_one():
+    compliance, gaps, totals = problems(count=300)
+    together = solve_contact(compliance, gaps, totals, tolerance=1e-8).pressure
+    for number in (0, 7, 255, 256, 299):
+        alone = solve_contact(compliance, gaps[[number]], totals[[number]], tolerance=1e-8).pressure[0]
+        torch.testing.assert_close(together[number], alone, rtol=0, atol=1e-6 * alone.max().item())
+
+
+def test_single_precision_is_enough():
+    compliance, gaps, totals = problems()
+    exact = solve_contact(compliance, gaps, totals, tolerance=1e-9).pressure
+    single = solve_contact(compliance.float(), gaps, totals, tolerance=1e-4)
+    assert (single.residual <= 1e-4).all()
+    error = (single.pressure - exact).abs().amax(1) / exact.amax(1)
+    assert error.max() < 2e-3
+
+
+def test_the_start_changes_the_way_and_not_the_end():
+    compliance, gaps, totals = problems()
+    even = solve_contact(compliance, gaps, totals, tolerance=1e-8)
+    warm = solve_contact(compliance, gaps, totals, start=even.pressure, tolerance=1e-8)
+    assert warm.iterations.sum() < even.iterations.sum() / 4
+    # One cell in contact, which alone can take no step, and none at all.
+    for start in (torch.zeros_like(gaps).index_fill(1, torch.tensor([3]), 1.0), torch.zeros_like(gaps)):
+        other = solve_contact(compliance, gaps, totals, start, tolerance=1e-8)
+        worst = (other.pressure - even.pressure).abs().amax(1) / even.pressure.amax(1)
+        assert worst.max() < 1e-6
+
+
+@pytest.mark.parametrize("touching", [[0], [0, 4], [0, 2, 4, 6]])
+def test_cells_that_are_exactly_at_rest_let_others_join(touching):
+    """A ring of cells in whole numbers: the errors of the cells in contact are 0, without any rounding."""
+    row = torch.tensor([16.0, 6, 2, 1, 0, 1, 2, 6], dtype=torch.float64)
+    compliance = torch.stack([row.roll(turn) for turn in range(8)])
+    assert torch.linalg.eigvalsh(compliance).min() > 1
+    gap = torch.full((1, 8), 4.0, dtype=torch.float64)
+    gap[0, touching] = 0
+    start = (gap == 0).double()
+    for total in (1.0, 4.0, 32.0):
+        state = solve_contact(compliance, gap, torch.tensor([total]), start, tolerance=1e-8)
+        assert state.residual <= 1e-8
+        height = compliance @ state.pressure[0] + gap[0]
+        touched = state.pressure[0] > 0
+        assert np.ptp(height[touched].numpy()) < 1e-6
+        assert height.min() > height[touched].mean() - 1e-6
+    assert touched.all()
+
+
+def test_what_is_not_found_is_told():
+    compliance, gaps, totals = problems()
+    state = solve_contact(compliance, gaps, totals, tolerance=1e-8, iterations=2)
+    assert (state.residual > 1e-8).any()
+    assert (state.iterations <= 2).all()
+    torch.testing.assert_close(state.pressure.sum(1), totals)
+
+
+def test_no_problems_are_no_trouble():
+    compliance, gaps, totals = problems()
+    assert solve_contact(compliance, gaps[:0], totals[:0]).pressure.shape == (0, 144)

@@ -1,0 +1,181 @@
+"""The solid obeys the laws of elasticity that a few elements can show; tests/validation shows the rest."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse.linalg import spsolve
+
+from skin.body.sensors import Sensors
+from skin.body.sheet import Sheet
+from skin.errors import InputError
+from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator.solid import Elastic, Solid, hexahedra, reading_rows
+
+LAYERS = [
+    {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
+    {"material": "EcoFlex 00-30", "thickness": 0.005},
+]
+SHEET = Sheet([0.12, 0.12], [12, 12], LAYERS)
+FOOTPRINT = (0.01, 0.01)
+
+
+def sensors(*places, normals=(0.0, 0.0, 1.0)):
+    return Sensors(np.array(places, dtype=float), FOOTPRINT, np.array(normals, dtype=float))
+
+
+MIDDLE = sensors((0.06, 0.06, 0.005))
+
+
+def solid(where=MIDDLE, body=SHEET, **settings):
+    return Solid(body, where, **{"divisions": 2} | settings)
+
+
+def bent(points):
+    """Move a chart's points smoothly and unevenly: no element stays a box."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.stack([x + 0.2 * y * x, y + 0.1 * x * x - 0.1 * z, -z + 0.3 * x * z], axis=-1)
+
+
+def identity(points):
+    return np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3))
+
+
+def test_a_place_between_nodes_moves_as_trilinear_elements_do():
+    lines = tuple(np.sort(np.random.default_rng(seed).random(5)) for seed in range(3))
+    mesh = Hexahedra(lines, np.full((4, 4, 4), 2e5), np.full(4, 0.49), bent, identity)
+    strain = np.array([[1.0, 0.3, -0.2], [0.3, -0.4, 0.5], [-0.2, 0.5, 0.7]]) * 1e-3
+    points = np.random.default_rng(3).uniform(np.array(lines)[:, 0], np.array(lines)[:, -1], (20, 3))
+    down = mesh.motion(points, np.tile([0, 0, 1.0], (20, 1))) @ (mesh.nodes @ strain).ravel()
+    assert down == pytest.approx(_interpolated(mesh, points, strain), rel=1e-12)
+
+
+def _interpolated(mesh, points, strain):
+    """Return the third component of a uniform strain's motion where trilinear elements put chart points."""
+    values = bent(np.stack(np.meshgrid(*mesh.lines, indexing="ij"), axis=-1)) @ strain
+    return RegularGridInterpolator(mesh.lines, values)(points)[:, 2]
+
+
+def test_the_table_pushes_back():
+    mesh = hexahedra(SHEET, 2, {})
+    for axis in range(3):
+        load = mesh.loads(axis) @ np.random.default_rng(axis).random(144)
+        moved = Elastic(mesh).solve(load[:, None])[:, 0]
+        total = (mesh.stiffness() @ moved)[mesh.held].reshape(-1, 3).sum(axis=0)
+        assert total == pytest.approx(-load.reshape(-1, 3).sum(axis=0), rel=1e-9, abs=1e-15)
+
+
+def test_the_operator_is_a_direct_solve():
+    mesh = hexahedra(SHEET, 2, {})
+    free = np.flatnonzero(~mesh.held)
+    where = sensors((0.031, 0.052, 0.005), (0.09, 0.03, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
+    pressure = 1e4 * np.random.default_rng(0).random(144)
+    load = mesh.loads(2) @ pressure - 0.4 * mesh.loads(0) @ pressure
+    moved = np.zeros(len(load))
+    moved[free] = spsolve(mesh.stiffness()[free][:, free].tocsc(), load[free])
+    frame, shear = torch.from_numpy(pressure).reshape(12, 12), torch.tensor([-0.4, 0.0])
+    felt = solid(where)(frame, shear).readings.numpy()
+    assert felt == pytest.approx(reading_rows(mesh, where) @ moved, rel=2e-6)
+
+
+def test_forces_are_mutual():
+    """Maxwell and Betti: cell a moves under cell b as cell b does under cell a."""
+    mesh = hexahedra(SHEET, 2, {})
+    loads = mesh.loads(2)
+    compliance = loads.T @ Elastic(mesh).solve(loads.toarray())
+    assert np.abs(compliance - compliance.T).max() < 1e-10 * np.abs(compliance).max()
+    kept = solid().compliance().numpy() * np.prod(SHEET.cell)
+    assert kept == pytest.approx(compliance, rel=1e-4, abs=1e-6 * float(np.abs(compliance).max()))
+    assert np.linalg.eigvalsh(kept)[0] > 0
+
+
+def test_a_tilted_sensor_feels_shear():
+    """Traction q along x adds 2 q sin cos to what pushes across a plane leaning along x, in a wide sheet."""
+    wide, angle = Sheet([0.24, 0.24], [24, 24], LAYERS), np.deg2rad(30)
+    place = (0.12, 0.12, 0.0025)
+    where = sensors(place, place, normals=[(np.sin(angle), 0, np.cos(angle)), (0, 0, 1)])
+    skin = solid(where, wide)
+    nothing = torch.full(wide.shape, 1e3)
+    pushed = skin(nothing).readings.double()
+    sheared = skin(nothing, torch.tensor([0.5, 0.0])).readings.double()
+    # The traction pushes the surface along +x; on the plane across n it pulls where n leans into the motion.
+    change = (sheared - pushed).numpy() / (1e3 * 1e-4)
+    assert change[0] == pytest.approx(2 * 0.5 * np.sin(angle) * np.cos(angle), rel=0.03)
+    assert change[1] == pytest.approx(0, abs=0.01)
+
+
+def test_a_sensor_may_stand_on_edge():
+    """In the middle of a wide sheet what pushes sideways is nu / (1 - nu) of the pressure, in each layer."""
+    wide = Sheet([0.24, 0.24], [24, 24], LAYERS)
+    on_edge = sensors((0.12, 0.12, 0.0075), normals=(1.0, 0.0, 0.0))
+    mean = solid(on_edge, wide)(torch.full(wide.shape, 1e3)).readings.item() / 1e-4
+    sideways = 0.25 * 0.499 / 0.501 + 0.75 * 0.49 / 0.51  # the footprint reaches from 2.5 to 12.5 mm
+    assert mean == pytest.approx(1e3 * sideways, rel=0.01)
+
+
+def test_a_layout_needs_no_further_solve():
+    where = sensors((0.031, 0.052, 0.005), (0.09, 0.03, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
+    skin = solid(where)
+    direct = skin.transfer[:, :, :2].transpose(1, 2).numpy()
+    assert skin.of(where) == pytest.approx(direct, rel=1e-4, abs=1e-6 * float(np.abs(direct).max()))
+    assert np.array_equal(skin.pressure_rows(where), skin.of(where)[2])
+
+
+def test_sensors_move_as_the_skin_does():
+    skin, frame = solid(), torch.zeros(SHEET.shape)
+    frame[5:7, 5:7] = 1e4
+    motion, response = skin.motion(frame), skin(frame)
+    assert response.displacement is not None
+    torch.testing.assert_close(motion[:, 2], response.displacement[:, 0])
+    assert 0 < response.displacement[0, 0] < response.displacement[0, 1]
+
+
+def test_a_modulus_that_varies_is_felt():
+    varied = Sheet([0.12, 0.12], [12, 12], LAYERS, variation=0.3)
+    frame = torch.full(SHEET.shape, 1e3)
+    assert not torch.allclose(solid(body=varied)(frame).readings, solid()(frame).readings, rtol=1e-3)
+
+
+def test_operators_are_kept(tmp_path, monkeypatch):
+    first = solid(cache=tmp_path)
+    monkeypatch.setattr(Elastic, "transfer", None)
+    assert torch.equal(solid(cache=tmp_path).transfer, first.transfer)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"divisions": 0}, r"simulator.divisions=0 must be greater than 0"),
+        ({"poisson": {"muscle": 0.5}}, r"muscle has Poisson's ratio 0\.5.*poisson=\{muscle: 0\.49\}"),
+        ({"poisson": {"mussel": 0.4}}, r"names mussel, but the body is made of EcoFlex 00-30, muscle"),
+    ],
+)
+def test_what_no_solid_can_be(settings, reason):
+    with pytest.raises(InputError, match=reason):
+        solid(**settings)
+
+
+def test_the_measured_ratio_of_dragon_skin_is_refused_by_name():
+    body = Sheet([0.12, 0.12], [12, 12], [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}])
+    with pytest.raises(InputError, match=r"Dragon Skin 10 Medium has Poisson's ratio 0\.54") as caught:
+        solid(sensors((0.06, 0.06, 0.0)), body)
+    python, shell = (
+        "poisson={'Dragon Skin 10 Medium': 0.49}",
+        "'simulator.poisson={Dragon Skin 10 Medium: 0.49}'",
+    )
+    assert f"in Python give {python}" in str(caught.value)
+    assert f"on the command line give {shell}" in str(caught.value)
+    given = eval(python.removeprefix("poisson="))
+    assert Solid(body, sensors((0.06, 0.06, 0.005)), divisions=1, poisson=given).transfer.isfinite().all()
+
+
+def test_sensors_move_with_what_slides_over_them():
+    """Under a shear along x they go along x, and by symmetry neither along y nor deeper."""
+    body = Sheet([0.16, 0.16], [8, 8], LAYERS)
+    solid = Solid(body, Sensors(np.array([[0.08, 0.08, 0.005]]), (0.02, 0.02)), divisions=1)
+    pressure = torch.zeros(1, 8, 8)
+    pressure[:, 3:5, 3:5] = 1e4
+    still, pulled = solid.motion(pressure), solid.motion(pressure, torch.tensor([[0.5, 0.0]]))
+    assert pulled[0, 0, 0] > 1e-6
+    torch.testing.assert_close(pulled[0, 0, 1:], still[0, 0, 1:], atol=1e-8, rtol=1e-4)
+    torch.testing.assert_close(still[0, 0, :2], torch.zeros(2), atol=1e-8, rtol=0)

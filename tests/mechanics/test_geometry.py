@@ -1,0 +1,62 @@
+"""What a network is told of each sensor, against closed forms."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from skin.body.base import Layer
+from skin.body.layout.grid import Grid
+from skin.body.material import Material
+from skin.body.sensors import GEOMETRY
+from skin.body.sheet import Sheet
+from skin.mechanics.geometry import sensor_geometry
+from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.solid import Solid
+
+
+@pytest.fixture(scope="module")
+def body():
+    return Sheet(
+        (0.2, 0.16),
+        (40, 32),
+        [Layer(Material("hard", 2e5, 0.49), 0.01), Layer(Material("soft", 1e5, 0.49), 0.01)],
+    )
+
+
+def column(geometry, name):
+    return geometry[:, GEOMETRY.index(name)]
+
+
+def test_without_mechanics_a_sensor_reads_the_pressure_above_it(body):
+    body = replace(body, size=(0.205, 0.165), cells=(41, 33))
+    sensors = Grid(1, 1, (0.005, 0.005), depth=0.005).sensors(body)  # in the middle of a cell
+    geometry = sensor_geometry(body, sensors, Naive(body, sensors))
+    torch.testing.assert_close(column(geometry, "share"), torch.ones(1))
+    # The integral of 1 / (1 + exp((d - r) / w)) over the plane is pi r^2 (1 + (pi w / r)^2 / 3).
+    area = math.pi * 0.008**2 * (1 + (math.pi * 0.0015 / 0.008) ** 2 / 3)
+    assert column(geometry, "response_0mm").item() == pytest.approx(0.005**2 / area, rel=0.03)
+    assert column(geometry, "response_40mm").item() == pytest.approx(0, abs=1e-6)
+
+
+def test_places_and_sizes_are_those_of_the_skin(body):
+    sensors = Grid(2, 3, (0.008, 0.006), depth=0.004).sensors(body)
+    geometry = sensor_geometry(body, sensors, Naive(body, sensors))
+    torch.testing.assert_close(
+        geometry[:, :3].double(), torch.from_numpy(sensors.positions), rtol=1e-6, atol=0
+    )
+    for name, value in {"footprint_x": 0.008, "footprint_y": 0.006, "width": 0.2, "height": 0.16}.items():
+        torch.testing.assert_close(column(geometry, name), torch.full((6,), value))
+    torch.testing.assert_close(column(geometry, "thickness"), torch.full((6,), body.thickness))
+
+
+def test_in_a_solid_the_response_falls_with_distance_and_mirrors(body):
+    sensors = Grid(2, 2, (0.01, 0.01), depth=0.01).sensors(body)
+    geometry = sensor_geometry(body, sensors, Solid(body, sensors, divisions=2))
+    near, far = column(geometry, "response_0mm"), column(geometry, "response_20mm")
+    assert (near > 5 * far.abs()).all()
+    # the four sensors are mirror images of each other
+    torch.testing.assert_close(near, near.mean().expand(4), rtol=1e-3, atol=0)
+    # an even load is carried evenly
+    torch.testing.assert_close(column(geometry, "share"), torch.ones(4), rtol=0.05, atol=0)

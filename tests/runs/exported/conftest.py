@@ -1,0 +1,40 @@
+"""Small untrained networks: their weights do not matter here."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.model_of_run import RunModel
+
+SMALL = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=3", "data.gestures=400"]
+
+
+@pytest.fixture(scope="session")
+def untrained(configured):
+    """Return a function that builds a run of a learner without training it."""
+
+    def build(*overrides: str) -> RunModel:
+        config = configured(*SMALL, *overrides)
+        device, learner = build_device(config), build_learner(config)
+        data = build_data(config, device)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            learner.build(data)
+        return RunModel(device, learner, data.example, touch=0.3)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def exported(untrained, tmp_path_factory) -> tuple[RunModel, Path]:
+    """Return the run with features, and its exported file."""
+    pytest.importorskip("onnxruntime")
+    from skin.runs.exported.writer import write_model
+
+    of = untrained("experiment=best_fresh")
+    path = tmp_path_factory.mktemp("exported") / "skin.onnx"
+    module = of.learner.pipeline(of.places)
+    write_model(module, of.describe(), of.device.touches("train"), path)
+    return of, path

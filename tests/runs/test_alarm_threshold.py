@@ -1,0 +1,116 @@
+"""The device on which the alarm's threshold is chosen, for a skin and for the imperfections of a device."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from skin.core.files import CONF
+from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
+from skin.runs.alarm_threshold import alarm_point, threshold_device
+from skin.runs.configuration import plain, validate_config
+from skin.runs.finished_run import TAG, FinishedRun
+from skin.runs.overrides import profile_settings
+
+SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
+
+
+@pytest.fixture
+def hydra():
+    """Compose configurations, as commands do."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield lambda *words: validate_config(compose("train", [*SMALL, *words]))
+
+
+def kept(config):
+    """Return a configuration as a run stores it."""
+    return OmegaConf.create(plain(config))
+
+
+def test_a_profile_replaces_the_imperfections_of_the_training(hydra):
+    stored = kept(hydra("seed=3", "device.quantum=0.1"))
+    device = threshold_device(stored, hydra("evaluation.profile=calibrated", "layout=grid", "layout.rows=3"))
+    assert device.randomise
+    assert (device.gain_spread, device.noise, device.dead, device.tare) == (0.02, 0.1, [0, 2], True)
+    # What a profile does not name is that of the training; the skin is the new one.
+    assert (device.quantum, device.data_seed, len(device.sensors)) == (0.1, 3, 15)
+
+
+def test_without_a_profile_it_is_the_device_of_the_training(hydra):
+    stored = kept(hydra("profile=rough"))
+    device = threshold_device(stored, hydra())
+    assert (device.gain_spread, device.randomise) == (0.2, False)
+
+
+def test_a_profile_does_not_follow_a_calibration(hydra, tmp_path):
+    stored = kept(hydra(f"device.calibration={tmp_path}/gone.yaml"))
+    assert threshold_device(stored, hydra("evaluation.profile=mild")).calibration is None
+
+
+def test_a_profile_holds_on_a_run_of_drawn_skins(hydra):
+    stored = kept(hydra("device=skins", "device.count=1"))
+    for profile in ("rough", "drawn"):
+        device = threshold_device(stored, hydra(f"evaluation.profile={profile}"))
+        assert device.randomise
+        assert device.noise == profile_settings(profile)["noise"]
+
+
+def run_of(config, point):
+    """Return as much of a run as its operating point is read from."""
+    data = SimpleNamespace(tags={TAG: point.text()})
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
+    run.__dict__["stored"] = kept(config)
+    return run
+
+
+class Quiet:
+    """Finds every touch a little dangerous."""
+
+    def probabilities(self, touches):
+        return torch.full((len(touches), 4), 0.25)
+
+
+STORED = OperatingPoint(0.875, 0.02, 5000, 99, 0)
+
+
+def test_the_stored_threshold_holds_without_another_profile(hydra):
+    assert alarm_point(run_of(hydra(), STORED), None, hydra()) == STORED
+    rough = hydra("evaluation.profile=rough")
+    assert alarm_point(run_of(rough, STORED), None, rough) == STORED
+
+
+def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hydra):
+    skins = hydra("device=skins", "device.count=1")
+    assert alarm_point(run_of(skins, STORED), None, skins) == STORED
+    for run, config, one_skin in (
+        (hydra(), hydra("evaluation.profile=rough"), False),
+        (skins, hydra(), False),
+        (skins, skins, True),
+    ):
+        point = alarm_point(run_of(run, STORED), Quiet(), config, one_skin)
+        assert 0.25 < point.threshold < 0.2501
+
+
+def test_more_noise_means_higher_readings_at_rest(hydra):
+    """The gestures are measured by devices of the profile, each by another one."""
+    stored = kept(hydra())
+    idle = {}
+    for profile in ("mild", "harsh"):
+        touches = threshold_device(stored, hydra(f"evaluation.profile={profile}")).fresh_touches(40)
+        idle[profile] = np.nanmedian(touches.readings.diff(dim=1).abs().numpy())
+    assert idle["harsh"] > 2 * idle["mild"]
+
+
+def test_runs_on_other_touches_are_refused(hydra, tmp_path):
+    stored = kept(hydra("device=recording", f"device.path={tmp_path}/x.csv"))
+    with pytest.raises(InputError, match="trained on others"):
+        threshold_device(stored, hydra("evaluation.profile=rough"))
+
+
+def test_unknown_profiles_are_refused(hydra):
+    with pytest.raises(InputError, match="no profile soft: choose one of calibrated, drawn, harsh"):
+        threshold_device(kept(hydra()), hydra("evaluation.profile=soft"))

@@ -1,0 +1,304 @@
+"""The configuration mirrors the package, refuses what it does not know, and tells which runs are the same."""
+
+import csv
+import subprocess
+import sys
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class
+from hypothesis import given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from omegaconf.errors import ReadonlyConfigError
+
+from skin.commands._command import command
+from skin.core.files import CONF, ROOT
+from skin.core.settings import GROUPS
+from skin.errors import InputError
+from skin.evaluation.settings import check_evaluation
+from skin.runs.build import build_device, build_learner
+from skin.runs.configuration import fingerprint, plain, validate_config
+from tests.damage import DAMAGED_FILES
+
+ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+TRAIN = ROOT / "experiments" / "train.py"
+with (ROOT / "docs" / "results" / "tuning.csv").open(newline="") as file:
+    TRIALS = list(csv.DictReader(file))
+CHOSEN = [trial for trial in TRIALS if trial["chosen"] == "yes"]
+
+
+def keys(value):
+    """Return every key of nested containers."""
+    if isinstance(value, dict):
+        return set(value) | {key for entry in value.values() for key in keys(entry)}
+    return {key for entry in value for key in keys(entry)} if isinstance(value, list) else set()
+
+
+def place_of(group, option):
+    return "skin.hardware.serial" if (group, option) == ("device", "serial") else f"{GROUPS[group]}.{option}"
+
+
+@pytest.mark.parametrize("group", sorted({*GROUPS} - {"body", "device"}))
+def test_options_are_the_public_modules_of_the_folder(group):
+    folder = ROOT / GROUPS[group].replace(".", "/")
+    modules = {path.stem for path in folder.glob("*.py") if not path.stem.startswith("_")}
+    if group == "simulator":
+        modules -= {"plates"}
+    assert {path.stem for path in (CONF / group).glob("*.yaml")} == modules - {"base"}
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_an_option_names_a_class_of_its_own_module(group, option):
+    stored = OmegaConf.load(CONF / group / f"{option}.yaml")
+    assert stored["_convert_"] == "all"
+    assert get_class(stored["_target_"]).__module__ == place_of(group, option)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "simulator").glob("*.yaml")))
+def test_a_simulator_has_data(name):
+    assert OmegaConf.load(CONF / "data" / f"{name}.yaml").name == name, "step 2 of CONTRIBUTING.md"
+
+
+@pytest.mark.parametrize("group", ["data", "experiment", "sweep"])
+def test_groups_of_values_build_nothing(group):
+    for path in (CONF / group).glob("*.yaml"):
+        assert "_target_" not in keys(OmegaConf.to_container(OmegaConf.load(path), resolve=False)), path
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_composes(configured, group, option):
+    config = plain(validate_config(configured(f"{group}={option}")))
+    assert config[group]["_target_"].rpartition(".")[0] == place_of(group, option)
+
+
+@pytest.mark.parametrize("simulator", ["naive", "fem"])
+@pytest.mark.parametrize("row", ROWS)
+def test_every_row_composes_and_is_built(configured, row, simulator):
+    config = validate_config(configured(f"experiment={row}", f"simulator={simulator}"))
+    build_learner(config)
+    assert (config.row, config.data.name) == (row, simulator)
+    assert config.trainer.max_epochs == config.epochs[simulator]
+
+
+@pytest.mark.parametrize("trial", CHOSEN, ids=[trial["row"] for trial in CHOSEN])
+def test_a_tuned_row_has_the_settings_of_the_chosen_trial(configured, trial):
+    settings = [*trial["settings"].split(), f"epochs.fem={trial['epochs']}"]
+    tried = plain(configured(f"experiment={trial['row']}", "simulator=fem", *settings))
+    tuned = plain(configured(f"experiment={trial['row']}_tuned", "simulator=fem"))
+    differ = {key for key in tried if tried[key] != tuned[key]}
+    assert differ <= {"row", "epochs"}, "epochs of other data"
+    assert tuned["trainer"]["max_epochs"] == int(trial["epochs"])
+
+
+def test_every_tuned_row_is_the_best_of_its_trials():
+    for row in {trial["row"] for trial in TRIALS}:
+        trials = [trial for trial in TRIALS if trial["row"] == row]
+        best = max(trials, key=lambda trial: float(trial["validation_overall"]))
+        assert [trial for trial in trials if trial["chosen"] == "yes"] == [best], row
+
+
+@pytest.mark.parametrize("simulator", ["naive", "fem"])
+def test_the_device_carries_the_groups_that_were_chosen(configured, simulator):
+    config = validate_config(configured(f"simulator={simulator}", "seed=3", "layout=grid", "layout.rows=3"))
+    device = build_device(config)
+    assert (len(device.sensors), device.data_seed, device.seed) == (15, 3, 0)
+    assert device.padded == (simulator == "fem")
+    assert device.gestures == {"naive": 2350, "fem": 4038}[simulator]
+
+
+def test_a_checked_configuration_cannot_be_changed(configured):
+    with pytest.raises(ReadonlyConfigError):
+        validate_config(configured()).seed = 1
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [("+typo=1", "typo"), ("+data.typo=1", "typo"), ("data.gestures=many", "many"), ("seed=x", "seed")],
+)
+def test_what_does_not_fit_is_refused_by_name(configured, override, reason):
+    with pytest.raises(InputError, match=reason):
+        validate_config(configured(override))
+
+
+@pytest.mark.parametrize(
+    "name", ["device.noise", "optimizer.lr", "touch.small_area.0", "touch.thresholds.area"]
+)
+def test_what_is_no_number_is_refused_by_name(configured, name):
+    with pytest.raises(InputError, match=f"^{name} is nan: give a number$"):
+        validate_config(configured(f"{name}=nan"))
+
+
+def test_keys_that_only_steer_leave_the_fingerprint(configured):
+    same = configured("tracking.uri=sqlite:///elsewhere.db", "tracking.resume=false", "tracking.threads=1")
+    assert fingerprint(same) == fingerprint(configured())
+
+
+def test_keys_of_other_commands_leave_the_fingerprint(configured):
+    assert fingerprint(validate_config(configured())) == fingerprint(configured())
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["seed=1", "simulator=naive", "device.noise=0.06", "trainer.max_epochs=3"],
+)
+def test_anything_else_changes_the_fingerprint(configured, override):
+    assert fingerprint(configured(override)) != fingerprint(configured())
+
+
+def test_a_changed_layout_file_changes_the_fingerprint(configured, tmp_path):
+    path = tmp_path / "sensors.csv"
+    path.write_text("x_m,y_m\n0.05,0.05\n")
+    before = fingerprint(configured(f"layout.path={path}"))
+    assert fingerprint(configured(f"layout.path={path}")) == before
+    path.write_text("x_m,y_m\n0.05,0.06\n")
+    assert fingerprint(configured(f"layout.path={path}")) != before
+
+
+def train(*arguments: str, code: str = "") -> subprocess.CompletedProcess:
+    """Run train.py, or Python code in its place."""
+    command = [sys.executable, "-c", code] if code else [sys.executable, str(TRAIN)]
+    return subprocess.run(
+        [*command, *arguments], capture_output=True, text=True, timeout=120, check=False, cwd=ROOT
+    )
+
+
+@pytest.mark.parametrize(
+    ("argument", "named"),
+    [("sede=1", "sede"), ("+typo=1", "typo"), ("model=cn", "cn"), ("seed=x", "x"), ("model.typo=1", "typo")],
+)
+def test_a_mistake_ends_with_code_2_and_says_which(argument, named, tmp_path):
+    done = train(argument, f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a")
+    assert done.returncode == 2, done.stderr
+    assert named in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+LIGHT = f"""
+import runpy, sys
+sys.path.insert(0, {str(TRAIN.parent)!r})
+try:
+    runpy.run_path({str(TRAIN)!r}, run_name="__main__")
+except SystemExit as stop:
+    heavy = {{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)
+    print("exit", stop.code, *sorted(heavy))
+    raise
+print("exit 0", *sorted({{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize(("argument", "code"), [("--help", 0), ("+typo=1", 2), ("model=cn", 2)])
+def test_help_and_mistakes_wait_for_no_heavy_import(argument, code):
+    assert train(argument, code=LIGHT).stdout.splitlines()[-1] == f"exit {code}"
+
+
+@pytest.mark.parametrize(("verb", "least"), [("listen", 1), ("emulate", 7), ("evaluate", 11)])
+def test_a_verb_composes_only_what_it_needs(verb, least):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose(verb)
+    groups = {"touch", "body", "layout", "simulator", "contact", "device", "data", "representation", "model"}
+    groups |= {"fusion", "learner"}
+    assert len(groups & set(config)) == least
+
+
+ODD = [
+    "null",
+    "true",
+    "-1",
+    "0",
+    "1",
+    "1e300",
+    "-1e-320",
+    ".inf",
+    "-.inf",
+    ".nan",
+    "nan",
+    "1000000000",
+    "9999999999999999999999",
+    "''",
+    "x",
+    "[]",
+    "[1]",
+    "[1,2]",
+    "[1,2,3]",
+    "[null]",
+    "[-1,.inf]",
+    "{}",
+    "{a:1}",
+    "[[1]]",
+    "'{x'",
+    "'${x}'",
+    "../x",
+    "/dev/zero",
+    "0.5",
+    "[x,y]",
+    "[1e300,1e300]",
+    "[0,0]",
+    "${seed}",
+    "${nosuch}",
+    "1,2",
+]
+
+
+def names(value, before=""):
+    """Return the names of all settings and groups of a configuration."""
+    if not isinstance(value, dict):
+        return []
+    below = [name for key, part in value.items() for name in names(part, f"{before}{key}.")]
+    return [f"{before}{key}" for key in value if key != "_target_"] + below
+
+
+def built(word):
+    """Compose the configuration of a training with an override, and build its parts, as a command does."""
+
+    def task(config):
+        build_device(config)
+        build_learner(config)
+        check_evaluation(config.evaluation)
+
+    task.__module__ = "skin.commands.train"  # where Hydra looks for its help
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.exit", lambda code: None)
+        patch.setattr("logging.config.dictConfig", lambda *_: None)
+        command("train")(task)([word, "simulator=naive", "hydra.output_subdir=null", "hydra.run.dir=."])
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "evaluation=null",
+        "trainer=null",
+        "contact._partial_=../x",
+        "device.contact=''",
+        "representation=2147483648",
+        "layout=[[1]]",
+        "layout=[]",
+        "device.stuck=99999999999999999999999999",
+        "device.touch=-1",
+        "device.simulator=null",
+        "model.width=1e300",
+    ],
+)
+def test_settings_that_nobody_means_cost_one_sentence(word, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    built(word)
+    message = capsys.readouterr().err
+    assert len(message.splitlines()) == 1, message
+    assert "Traceback" not in message
+
+
+@pytest.mark.slow
+def test_every_setting_works_or_is_refused_whatever_it_is_set_to(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = OmegaConf.to_container(compose("train", ["simulator=naive"]))
+    settings_of = [name for name in names(config) if not name.startswith(("hydra", "tracking"))]
+
+    @DAMAGED_FILES
+    @given(st.sampled_from(settings_of), st.sampled_from(ODD))
+    def try_it(name, value):
+        built(f"{name}={value}")
+
+    try_it()

@@ -1,0 +1,224 @@
+"""A run comes back as it was, but for what the command line names."""
+
+import io
+import json
+import zipfile
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import skops.io as sio
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostingRegressor
+from sklearn.linear_model import LinearRegression
+
+from skin.core.files import CONF
+from skin.errors import InputError
+from skin.evaluation.operating_point import OperatingPoint
+from skin.evaluation.settings import Evaluation
+from skin.runs.alarm_threshold import stored_point
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.configuration import Tracking, validate_config
+from skin.runs.finished_run import TAG, FinishedRun, find_run
+from skin.runs.store import Store
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("evaluate", list(overrides))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """A store with a killed, a failed and two finished runs; the last one is an evaluation."""
+    folder = tmp_path_factory.mktemp("store")
+    settings = Tracking(f"sqlite:///{folder / 'm.db'}", str(folder / "a"), "skin", True, None)
+    store = Store.open(settings)
+    with store.run("older", {"learned": "weights.pt"}):
+        pass
+    with store.run("newer", {"learned": "weights.pt"}):
+        pass
+    with pytest.raises(ZeroDivisionError), store.run("failed", {"learned": "weights.pt"}):
+        raise ZeroDivisionError
+    store.client.create_run(store.experiment, run_name="killed", tags={"learned": "weights.pt"})
+    with store.run("evaluation", {"evaluated": "newer"}):
+        pass
+    return store
+
+
+def test_latest_is_the_last_training_that_finished(store):
+    assert find_run(store, "latest").title == "newer"
+
+
+def test_the_beginning_of_an_id_is_enough(store):
+    run = find_run(store, "latest")
+    assert find_run(store, run.identity[:12]).identity == run.identity
+
+
+@pytest.mark.parametrize(("name", "reason"), [("no such id", "no finished training run"), ("", "2 runs")])
+def test_a_name_that_means_no_single_run_is_refused(store, name, reason):
+    with pytest.raises(InputError, match=reason):
+        find_run(store, name)
+
+
+RECORDED = OmegaConf.create({"device": {"_target_": "skin.device.recording.Recorded"}})
+
+
+def tagged(text=None):
+    """Return as much of a run as its operating point is read from."""
+    data = SimpleNamespace(tags={} if text is None else {TAG: text})
+    run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
+    run.__dict__["stored"] = RECORDED
+    return run
+
+
+def settings(rate=0.02):
+    return Evaluation(devices=0, layouts=0, false_alarm_rate=rate)
+
+
+def test_an_operating_point_comes_back_as_it_was_stored(caplog):
+    point = OperatingPoint(0.8782987594604492, 0.02, 5000, 99, 0)
+    assert stored_point(tagged(point.text()), None, settings()) == point
+    assert stored_point(tagged("null"), None, settings()) is None
+    assert caplog.text == ""
+
+
+def test_an_old_run_on_a_recording_alarms_at_one_half_and_says_so(caplog):
+    point = stored_point(tagged(), None, settings())
+    assert (point.threshold, point.safe) == (0.5, 0)
+    said = caplog.text
+    assert "run abc stores no alarm threshold for 2 % false alarms" in said
+    assert "its false-alarm rate is unknown; train it again" in said
+
+
+def test_another_rate_on_a_recording_keeps_the_stored_threshold_and_says_so(caplog):
+    point = OperatingPoint(0.875, 0.02, 300, 5, None)
+    assert stored_point(tagged(point.text()), None, settings(0.1)) == point
+    said = caplog.text
+    assert "no alarm threshold for 10 % false alarms" in said
+    assert "chosen on 300 safe validation gestures for 2 % false alarms" in said
+
+
+SKIN = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2", "data.gestures=20"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What learners save: the name of the file -> its content."""
+    found = {}
+    for name, learner in (
+        ("trees.skops", ["learner=boosted_trees", "learner.rounds=2", "data.gestures=200"]),
+        ("rules.json", ["learner=rules"]),
+    ):
+        config = validate_config(composed(*SKIN, *learner))
+        made = build_learner(config)
+        made.fit(build_data(config, build_device(config)))
+        path = made.save(tmp_path_factory.mktemp("learned"))
+        assert path.name == name
+        found[name] = path.read_bytes()
+    return found | {"weights.pt": b"PK\3\4" + bytes(100)}
+
+
+def stored(change):
+    """Return a function of a file of trees that gives one of the same models, changed."""
+
+    def damage(content):
+        models = sio.loads(content, trusted=sio.get_untrusted_types(data=content))
+        return sio.dumps(change(models) or models)
+
+    return damage
+
+
+def nodes(**values):
+    """Return a function that changes the first node of the first tree of models."""
+
+    def change(models):
+        for name, value in values.items():
+            models[0]._predictors[0][0].nodes[name][0] = value
+
+    return change
+
+
+def claimed(shape):
+    """Return a function of a file of trees whose arrays claim a shape that they do not have."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+
+    def damage(content):
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(content)) as before, zipfile.ZipFile(buffer, "w") as after:
+            for name in before.namelist():
+                text = before.read(name)
+                after.writestr(name, header.getvalue() + bytes(64) if name.endswith(".npy") else text)
+        return buffer.getvalue()
+
+    return damage
+
+
+class Stranger:
+    """A class that no file may choose."""
+
+
+DAMAGED = {
+    "cut": ("trees.skops", lambda content: content[:-100]),
+    "almost empty": ("trees.skops", lambda content: content[:3]),
+    "a byte": ("trees.skops", lambda content: content[:200] + b"\0\1\2\3" + content[204:]),
+    "text": ("trees.skops", lambda content: b"no archive"),
+    "larger than memory": ("trees.skops", claimed((250_000_000, 240))),
+    "an endless shape": ("trees.skops", claimed((10**400,))),
+    "other content": ("trees.skops", stored(lambda models: {"a": 1})),
+    "a stranger": ("trees.skops", stored(lambda models: [Stranger()] * 4)),
+    "another estimator": ("trees.skops", stored(lambda models: [LinearRegression()] * 4)),
+    "regressors": ("trees.skops", stored(lambda models: [
+        HistGradientBoostingRegressor(max_iter=1).fit(np.eye(60), np.arange(60))] * 4)),
+    "other features": ("trees.skops", stored(lambda models: [
+        HistGradientBoostingClassifier(max_iter=1).fit(np.eye(60), np.arange(60) % 2)] * 4)),
+    "other labels": ("trees.skops", stored(lambda models: models[:2])),
+    "a loop": ("trees.skops", stored(nodes(left=0))),
+    "a missing child": ("trees.skops", stored(nodes(right=10_000))),
+    "a missing feature": ("trees.skops", stored(nodes(feature_idx=-7))),
+    "a category": ("trees.skops", stored(nodes(is_categorical=1))),
+    "a list": ("rules.json", lambda content: b"[]"),
+    "other rules": ("rules.json", lambda content: b"{}"),
+    "cut rules": ("rules.json", lambda content: content[:40]),
+    "rules of other types": ("rules.json", lambda content: json.dumps(
+        {name: {"measurement": 3, "threshold": 0, "slope": 1} for name in json.loads(content)}).encode()),
+    "unknown measurements": ("rules.json", lambda content: json.dumps(
+        {name: rule | {"measurement": "luck"} for name, rule in json.loads(content).items()}).encode()),
+    "weights": ("weights.pt", lambda content: content),
+    "no weights": ("weights.pt", lambda content: b""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_what_was_learned_is_refused_where_it_is_damaged_or_foreign(case, store, whole, tmp_path):
+    name, damage = DAMAGED[case]
+    kind = {"trees.skops": "boosted_trees", "rules.json": "rules", "weights.pt": "network"}[name]
+    config = validate_config(composed(*SKIN, f"learner={kind}"))
+    path = tmp_path / name
+    path.write_bytes(damage(whole[name]))
+    with store.run("damaged", {"learned": name}) as run:
+        store.client.log_artifact(run.info.run_id, str(path))
+    data, learner = build_data(config, build_device(config)), build_learner(config)
+    with pytest.raises(InputError, match=rf"{name} of run .* is damaged or does not fit") as refused:
+        FinishedRun(store, store.client.get_run(run.info.run_id)).load_weights(learner, data)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_run_without_its_files_is_refused(store):
+    with store.run("bare", {"learned": "rules.json"}) as run:
+        pass
+    config = validate_config(composed(*SKIN, "learner=rules"))
+    with pytest.raises(InputError, match=r"has no rules\.json in "):
+        FinishedRun(store, store.client.get_run(run.info.run_id)).load_weights(build_learner(config), None)
+
+
+def test_a_run_of_another_version_is_refused(store):
+    with store.run("other", {"learned": "rules.json"}) as run:
+        store.client.log_text(run.info.run_id, "evaluation: {gestures: 5}", "config.yaml")
+    with pytest.raises(InputError, match=r"does not fit this version: .*gestures.*: train it again$"):
+        _ = FinishedRun(store, run).stored

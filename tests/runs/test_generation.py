@@ -1,0 +1,189 @@
+"""Data sets are generated whole, once, and as a single file would be."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from skin.core.files import CONF
+from skin.device.files import DataSet, Manifest
+from skin.device.touches import concatenate
+from skin.errors import InputError
+from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
+from skin.runs.generation import generate_data_set, generate_file
+
+SMALL = ["simulator=naive", "n=80", "touch.leak=0.95"]  # few gestures may have few shapes
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return validate_config(compose("generate", [*SMALL, *overrides]))
+
+
+def generate(folder, *overrides) -> str:
+    config = composed(*overrides)
+    return generate_data_set(build_device(config), config, folder)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Make shards of 16 gestures."""
+    monkeypatch.setattr("skin.device.simulated._BATCH", 8)
+    monkeypatch.setattr("skin.device.base._PART", 2)
+
+
+def contents(folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("shards/*"))}
+
+
+@pytest.mark.parametrize("stream", ["false", "true"])
+def test_shards_are_the_budget(tmp_path, stream):
+    said = generate(tmp_path / "touches", f"data.stream={stream}")
+    assert said.startswith("80 gestures in 5 shards, ")
+    found = DataSet(tmp_path / "touches")
+    assert found.counts == [16] * 5
+    joined = concatenate([found.read(number) for number in range(5)])
+    whole = build_device(composed(f"data.stream={stream}")).recording(complete=False)
+    assert torch.equal(joined.touches.readings, whole.touches.readings)
+    assert torch.equal(joined.touches.valid, whole.touches.valid)
+    assert torch.equal(joined.touches.labels, whole.touches.labels)
+    assert torch.equal(joined.force, whole.force)
+    assert all(torch.equal(values, whole.parameters[name]) for name, values in joined.parameters.items())
+
+
+def test_the_manifest_tells_where_the_touches_come_from(tmp_path):
+    generate(tmp_path, "seed=3")
+    found = Manifest.read(tmp_path)
+    assert found.seed == found.config["device"]["data_seed"] == 3
+    assert len(found.source_commit) >= 5
+    assert found.source_dirty in ("true", "false", "unknown")
+    assert found.config["simulator"]["_target_"] == "skin.mechanics.simulator.naive.Naive"
+
+
+def test_what_is_there_is_not_drawn_again(tmp_path, monkeypatch, capsys):
+    generate(tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("shards/*")}
+    kept, gone = contents(tmp_path), tmp_path / "shards" / "00002.parquet"
+    gone.unlink()
+    drawn = []
+    draw = build_device(composed()).parts()[2].make
+    with monkeypatch.context() as patch:
+        patch.setattr("skin.runs.generation.write_recording", lambda *of: drawn.append(of))
+        with pytest.raises(InputError, match=r"1 of 5 shards are missing"):
+            generate(tmp_path)
+    assert [str(path) for _, path, _ in drawn] == [str(gone)]
+    assert torch.equal(drawn[0][0].touches.readings, draw().touches.readings)
+    assert "64 of 80 gestures are there already" in capsys.readouterr().err
+    generate(tmp_path)
+    assert contents(tmp_path) == kept
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items() if path != gone)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import skin.device.simulated, skin.device.base, skin.device.files
+skin.device.simulated._BATCH, skin.device.base._PART = 8, 2
+from test_generation import generate
+write, calls = skin.device.files.write_parquet, []
+
+def cut_off(table, partial, **options):
+    calls.append(partial)
+    if len(calls) < 4:
+        return write(table, partial, **options)
+    partial.write_bytes(b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+skin.device.files.write_parquet = cut_off
+generate(Path({folder!r}))
+"""
+
+
+def test_a_killed_generation_goes_on(tmp_path):
+    folder, whole = tmp_path / "touches", tmp_path / "whole"
+    script = KILLED.format(tests=os.path.dirname(__file__), folder=str(folder))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    left = sorted(path.name for path in folder.glob("shards/*"))
+    assert left[1:] == [f"0000{number}.parquet" for number in range(3)]
+    assert left[0].startswith(".00003.")  # half a shard
+    with pytest.raises(InputError, match=r"2 of 5 shards are missing"):
+        DataSet(folder)
+    generate(folder)
+    generate(whole)
+    assert contents(folder) == contents(whole)
+    numbers = [DataSet(folder).read(number).parameters["peak"] for number in range(5)]
+    assert len(torch.cat(numbers).unique()) == 80
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["seed=1"], r"was begun with seed=0, not 1; device.data_seed=0, not 1: repeat those settings"),
+        (["n=96"], r"was begun with n=80, not 96"),
+        (["device.noise=0.1"], r"was begun with device.noise=0.05, not 0.1: repeat"),
+    ],
+)
+def test_other_settings_are_refused(tmp_path, overrides, message):
+    generate(tmp_path)
+    (tmp_path / "shards" / "00001.parquet").unlink()
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=message):
+        generate(tmp_path, *overrides)
+    assert contents(tmp_path) == before
+
+
+def test_other_code_is_refused(tmp_path, monkeypatch):
+    generate(tmp_path)
+    other = {"source_commit": "f" * 40, "source_dirty": "false"}
+    monkeypatch.setattr("skin.runs.generation.source_tags", lambda: other)
+    with pytest.raises(InputError, match=r"was begun by the code of commit \w+, this is f{12}: use"):
+        generate(tmp_path)
+
+
+def test_a_folder_with_other_things_is_refused(tmp_path):
+    (tmp_path / "mine.txt").write_text("x")
+    with pytest.raises(InputError, match=r"exists and has no manifest.json: add out= with a new or an empty"):
+        generate(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    with pytest.raises(InputError, match=r"exists and has no manifest.json"):
+        generate(tmp_path / "mine.txt")
+
+
+def test_shapes_that_predict_a_label_leave_nothing_behind(tmp_path, monkeypatch):
+    one_size = ["touch.shapes=[disc,bar]", "touch.stretch=1", "touch.big_area=[0.45,0.7]"]
+    many = ["n=640", "touch.leak=0.6", "touch.strict=true"]
+    monkeypatch.setattr("skin.device.base._PART", 40)
+    with pytest.raises(InputError, match=r"the shape alone predicts big"):
+        generate(tmp_path / "touches", *one_size, *many)
+    assert not list(tmp_path.iterdir())
+
+
+def test_only_one_process_generates_a_folder(tmp_path):
+    from filelock import FileLock
+
+    generate(tmp_path)
+    with FileLock(tmp_path / ".lock"), pytest.raises(InputError, match=r"another process generates"):
+        generate(tmp_path)
+
+
+def test_a_file_larger_than_memory_is_refused(tmp_path):
+    config = composed("n=100000000")
+    with pytest.raises(InputError, match=r"n=100000000 in one file needs about .* GB .*: add out=FOLDER"):
+        generate_file(build_device(config), config, tmp_path / "x.parquet")
+
+
+def test_a_recording_becomes_a_data_set(tmp_path):
+    config = composed()
+    generate_file(build_device(config), config, tmp_path / "x.csv")
+    said = generate(tmp_path / "touches", "device=recording", f"device.path={tmp_path / 'x.csv'}")
+    assert said.startswith("80 gestures in 1 shards")
+    whole, found = build_device(config).recording(), DataSet(tmp_path / "touches").read(0)
+    assert torch.equal(found.touches.readings, whole.touches.readings)
+    assert torch.equal(found.parameters["peak"], whole.parameters["peak"])

@@ -1,0 +1,214 @@
+"""Models that come with the package: complete, small, unaltered, and as good as their cards say."""
+
+import json
+import os
+import shutil
+import subprocess
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+import skin
+from skin.core.files import ROOT
+from skin.core.safe_loading import load_yaml
+from skin.errors import InputError
+from skin.evaluation.operating_point import LABEL
+from skin.runs.finished_run import (
+    CARD,
+    CONFIG,
+    MODELS,
+    RECORD,
+    SUMS,
+    FinishedRun,
+    checksums,
+    find_pretrained,
+    is_name,
+)
+from skin.runs.model_folder import model_card
+from tests.damage import DAMAGED_FILES, damaged, mutated, opened
+
+NAMES = sorted(path.name for path in (ROOT / MODELS).iterdir())
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+
+def record_of(name):
+    return json.loads((ROOT / MODELS / name / RECORD).read_text())
+
+
+def test_there_is_a_model_of_the_default_skin():
+    assert "default_skin" in NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_is_one_small_file_of_weights_with_configuration_and_card(name):
+    folder, record = ROOT / MODELS / name, record_of(name)
+    weights = record["tags"]["learned"]
+    assert {path.name for path in folder.iterdir()} == {RECORD, CONFIG, CARD, SUMS, weights}
+    assert (folder / weights).stat().st_size <= 4e6
+    assert (folder / SUMS).read_text() == checksums(folder, weights)
+    assert find_pretrained(name).info.run_name == name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_card_is_generated_and_has_every_metric(name):
+    record, config = record_of(name), load_yaml(ROOT / MODELS / name / CONFIG)
+    card = (ROOT / MODELS / name / CARD).read_text()
+    assert card == model_card(name, record, config)
+    for metric in (metric for metric in record["metrics"] if metric.count("/") == 2):
+        assert f"| {metric.split('/', 1)[1]} | " in card, metric
+    for text in (record["licence"], record["tags"]["source_commit"], "alarm above 0.", "## Not for"):
+        assert text in card
+
+
+def test_a_card_says_that_its_alarm_was_measured_on_drawn_devices():
+    """The recall of the card, 78.5 %, is no contradiction to that of a model of one quiet device."""
+    config = load_yaml(ROOT / MODELS / "default_skin" / CONFIG)
+    quiet = config | {"device": config["device"] | {"randomise": False}}
+    drawn, alone = (model_card("default_skin", record_of("default_skin"), each) for each in (config, quiet))
+    assert "means over these devices, quiet and bad ones, with one threshold for all" in drawn
+    assert "## Devices" not in alone
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_names_no_folder_of_the_machine_of_its_training(name):
+    config = load_yaml(ROOT / MODELS / name / CONFIG)
+    assert not {"tracking", "trust"} & config.keys()
+    assert "process" not in record_of(name)["tags"]
+    for path in (ROOT / MODELS / name).iterdir():
+        assert b"file:/" not in path.read_bytes(), path
+        assert str(ROOT).encode() not in path.read_bytes(), path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_the_weights_reproduce_the_card_on_400_touches(name, tmp_path):
+    """At most a few predictions may differ: those closer to a threshold than processors round."""
+    check, trained = record_of(name)["check"], skin.load_run(name, f"sqlite:///{tmp_path}/m.db")
+    assert check["touches"] == 400
+    assert check["tolerance"] <= 2
+    touches = trained.device.touches("test")[slice(400)]
+    chances = trained.predict(touches)
+    differ = set()
+    for label, expected in check["predictions"].items():
+        place = trained.labels.index(LABEL if label == "alarm" else label)
+        found = chances[:, place] > (trained.point.threshold if label == "alarm" else 0.5)
+        differ |= {number for number, bit in enumerate(expected) if bool(found[number]) != (bit == "1")}
+        correct = int((found == (touches.labels[:, place] > 0.5)).sum())
+        assert abs(correct - check["correct"][label]) <= check["tolerance"], label
+    assert len(differ) <= check["tolerance"], differ
+
+
+@pytest.fixture
+def copied(tmp_path, monkeypatch):
+    """Return the folder of a copy in the current folder, which comes before the one of the package."""
+    folder = tmp_path / MODELS / "copy"
+    shutil.copytree(ROOT / MODELS / "default_skin", folder)
+    monkeypatch.chdir(tmp_path)
+    assert find_pretrained("copy").info.artifact_uri == folder.as_uri()
+    return folder
+
+
+@pytest.mark.parametrize("name", ["weights.pt", CONFIG, RECORD, CARD])
+def test_an_altered_file_is_refused_by_name(name, copied):
+    content = bytearray((copied / name).read_bytes())
+    place = content.index(b"0") if name == RECORD else len(content) // 2
+    content[place] = ord("1") if content[place] != ord("1") else ord("2")
+    (copied / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"^{name} in .*copy differs from {SUMS}: "):
+        find_pretrained("copy")
+
+
+@pytest.mark.parametrize("name", ["weights.pt", CONFIG, RECORD, CARD, SUMS])
+def test_a_missing_file_is_refused_by_name(name, copied):
+    (copied / name).unlink()
+    with pytest.raises(InputError, match=name):
+        find_pretrained("copy")
+
+
+def test_another_format_is_refused_before_anything_else_is_read(copied):
+    (copied / RECORD).write_text(json.dumps({"format": 2}))
+    with pytest.raises(InputError, match="has format 2 and this version reads format 1: install"):
+        find_pretrained("copy")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 1}', '{"format": 1, "tags": {"learned": 3}}'])
+def test_another_record_is_refused(text, copied):
+    (copied / RECORD).write_text(text)
+    with pytest.raises(InputError, match=r"is no (complete )?pretrained model"):
+        find_pretrained("copy")
+
+
+@pytest.mark.parametrize("name", ["", "latest", "25aa", "../models/default_skin", "Default", ".hidden"])
+def test_what_selects_a_run_or_a_path_is_no_name(name):
+    assert not is_name(name)
+    assert find_pretrained(name) is None
+
+
+def test_sha256sum_reads_the_hashes(copied):
+    if shutil.which("sha256sum") is None:
+        pytest.skip("needs sha256sum")
+    command = ["sha256sum", "--check", "--strict", SUMS]
+    done = subprocess.run(command, cwd=copied, capture_output=True, text=True, check=True)
+    assert done.stdout.count(": OK") == 4
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """Return the folder of a copy of a model, with few bytes of weights."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / MODELS / "mine"
+    shutil.copytree(ROOT / MODELS / "default_skin", folder)
+    (folder / "weights.pt").write_bytes(b"weights")
+    (folder / SUMS).write_text(checksums(folder, "weights.pt"))
+    return folder
+
+
+@pytest.mark.parametrize("name", [RECORD, CONFIG, CARD, SUMS, "weights.pt"])
+def test_damage_never_passes_for_a_model(model, name):
+    content, whole = (model / name).read_bytes(), find_pretrained("mine")
+
+    @DAMAGED_FILES
+    @given(data=st.data())
+    def try_it(data):
+        (model / name).write_bytes(data.draw(damaged(content)))
+        run = opened(lambda: find_pretrained("mine"))
+        assert run is None or name == SUMS
+        assert run is None or (run.data.tags, run.data.metrics) == (whole.data.tags, whole.data.metrics)
+
+    try_it()
+
+
+@pytest.mark.parametrize("name", [RECORD, pytest.param(CONFIG, marks=pytest.mark.slow)])
+def test_a_model_of_somebody_else_works_or_is_refused(model, name):
+    """Its checksums are right, whatever is in it."""
+    content, store = load_yaml(model / name), None
+
+    @DAMAGED_FILES
+    @given(data=st.data())
+    def try_it(data):
+        changed = data.draw(mutated(content))
+        text = json.dumps(changed) if name == RECORD else yaml.safe_dump(changed, allow_unicode=True)
+        (model / name).write_text(text)
+        (model / SUMS).write_text(checksums(model, "weights.pt"))
+        run = opened(lambda: find_pretrained("mine"))
+        if run is not None and name == CONFIG:
+            opened(lambda: FinishedRun(store, run).stored)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FinishedRun, "fetch", lambda run, file, folder: model / file)
+        try_it()
+
+
+def test_weights_without_an_end_are_refused(model):
+    (model / "weights.pt").unlink()
+    os.mkfifo(model / "weights.pt")
+    with pytest.raises(InputError, match="no complete pretrained model: it is no regular file"):
+        find_pretrained("mine")
+    (model / "weights.pt").unlink()
+    (model / "weights.pt").symlink_to("/dev/zero")
+    with pytest.raises(InputError, match="it is no regular file"):
+        find_pretrained("mine")

@@ -1,0 +1,52 @@
+"""A skin that was built in Python has the settings that build it again."""
+
+import numpy as np
+import pytest
+from hydra.utils import instantiate
+
+from skin.body.arm import Arm
+from skin.body.base import Layer
+from skin.body.layout.file import File
+from skin.body.layout.grid import Grid
+from skin.body.layout.random import Random
+from skin.body.material import Material, Relaxation
+from skin.body.sheet import Sheet
+from skin.runs.overrides import with_skin
+
+LAYERS = [
+    {"material": "Dragon Skin 10 Medium", "thickness": 0.01},
+    Layer(Material("gel", 4e4, 0.49, Relaxation(0.5, 0.3)), 0.004),
+]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        Sheet((0.2, 0.1), (20, 10), LAYERS, variation=0.1, variation_seed=3),
+        Arm(cells=(20, 10), layers=LAYERS, radius=0.05, length=0.1, angle=2.0),
+    ],
+    ids=["sheet", "arm"],
+)
+@pytest.mark.parametrize(
+    "layout", [Grid(2, 3, (0.008, 0.006), tilt=0.3), Random(5, 1), File("data/layouts/tilted_5x5.csv")]
+)
+def test_the_settings_build_the_same_skin(body, layout):
+    if isinstance(layout, File):
+        body = Sheet((0.16, 0.16), (16, 16), LAYERS)
+    settings = with_skin({"seed": 1}, body, layout)
+    assert settings["seed"] == 1
+    assert instantiate(settings["body"]) == body
+    sensors, expected = instantiate(settings["layout"]).sensors(body), layout.sensors(body)
+    np.testing.assert_allclose(sensors.positions, expected.positions)
+    np.testing.assert_allclose(sensors.normals, expected.normals)
+    assert sensors.footprint == expected.footprint
+
+
+def test_names_and_files_are_options():
+    settings = with_skin({}, "arm", "sensors.csv")
+    assert settings["body"]["_target_"] == "skin.body.arm.Arm"
+    assert settings["layout"] == {
+        "_target_": "skin.body.layout.file.File", "_convert_": "all", "path": "sensors.csv",
+        "footprint": [0.01, 0.01], "depth": None,
+    }  # fmt: skip
+    assert with_skin({"layout": 1}, None, None) == {"layout": 1}

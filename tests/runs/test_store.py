@@ -1,0 +1,216 @@
+"""A run's status can be trusted, whatever ends it."""
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from skin.core.files import ROOT
+from skin.runs import store as tracking
+from skin.runs.configuration import Tracking, source_tags
+from skin.runs.finished_run import FinishedRun
+from skin.runs.model_of_run import load_run
+from skin.runs.store import TAGS, Store, print_table_link
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+BEGIN = f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+from skin.runs.configuration import Tracking
+from skin.runs.store import Store
+store = Store.open(Tracking(sys.argv[1], sys.argv[2], "skin", True, None))
+"""
+WAIT = """
+import time
+with store.run("waiting", {"fingerprint": "f"}):
+    print("open", flush=True)
+    time.sleep(120)
+"""
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("store")
+    return Tracking(f"sqlite:///{folder / 'm.db'}", str(folder / "artifacts"), "skin", True, None)
+
+
+@pytest.fixture(scope="module")
+def store(settings):
+    return Store.open(settings)
+
+
+def status(store, run):
+    return store.client.get_run(run.info.run_id).info.status
+
+
+def test_a_run_that_ends_by_itself_is_finished(store):
+    with store.run("good", {"fingerprint": "a"}) as run:
+        assert status(store, run) == "RUNNING"
+        assert not store.find("FINISHED", fingerprint="a")
+    assert status(store, run) == "FINISHED"
+    assert [found.info.run_id for found in store.find("FINISHED", fingerprint="a")] == [run.info.run_id]
+
+
+def test_a_run_that_raises_is_failed_and_says_why(store):
+    with pytest.raises(ValueError, match="broken"), store.run("bad", {"fingerprint": "b"}) as run:
+        raise ValueError("broken")
+    assert status(store, run) == "FAILED"
+    assert store.client.get_run(run.info.run_id).data.tags["error"] == "ValueError: broken"
+    assert not store.find("FINISHED", fingerprint="b")
+
+
+def test_an_interrupted_run_is_killed(store):
+    with pytest.raises(KeyboardInterrupt), store.run("stopped", {"fingerprint": "c"}) as run:
+        raise KeyboardInterrupt
+    assert status(store, run) == "KILLED"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [(signal.SIGTERM, "KILLED"), (signal.SIGINT, "KILLED"), (signal.SIGKILL, "RUNNING")],
+)
+def test_a_signal_leaves_no_finished_run(begin, tmp_path, settings, store, number, expected):
+    (tmp_path / "wait.py").write_text(BEGIN + WAIT)
+    with begin(ROOT, tmp_path / "wait.py", settings.uri, settings.artifacts) as process:
+        assert next(process.lines()) == "open"
+        process.send_signal(number)
+        process.wait(60)
+    assert store.find(fingerprint="f")[0].info.status == expected
+    assert not store.find("FINISHED", fingerprint="f")
+    # Whatever starts next tells what nobody could tell at the end.
+    assert Store.open(settings).find(fingerprint="f")[0].info.status == "KILLED"
+
+
+def test_a_run_whose_process_is_gone_is_called_killed(settings, store):
+    here, number, started = json.loads(tracking._me())
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    tags = {
+        "gone": json.dumps([here, ended.pid, started]),
+        "number given anew": json.dumps([here, number, started - 3600]),
+        "another machine": json.dumps(["elsewhere", ended.pid, started]),
+        "no process": "x",
+    }
+    runs = {
+        name: store.client.create_run(store.experiment, run_name=name, tags={"process": process})
+        for name, process in tags.items()
+    }
+    with store.run("mine", {}) as runs["mine"]:
+        Store.open(settings)
+        found = {name: status(store, run) for name, run in runs.items()}
+    killed = {name for name, said in found.items() if said == "KILLED"}
+    assert killed == {"gone", "number given anew"}
+    assert set(found.values()) == {"KILLED", "RUNNING"}
+    assert status(store, runs["mine"]) == "FINISHED"
+
+
+def test_a_child_knows_its_parent(store):
+    with store.run("parent", {}) as parent, store.run("child", {}, parent.info.run_id) as child:
+        assert child.data.tags["mlflow.parentRunId"] == parent.info.run_id
+        assert source_tags().items() <= child.data.tags.items()
+
+
+def test_opening_twice_gives_the_same_experiment(settings, store):
+    assert Store.open(settings).experiment == store.experiment
+
+
+def test_artifacts_lie_where_they_were_meant_to(settings, store):
+    with store.run("with a file", {}) as run:
+        store.client.log_text(run.info.run_id, "hello", "note.txt")
+    (found,) = (ROOT / settings.artifacts).glob("**/note.txt")
+    assert found.read_text() == "hello"
+
+
+def test_readers_and_writers_work_side_by_side(settings, store):
+    path = settings.uri.removeprefix("sqlite:///")
+    database = sqlite3.connect(path)
+    assert database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    database.close()
+
+
+@pytest.mark.slow
+def test_processes_that_start_at_once_share_one_new_database(tmp_path):
+    command = [sys.executable, "-c", BEGIN + "print(store.experiment)"]
+    command += [f"sqlite:///{tmp_path}/m.db", str(tmp_path / "a")]
+
+    def start(_):
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+    with ThreadPoolExecutor(2) as pool:
+        done = list(pool.map(start, range(2)))
+    assert [one.returncode for one in done] == [0, 0], done[-1].stderr
+    assert len({one.stdout for one in done}) == 1
+
+
+def test_the_experiment_has_the_tags_of_the_run_table(store):
+    tags = store.client.get_experiment(store.experiment).tags
+    assert tags["mlflow.experimentKind"] == "custom_model_development"
+    view = json.loads(tags["mlflow.sharedViewState.skin"])
+    assert "metrics.`same/overall/accuracy`" in view["selectedColumns"]
+
+
+def test_an_experiment_of_an_earlier_version_gets_the_tags(store, settings):
+    for name in TAGS:
+        store.client.delete_experiment_tag(store.experiment, name)
+    assert not store.client.get_experiment(store.experiment).tags
+    assert Store.open(settings).client.get_experiment(store.experiment).tags == TAGS
+
+
+def test_the_link_opens_the_runs_of_the_experiment(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    print_table_link("http://127.0.0.1:1")
+    assert capsys.readouterr().out == (
+        "runs: http://127.0.0.1:1/#/experiments/1/runs?workflowType=machine_learning&viewStateShareKey=skin\n"
+    )
+
+
+@pytest.mark.parametrize("name", ["a%20b", "what? #1"])
+def test_a_working_folder_may_have_any_name(name, tmp_path, monkeypatch):
+    folder = tmp_path / name
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    store = Store.open(Tracking(None, None, "skin", True, None))
+    with store.run("here", {}) as run:
+        store.client.log_text(run.info.run_id, "text", "note.txt")
+    assert FinishedRun(store, run).fetch("note.txt", str(tmp_path)).read_text() == "text"
+    assert (folder / "mlflow.db").is_file()
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [name]
+
+
+def test_a_store_without_a_database_has_no_runs_and_makes_no_file(tmp_path):
+    store = Store.existing(Tracking(f"sqlite:///{tmp_path}/m.db", None, "skin", True, None))
+    assert store.find("FINISHED", fingerprint="a") == []
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_database_is_opened(settings, store):
+    assert Store.existing(settings).experiment == store.experiment
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "run=latest"],
+        ["live", "run=none"],
+        ["export", "run=latest", "out=x.onnx"],
+        ["train", "simulator=fem", "body=arm", "layout=grid"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_refused_command_leaves_no_database(words, run, tmp_path):
+    done = run(tmp_path, *words, store=False)
+    assert done.returncode == 2, done.stderr
+    assert not list(tmp_path.glob("mlflow.db*"))
+
+
+def test_a_pretrained_model_needs_no_database(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_run("any_skin").window == 30
+    assert not list(tmp_path.glob("mlflow.db*"))

@@ -1,0 +1,137 @@
+"""A run counts as finished only with all its results."""
+
+import re
+import sqlite3
+
+import pytest
+
+import skin.runs.train
+from skin.core.files import ROOT
+from skin.errors import InputError
+from skin.runs.configuration import validate_config
+from skin.runs.store import Store
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+SMALL = (
+    "experiment=linked_graph",
+    "simulator=naive",
+    "data.gestures=64",
+    "trainer.max_epochs=1",
+    "device.test_gestures=32",
+    "evaluation.devices=1",
+    "evaluation.layouts=1",
+    "evaluation.safe_gestures=64",
+)
+
+
+@pytest.fixture
+def config(configured, tmp_path):
+    """Return a small training that logs to a folder of its own."""
+    return validate_config(
+        configured(
+            *SMALL, f"tracking.uri=sqlite:///{tmp_path}/runs.db", f"tracking.artifacts={tmp_path}/artifacts"
+        )
+    )
+
+
+@pytest.mark.slow
+def test_a_run_stays_open_until_its_results_are_logged(config, monkeypatch):
+    seen = []
+    evaluate = skin.runs.train.evaluate
+
+    def looking(*arguments):
+        # What a kill would leave behind between training and evaluation.
+        seen.extend(run.info.status for run in Store.open(config.tracking).find())
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(skin.runs.train, "evaluate", looking)
+    assert skin.runs.train.train(config) is True
+    assert seen == ["RUNNING"]
+    (run,) = Store.open(config.tracking).find("FINISHED")
+    assert run.data.metrics["parameters"] == 196
+    choices = {group: run.data.params[group] for group in ("representation", "model", "fusion", "learner")}
+    assert choices == {"representation": "graph", "model": "gcn", "fusion": "linked", "learner": "network"}
+    assert {"same/overall/accuracy", "train_loss", "val_loss", "seconds_per_epoch"} <= set(run.data.metrics)
+    assert skin.runs.train.train(config) is False
+    page = (ROOT / "docs" / "runs.md").read_text()
+    for name in run.data.metrics:
+        # train_accuracy_press is told of as train_accuracy
+        parts = name.split("/") if f"`{name}`" not in page else [name]
+        parts = [re.sub("(_accuracy)_[a-z]+$", r"\1", part) for part in parts]
+        assert all(f"`{part}`" in page for part in parts), name
+
+
+def test_a_run_is_found_by_what_simulated_it_and_not_by_the_name_of_its_data(configured):
+    assert skin.runs.train.tags(configured("simulator=solid", "data=fem"))["simulator"] == "solid"
+    for simulator in ("naive", "fem", "solid"):
+        assert skin.runs.train.tags(configured(f"simulator={simulator}"))["simulator"] == simulator
+
+
+@pytest.mark.parametrize("device", ["recording", "serial", "cost"])
+def test_a_device_without_simulator_stands_in_its_place(device, configured):
+    assert skin.runs.train.tags(configured(f"device={device}"))["simulator"] == device
+
+
+def test_no_threads_are_refused(configured):
+    with pytest.raises(InputError, match=r"tracking\.threads=0 must be at least 1, or null"):
+        skin.runs.train.train(validate_config(configured("tracking.threads=0")))
+
+
+def logged(folder):
+    """Return (name, status, losses of validation by epoch) of every run that is no sweep, oldest first."""
+    with sqlite3.connect(folder / "m.db") as database:
+        found = database.execute(
+            "select name, status, (select group_concat(value) from metrics "
+            "where metrics.run_uuid = runs.run_uuid and key = 'val_loss') "
+            "from runs where name not like 'sweep%' order by start_time"
+        ).fetchall()
+    database.close()
+    return [(name, status, [float(loss) for loss in losses.split(",")]) for name, status, losses in found]
+
+
+@pytest.mark.slow
+def test_two_processes_make_one_run(run, tmp_path):
+    """The second one, which Lightning starts as the command again, neither logs nor prints."""
+    given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
+    two = ["trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu"]
+    done = run(tmp_path, "train", *given, *two)
+    assert done.returncode == 0, done.stderr
+    ((name, status, losses),) = logged(tmp_path)
+    assert status == "FINISHED"
+    assert "strategy" not in name  # names tell what results depend on
+    assert done.stdout.count("overall/accuracy") == 1
+    assert len([line for line in done.stderr.splitlines() if line.startswith("dangerous")]) == 1
+    assert "GLOBAL_RANK" not in done.stderr
+    alone = run(tmp_path, "train", *given)
+    assert "did this before" in alone.stderr
+    alone = run(tmp_path, "train", *given, "tracking.resume=false")
+    assert alone.returncode == 0, alone.stderr
+    assert losses == pytest.approx(logged(tmp_path)[1][2], rel=1e-5)
+    assert len(losses) == 2
+
+
+@pytest.mark.slow
+def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
+    two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
+    done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two)
+    assert done.returncode == 0, done.stderr
+    ((_, status, losses),) = logged(tmp_path)
+    assert (status, len(losses)) == ("FINISHED", 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["trainer.strategy=ddp_fork"], "give trainer.strategy=ddp or ddp_spawn"),
+        (["-m", "trainer.strategy=ddp"], "add trainer.strategy=ddp_spawn"),
+    ],
+)
+def test_processes_that_cannot_train_together_are_refused(run, tmp_path, given, said):
+    done = run(tmp_path, "train", *given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out")
+    assert done.returncode in (1, 2)
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not logged(tmp_path)

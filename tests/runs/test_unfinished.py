@@ -1,0 +1,253 @@
+"""A training that is killed continues, and ends as if nothing had happened."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+import torch
+from mlflow.exceptions import MlflowException
+from pytorch_lightning.loggers import MLFlowLogger
+
+from skin.errors import InputError
+from skin.learning.learner.network import LAST
+from skin.runs.configuration import Tracking, source_tags
+from skin.runs.store import PROCESS, Store
+from skin.runs.train import RunLogger, alone, find_unfinished
+
+# MLflow's own business with SQLAlchemy.
+pytestmark = pytest.mark.filterwarnings("ignore:The ``noload`` loader strategy")
+
+TRAINING = (
+    "train", "experiment=best_fresh", "simulator=naive", "data.gestures=400", "learner.dropout=0.2",
+    "trainer.max_epochs=8", "device.test_gestures=48", "evaluation.devices=0", "evaluation.layouts=0",
+    "evaluation.safe_gestures=64", "tracking.threads=1",
+)  # fmt: skip
+
+
+def stored(folder):
+    settings = Tracking(f"sqlite:///{folder}/m.db", f"{folder}/a", "skin", True, None)
+    return settings, Store.open(settings)
+
+
+def learned(folder):
+    """Return the only finished run of a folder and its weights."""
+    _, store = stored(folder)
+    (run,) = store.find("FINISHED")
+    path = store.client.download_artifacts(run.info.run_id, "weights.pt")
+    return run, torch.load(path, weights_only=True)
+
+
+def epochs(folder, run):
+    """Return the validation loss by step."""
+    _, store = stored(folder)
+    return {one.step: one.value for one in store.client.get_metric_history(run.info.run_id, "val_loss")}
+
+
+def wait_for(epoch, folder, command, artifacts="a"):
+    """Wait until the checkpoint of an epoch exists, counted from 0, and return its path."""
+    for _ in range(1200):
+        for path in Path(folder).glob(f"{artifacts}/unfinished/*/{LAST}"):
+            if torch.load(path, weights_only=True)["epoch"] >= epoch:
+                return path
+        assert command.poll() is None, command.completed().stderr
+        time.sleep(0.05)
+    raise AssertionError("no checkpoint")
+
+
+@pytest.mark.slow
+def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(run, begin, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for folder in (whole, killed):
+        folder.mkdir()
+    assert run(whole, *TRAINING).returncode == 0
+    own = [f"tracking.uri=sqlite:///{killed}/m.db", f"tracking.artifacts={killed}/a"]
+    with begin(killed, *TRAINING, *own) as first:
+        last = wait_for(2, killed, first)
+    settings, store = stored(killed)
+    (left,) = store.find("KILLED")
+    again = run(killed, *TRAINING)
+    assert again.returncode == 0, again.stderr
+    assert f"run {left.info.run_id} was interrupted and continues" in again.stderr
+    assert not last.parent.exists()
+    (expected, weights), (found, same) = learned(whole), learned(killed)
+    assert found.info.run_id == left.info.run_id
+    assert epochs(killed, found) == epochs(whole, expected)
+    assert all(torch.equal(weights[name], same[name]) for name in weights)
+    assert find_unfinished(store, settings, found.data.tags["fingerprint"]) is None
+
+
+@pytest.mark.slow
+def test_other_code_and_resume_false_begin_again_and_a_complete_training_is_evaluated(run, begin, tmp_path):
+    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
+    with begin(tmp_path, *TRAINING, *own) as first:
+        wait_for(7, tmp_path, first)
+    settings, store = stored(tmp_path)
+    (left,) = store.find("KILLED")
+    identity, commit = left.data.tags["fingerprint"], left.data.tags["source_commit"]
+    assert find_unfinished(store, settings, "another") is None
+    fresh = Tracking(settings.uri, settings.artifacts, "skin", False, None)
+    assert find_unfinished(store, fresh, identity) is None
+    store.client.set_tag(left.info.run_id, "source_commit", "another")
+    assert find_unfinished(store, settings, identity) is None
+    store.client.set_tag(left.info.run_id, "source_commit", commit)
+    again = run(tmp_path, *TRAINING)
+    assert again.returncode == 0, again.stderr
+    found, _ = learned(tmp_path)
+    assert found.info.run_id == left.info.run_id
+    assert sorted(epochs(tmp_path, found)) == sorted(epochs(tmp_path, left))
+    assert "same/overall/accuracy" in found.data.metrics
+
+
+class Server:
+    """An MLflow server of its own, whose runs are in a folder; it can be stopped and started again.
+
+    Args:
+        folder: of the database and the artifacts.
+    """
+
+    def __init__(self, folder):
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self.uri, self.folder = f"http://127.0.0.1:{self.port}", folder
+
+    def __enter__(self):
+        command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(self.port)]
+        command += ["--backend-store-uri", f"sqlite:///{self.folder}/server.db", "--workers", "1"]
+        command += ["--artifacts-destination", str(self.folder / "served")]
+        settings = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": self.folder}
+        self.process = subprocess.Popen(command, env=os.environ | settings, start_new_session=True, **quiet)
+        for _ in range(600):
+            with suppress(OSError), urlopen(f"{self.uri}/health", timeout=5):
+                return self
+            assert self.process.poll() is None
+            time.sleep(0.1)
+        raise AssertionError("the server does not start")
+
+    def __exit__(self, *error):
+        os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+
+def on_server(server):
+    """Return the only run of a server and the steps of its metrics."""
+    with server:
+        store = Store.open(Tracking(server.uri, None, "skin", True, None))
+        (run,) = store.find()
+        history = {
+            name: [one.step for one in store.client.get_metric_history(run.info.run_id, name)]
+            for name in ("train_loss", "val_loss")
+        }
+        files = {one.path for one in store.client.list_artifacts(run.info.run_id)}
+    assert {"weights.pt", "predictions.parquet", "config.yaml"} <= files
+    return run, history
+
+
+@pytest.mark.slow
+def test_a_training_waits_for_a_server_that_is_away(begin, tmp_path):
+    server = Server(tmp_path)
+    own = [f"tracking.uri={server.uri}"]
+    with ExitStack() as stack:
+        with server:
+            training = stack.enter_context(begin(tmp_path, *TRAINING, *own))
+            wait_for(1, tmp_path, training, "mlartifacts")
+        time.sleep(3)
+        assert training.poll() is None
+        with server:
+            done = training.completed()
+    assert done.returncode == 0, done.stderr
+    run, history = on_server(server)
+    assert run.info.status == "FINISHED"
+    assert "same/overall/accuracy" in run.data.metrics
+    assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
+    assert all(len(steps) == 8 for steps in history.values())
+
+
+@pytest.mark.slow
+def test_a_training_without_its_server_is_complete_when_repeated(begin, run, tmp_path, monkeypatch):
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+    server = Server(tmp_path)
+    own = [f"tracking.uri={server.uri}"]
+    with ExitStack() as stack:
+        with server:
+            training = stack.enter_context(begin(tmp_path, *TRAINING, *own))
+            wait_for(1, tmp_path, training, "mlartifacts")
+        ended = training.completed()
+    assert ended.returncode == 2, ended.stderr
+    assert "Traceback" not in ended.stderr
+    said = rf"the tracking server {server.uri} does not answer, and run \w+ is not complete"
+    assert re.search(said, ended.stderr)
+    began = time.monotonic()
+    refused = run(tmp_path, *TRAINING, *own, store=False)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+    assert time.monotonic() - began < 20
+    with server:
+        again = run(tmp_path, *TRAINING, *own, store=False)
+    assert again.returncode == 0, again.stderr
+    assert "was interrupted and continues" in again.stderr
+    finished, history = on_server(server)
+    assert finished.info.status == "FINISHED"
+    assert {name: len(set(steps)) for name, steps in history.items()} == {"train_loss": 8, "val_loss": 8}
+
+
+@pytest.mark.slow
+def test_a_training_in_progress_is_refused_and_a_killed_one_is_not(run, begin, tmp_path):
+    own = [f"tracking.uri=sqlite:///{tmp_path}/m.db", f"tracking.artifacts={tmp_path}/a"]
+    with begin(tmp_path, *TRAINING, *own) as first:
+        wait_for(0, tmp_path, first)
+        second = run(tmp_path, *TRAINING)
+        assert second.returncode == 2, second.stderr
+        assert "is in progress in another process: wait for it" in second.stderr
+        assert "Traceback" not in second.stderr
+        first.kill()
+        first.wait(60)
+    _, store = stored(tmp_path)
+    (left,) = store.find()
+    assert run(tmp_path, *TRAINING).returncode == 0
+    (finished,) = store.find()
+    assert (finished.info.run_id, finished.info.status) == (left.info.run_id, "FINISHED")
+
+
+def test_only_one_process_trains_a_configuration(tmp_path):
+    settings, _ = stored(tmp_path)
+    refused = pytest.raises(InputError, match="wait for it")
+    with alone(settings, "a"), alone(settings, "b"), refused, alone(settings, "a"):
+        pass
+    with alone(settings, "a"):
+        pass
+
+
+def test_a_run_of_another_machine_is_continued_where_its_folder_is_here(tmp_path):
+    settings, store = stored(tmp_path)
+    tags = source_tags() | {"fingerprint": "a", PROCESS: json.dumps(["another machine", 1, 0.0])}
+    runs = [store.client.create_run(store.experiment, tags=tags) for _ in range(2)]
+    folder = tmp_path / "a" / "unfinished" / runs[0].info.run_id
+    folder.mkdir(parents=True)
+    assert find_unfinished(store, settings, "a") is None
+    statuses = [store.client.get_run(run.info.run_id).info.status for run in runs]
+    assert statuses == ["KILLED", "RUNNING"]
+    (folder / LAST).touch()
+    assert find_unfinished(store, settings, "a").info.run_id == runs[0].info.run_id
+
+
+def test_metrics_that_a_server_did_not_take_are_sent_by_the_next_logger(tmp_path, monkeypatch):
+    _, store = stored(tmp_path)
+    run = store.create("a run", {})
+    logger = RunLogger(store, run.info.run_id, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(MLFlowLogger, "log_metrics", lambda *_: (_ for _ in ()).throw(MlflowException("away")))
+        with pytest.raises(MlflowException):
+            logger.log_metrics({"train_loss": 0.5}, 3)
+    for _ in range(2):
+        RunLogger(store, run.info.run_id, tmp_path)
+    found = store.client.get_metric_history(run.info.run_id, "train_loss")
+    assert [(one.step, one.value) for one in found] == [(3, 0.5)]

@@ -1,0 +1,149 @@
+"""The command `skin`: its verbs, their help, and what is wrong with what is typed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skin.__main__ import main, verbs
+from skin.core.files import ROOT
+
+VERBS = [name for name, module in verbs().items() if module.startswith("skin.")]
+OTHERS = ["results", "study"]
+SCRIPTS = ["evaluate", "generate", "live", "record", "train"]
+HEAVY = {"hydra", "numpy", "torch", "mlflow", "pytorch_lightning"}
+
+
+def test_the_verbs_are_listed_without_imports():
+    code = f"import sys, skin.__main__; skin.__main__.main([]); print(*({HEAVY} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    *lines, heavy = done.stdout.splitlines()
+    assert not heavy
+    listed = [line.split(maxsplit=1) for line in lines if line.startswith("  ")]
+    assert [name for name, _ in listed] == list(verbs())
+    assert all(text.endswith(".") for _, text in listed)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_shows_its_own_groups_and_settings(verb, capsys):
+    main([verb, "--help"])
+    text = capsys.readouterr().out
+    assert f"skin {verb}" in text
+    trained = ("adapt", "compare", "evaluate", "export", "live", "train")
+    assert ("fusion" in text) == (verb in trained)
+    assert ("[serial]" in text) == (verb in ("listen", "record"))
+    assert ("[simulated]" in text) == (verb not in ("listen", "record"))
+    assert "hydra" not in text
+
+
+@pytest.mark.parametrize("verb", OTHERS)
+def test_a_verb_of_the_repository_shows_its_settings(verb, capsys):
+    main([verb, "--help"])
+    text = capsys.readouterr().out
+    assert f"skin {verb}" in text
+    assert f"{verb}:" in text
+    assert verbs()[verb] == f"experiments.commands.{verb}"
+
+
+def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):
+    """As in an installed package, whose entry points are there, and whose experiments are not."""
+    (tmp_path / "x-1.dist-info").mkdir()
+    (tmp_path / "x-1.dist-info" / "METADATA").write_text("Name: x\nVersion: 1\n")
+    points = "[skin.verbs]\nstudies = nowhere.commands.study\n"
+    (tmp_path / "x-1.dist-info" / "entry_points.txt").write_text(points)
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from skin.__main__ import main; main(['studies'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr == "skin studies needs files that an installed package lacks: clone the repository\n"
+    code = code.replace("'studies'", "")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "studies" not in done.stdout
+
+
+def test_help_knows_overrides_and_mistakes(capsys):
+    main(["train", "model=mlp", "--help"])
+    assert "[mlp]" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "model=cn", "--help"])
+    assert stop.value.code == 2
+    assert "cn" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("verb", "words"), [("trian", "did you mean train?"), ("x", "animate, calibrate")])
+def test_a_mistyped_verb_is_told_the_right_one(verb, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([verb])
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_is_short_for_its_verb(run, tmp_path, name):
+    assert f'main(["{name}", *sys.argv[1:]])' in (ROOT / "experiments" / f"{name}.py").read_text()
+    done = run(tmp_path, f"{name}.py", "typo=1", store=False)
+    assert done.returncode == 2
+    assert "typo" in done.stderr
+    assert "is now" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("learner.rounds=20", "Could not override 'learner.rounds'."),
+        ("model=cn", "there is no model=cn: did you mean "),
+        ("seed=[", "seed=["),
+    ],
+)
+def test_what_cannot_be_composed_is_one_sentence(override, said, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["train", override])
+    assert stop.value.code == 2
+    text = capsys.readouterr().err
+    assert said in text
+    assert text.count("\n") == 1
+
+
+COMPLETE = """
+eval "$(skin -sc install=bash)"
+COMP_LINE='{line}'; COMP_POINT=${{#COMP_LINE}}; COMP_WORDS=($COMP_LINE); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1))
+_skin
+echo "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("line", "choices"),
+    [
+        ("skin exp", {"export"}),
+        ("skin train simul", {"simulator=", "simulator."}),
+        ("skin train simulator=", {"simulator=fem", "simulator=naive", "simulator=solid"}),
+        ("skin train simulator=so", {"simulator=solid"}),
+        ("skin evaluate touch.ra", {"touch.rate=", "touch.ramp="}),
+        ("skin nosuch a", set()),
+    ],
+)
+def test_bash_completes_verbs_groups_options_and_settings(line, choices):
+    script = COMPLETE.format(line=line)
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        ["bash", "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert set(done.stdout.split()) == choices
+
+
+def test_another_shell_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["-sc", "install=fish"])
+    assert ended.value.code == 2
+    assert "install=bash" in capsys.readouterr().err

@@ -24,7 +24,7 @@ from skin.core.settings import checked
 from skin.design.drawing import placement
 from skin.design.placement import PlacementProblem, Zones, keep_out
 from skin.device.base import AbstractSimulated
-from skin.device.simulated import modelled
+from skin.device.true_sensors import build_model
 from skin.errors import InputError
 from skin.plot.figures import save_figure
 from skin.runs.build import build_device
@@ -85,7 +85,7 @@ def _reader(device: AbstractSimulated, sensors: Sensors) -> Callable[[Movie], Te
     """Return a function that gives the readings (F, C), N, of all frames with contact of a movie."""
     rows = None if device.sampler.settings.shear else device.model.pressure_rows(sensors)
     if rows is None:
-        model = modelled(device.simulator, device.body, sensors, device.model_rate)
+        model = build_model(device.simulator, device.body, sensors, device.model_rate)
         return lambda movie: model.respond(movie, displacement=False).readings[movie.scale > 0]
     operator = torch.from_numpy(rows.T.copy()).float()
 

@@ -23,11 +23,11 @@ from skin.device.imperfection import Imperfection, ImperfectionSettings, draw_co
 from skin.device.resampling import check_rate
 from skin.device.stream import TouchStream, draw_timeline, only_touches
 from skin.device.touches import Part, Recording, Touches
+from skin.device.true_sensors import build_model, cover_surface, misplace, refuse_relaxation
 from skin.errors import InputError
 from skin.mechanics.contact.base import AbstractContact
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.geometry import sensor_geometry
-from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
@@ -62,64 +62,6 @@ def describe(
         "summary": summarise(only_touches(recording), device.body),
         "versions": _VERSIONS,
     }
-
-
-# The true sensors of a simulated device and its model of them.
-
-
-_ROUNDING = 1e-9  # m
-
-
-def misplaced(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
-    """Return sensors beside their places.
-
-    Args:
-        sensors: as touches report them.
-        size: extent (x, y) of the sheet, m, on which they stay.
-        error: standard deviation along x and along y, m.
-        seed: of the device.
-    """
-    moves = generator(Stream.POSITION, seed).standard_normal((len(sensors), 2))
-    positions = sensors.positions.copy()
-    positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
-    return replace(sensors, positions=positions)
-
-
-def everywhere(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
-    """Return a sensor at each cell of a body whose footprint lies wholly on it.
-
-    Their footprints are the areas over which a pressure can be dangerous anywhere.
-    """
-    margins = [max(extent, cell) / 2 for extent, cell in zip(footprint, body.cell, strict=True)]
-    x, y = (
-        centres[(centres >= margin - _ROUNDING) & (centres <= size - margin + _ROUNDING)]
-        for centres, size, margin in zip(_centres(body), body.size, margins, strict=True)
-    )
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return Sensors(np.column_stack([places, np.zeros(len(places))]), footprint)
-
-
-def _centres(body: AbstractBody) -> list[np.ndarray]:
-    return [(np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True)]
-
-
-def modelled(
-    simulator: Callable[[AbstractBody, Sensors], AbstractSimulator],
-    body: AbstractBody,
-    sensors: Sensors,
-    rate: float,
-) -> AbstractSimulator:
-    """Return the simulator of a body with sensors; in time, at ``rate`` in Hz, where a material relaxes."""
-    return Relaxing(simulator, body, sensors, rate) if relaxes(body) else simulator(body, sensors)
-
-
-def refuse_relaxation(body: AbstractBody, setting: str) -> None:
-    """Raise an InputError that names a setting with which no material of a body may relax."""
-    if relaxes(body):
-        raise InputError(
-            f"a skin that relaxes is simulated touch by touch from rest, where it stays, got {setting}: "
-            "leave that out, or the materials' relaxation"
-        )
 
 
 _BATCH = 1024
@@ -180,11 +122,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self._refuse()
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
-        self.true_sensors = misplaced(self.sensors, self.size, self.position_error, self.seed)
+        self.true_sensors = misplace(self.sensors, self.size, self.position_error, self.seed)
         settings = GestureSettings.of(self.touch)
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
         check_rate(self.rate, self.model_rate, "device.rate")
-        self.model = modelled(self.simulator, self.body, self.true_sensors, self.model_rate)
+        self.model = build_model(self.simulator, self.body, self.true_sensors, self.model_rate)
         self.sampler = self._sampler(self.body, self.true_sensors, self.model)
         if self.sampler.settings.shear:
             self.model.refuse_shear()
@@ -204,14 +146,14 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
 
     def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
         contact, settings = self.contact(body, model), GestureSettings.of(self.touch)
-        judged = sensors if settings.over_sensors else everywhere(body, sensors.footprint)
+        judged = sensors if settings.over_sensors else cover_surface(body, sensors.footprint)
         return TouchSampler(body, body.footprints(judged), contact, settings, self.padded)
 
     @cached_property
     def geometry(self) -> Tensor:
         """Where the sensors are and what they respond to, (S, G), :data:`skin.device.touches.GEOMETRY`."""
         same = self.position_error == 0
-        model = self.model if same else modelled(self.simulator, self.body, self.sensors, self.model_rate)
+        model = self.model if same else build_model(self.simulator, self.body, self.sensors, self.model_rate)
         return sensor_geometry(self.body, self.sensors, model)
 
     @property

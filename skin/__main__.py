@@ -119,8 +119,5 @@ def _refused(reason: str) -> int:
     return 2
 
 
-# ``python -m skin`` is ``skin``.
-
-
 if __name__ == "__main__":
     main()

@@ -58,7 +58,7 @@ def test_what_is_hidden_would_be_noticed(windows, tmp_path):
     (tmp_path / "skin").mkdir()
     (tmp_path / "skin" / "__init__.py").touch()
     for line in ("import fcntl", "import os; os.fork", "from signal import SIGKILL", "import os; os.getuid"):
-        (tmp_path / "skin" / "cli.py").write_text(f"{line}\n")
+        (tmp_path / "skin" / "__main__.py").write_text(f"{line}\n")
         code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(SCRIPT.parent)!r}]; import windows; "
         done = subprocess.run([sys.executable, "-c", f"{code}windows.main()"], capture_output=True, text=True)
         assert line.split()[-1].split(".")[-1] in done.stderr.splitlines()[-1]

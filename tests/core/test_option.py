@@ -11,7 +11,7 @@ from skin.mechanics.simulator.fem import PlatesAndBeams
 
 @pytest.mark.parametrize(
     ("made", "name"),
-    [(PlatesAndBeams, "fem"), (Blank(None, (1.0, 1.0), None), "_blank"), (partial, "functools")],
+    [(PlatesAndBeams, "fem"), (Blank(None, (1.0, 1.0), None), "base"), (partial, "functools")],
 )
 def test_an_option_is_named_after_its_module(made, name):
     assert option_name(made) == name

@@ -6,6 +6,7 @@ and prints the files of ``skin`` and ``experiments`` in which a function was exe
 """
 
 import ast
+import inspect
 import sys
 import threading
 from collections import defaultdict
@@ -121,7 +122,7 @@ def executed_files(arguments: list[str]) -> list[str]:
 
     def note(frame, event, argument):
         code = frame.f_code
-        if event == "call" and code.co_name != "<module>":
+        if event == "call" and code.co_flags & inspect.CO_OPTIMIZED:  # bodies of modules and classes are not
             executed.add(code.co_filename)
 
     from skin.__main__ import main

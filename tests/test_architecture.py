@@ -97,7 +97,7 @@ def test_a_file_is_read_in_one_sitting():
 
 
 @pytest.mark.parametrize(
-    ("figure", "limit"), [("statements", 19_400), ("files", 221), ("words of documentation", 23_800)]
+    ("figure", "limit"), [("statements", 19_400), ("files", 221), ("words of documentation", 23_900)]
 )
 def test_the_house_stays_small(figure, limit):
     """Raise a limit only for a new capability, and say so in the change log."""

@@ -14,7 +14,7 @@ WHEEL := .venv-wheel
 SMOKE := experiment=features simulator=naive data.gestures=400 device.test_gestures=200 evaluation.devices=0 evaluation.layouts=0
 # Marked tests to run. Empty: all.
 MARK ?= not slow
-TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -rs $(if $(MARK),-m "$(MARK)")
+TEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal -rs $(if $(MARK),-m "$(MARK)")
 # Settings that change floating-point rounding; the first is the default of the test suite.
 ROUNDINGS := OMP_NUM_THREADS=1 OMP_NUM_THREADS=2 MKL_CBWR=COMPATIBLE MKL_CBWR=AVX2 \
 	ATEN_CPU_CAPABILITY=default OPENBLAS_CORETYPE=Haswell
@@ -39,7 +39,7 @@ $(READY): pyproject.toml constraints.txt
 
 install: $(READY)  ## create .venv; run by the other targets if needed
 
-test: $(READY)  ## run the tests that are not slow, in 6 minutes; MARK=slow: the others, MARK=: all
+test: $(READY)  ## run the tests that are not slow, in 5 minutes; MARK=slow: the others, MARK=: all
 	$(TEST)
 
 roundings: $(READY)  ## run the numerical tests (TESTS=tests: all) under several rounding settings

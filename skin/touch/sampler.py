@@ -70,8 +70,7 @@ class ContactResult(NamedTuple):
 
 
 class ContactModel(Protocol):
-    """The interface of a contact for the sampler; see
-    :class:`skin.mechanics.contact.base.AbstractContact`."""
+    """The interface of a contact for the sampler (:mod:`skin.mechanics.contact.base`)."""
 
     @property
     def proportional(self) -> bool: ...

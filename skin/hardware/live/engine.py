@@ -176,11 +176,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """What an :class:`Engine` is built from.
-
-    Attributes:
-        classify, task, sensors, frames, rate, detection, patience, presses: as there.
-    """
+    """What an :class:`Engine` is built from: its arguments."""
 
     classify: Classify
     task: Task

@@ -42,8 +42,8 @@ class PortSettings:
         baudrate: bits per second, for serial ports.
         format: ``auto``, ``text`` or ``binary``.
         limits: smallest and largest value of a channel, as in
-        :class:`skin.hardware.wire.channels.ChannelHealth`;
-            None: the largest count, if the header gives the bits.
+            :class:`skin.hardware.wire.channels.ChannelHealth`; None: the largest count, if the header gives
+            the bits.
         timeout: s without a frame after which iterating and reading raise ``SkinTimeout``.
         backoff: s before the first attempt to reconnect, and the longest between two.
         silence: s without a byte after which a socket is closed and opened again, if it is to be reconnected;

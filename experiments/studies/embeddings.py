@@ -5,22 +5,30 @@ frames of one layout have it; what differs are the nodes' labels. Documents of s
 embedded together. An SVM tells what is in them, and the variance that labels and layouts explain.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from statistics import fmean, stdev
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from sklearn.decomposition import PCA
+from sklearn.manifold import TSNE
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from experiments.studies.comparison import combine_verdicts, judge_claim, paired
 from experiments.studies.measures import ProbeSettings
+from experiments.studies.pages import Page
 from skin.body.layout.scattered import Scattered
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.learner.base import AbstractLearner
 from skin.learning.representation.graph import adjacency, neighbours
+from skin.plot.figures import COLOURS, MARKS
 
 _POWERS = 5
 _EIGENVALUES = 10
@@ -97,7 +105,7 @@ def strongest(touches: Touches) -> np.ndarray:
     return readings[np.arange(len(readings)), readings.sum(axis=2).argmax(axis=1)]
 
 
-def accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
+def svm_accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
     """Return the share of ``vectors[train:]`` that an SVM trained on the others puts into its class (B,).
 
     Radial basis functions on standardised vectors, the cost chosen by cross-validation among the training
@@ -171,14 +179,14 @@ def _space(vectors: np.ndarray, touches: Sequence[Touches], mixed: Sequence[Touc
 
 def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> ProbeResult:
     each = zip(names, space.labels.T, strict=True)
-    right = {label: accuracy(space.vectors, classes, space.train) for label, classes in each}
+    right = {label: svm_accuracy(space.vectors, classes, space.train) for label, classes in each}
     shares: dict[str, float] = {}
     if space.mixed is not None:
         shares = {"layout": explained(space.mixed, space.layouts)}
         each = zip(names, space.mixed_labels.T, strict=True)
         shares |= {label: explained(space.mixed, classes) for label, classes in each}
         order = np.random.default_rng(seed).permutation(len(space.mixed))
-        right["layout"] = accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
+        right["layout"] = svm_accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
     return ProbeResult(attribute, name, seed, right, shares, space)
 
 
@@ -338,3 +346,169 @@ def _mix(values: np.ndarray) -> np.ndarray:
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return values ^ (values >> np.uint64(31))
+
+
+_ABOUT = """\
+The labels: accuracy on held-out touches of an SVM (radial basis functions on standardised vectors, cost
+chosen by cross-validation on the training touches). Graph embeddings and "readings, one frame" see the
+strongest frame of a touch alone, the encoder and "readings, window" all: one frame does not tell how long
+or where to. Layout: the same SVM on touches of several scattered layouts, whose graphs differ in
+morphology; beside it the share of an embedding's variance there that the layout explains, and the share
+that the best label does. On one layout all graphs have one morphology: labelled by degree, as Graph2Vec
+usually is, they are all equal.
+"""
+_Figure = Callable[[ProbeResult], float]
+
+
+def build_embeddings_page(found: Sequence[ProbeResult], names: Sequence[str]) -> Page:
+    """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
+    table = embeddings_table(found, names)
+    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(found, names))
+    figure = spaces([one for one in found if one.seed == found[0].seed], names)
+    return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
+
+
+def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
+    """Return the first touches in the plane, (points, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
+    few = np.asarray(vectors[:points], dtype=float)
+    # Neither method works on vectors that are all equal.
+    if np.ptp(few, axis=0).max() < 1e-9:
+        return np.zeros((len(few), 2))
+    reduced = PCA(min(30, *few.shape), random_state=0).fit_transform(few)
+    near = min(30.0, (len(few) - 1) / 3)
+    return TSNE(perplexity=near, init="pca", random_state=0).fit_transform(reduced)
+
+
+def spaces(found: Sequence[ProbeResult], names: Sequence[str], points: int = 400) -> Figure:
+    """Draw one row of planes per embedding, coloured by each label and by the layout (report, figure 5).
+
+    Args:
+        found: of one seed.
+        names: of the labels.
+        points: touches in each panel.
+    """
+    columns = len(names) + (found[0].space.mixed is not None)
+    figure = Figure(figsize=(2.1 * columns, 2.0 * len(found)), layout="constrained")
+    axes = figure.subplots(len(found), columns, squeeze=False)
+    for row, one in zip(axes, found, strict=True):
+        plane = planes(one.space.vectors, points)
+        for axis, classes in zip(row, one.space.labels.T, strict=False):
+            _scatter(axis, plane, classes[:points])
+        if one.space.mixed is not None:
+            order = np.random.default_rng(0).permutation(len(one.space.mixed))[:points]
+            _scatter(row[-1], planes(one.space.mixed[order], points), one.space.layouts[order])
+        row[0].set_ylabel(_title(one), fontsize=8)
+    for axis, name in zip(axes[0], [*names, "layout"], strict=False):
+        axis.set_title(name)
+    figure.supxlabel("square: the label holds, circle: it does not; each layout has a mark", fontsize=8)
+    return figure
+
+
+def embeddings_table(found: Sequence[ProbeResult], names: Sequence[str]) -> list[list[str]]:
+    """Return the table, its head first: accuracies and shares of variance in per cent, means over seeds."""
+    head = ["input", *names, "mean", "layout", "variance: layout", "variance: best label"]
+    table = [head]
+    for group in _groups(found).values():
+        labels = [[one.accuracy[name] for one in group] for name in names]
+        means = [_mean(one, names) for one in group]
+        layout = [one.accuracy["layout"] for one in group if "layout" in one.accuracy]
+        shares = [one.explained for one in group if one.explained]
+        variance = (
+            [share["layout"] for share in shares],
+            [max(share[name] for name in names) for share in shares],
+        )
+        table.append([_title(group[0]), *map(_percent, [*labels, means, layout, *variance])])
+    return table
+
+
+def embedding_statements(found: Sequence[ProbeResult], names: Sequence[str]) -> list[str]:
+    """Return verdicts on the report's statements about pretrained embeddings (3.2.4), one line each.
+
+    A statement holds if it holds for each embedding. Agree and disagree need the margin of at least
+    three seeds; "chance" has a tolerance of two points.
+    """
+    groups = _groups(found)
+    frame = {one.seed: _mean(one, names) for one in groups[("", FRAME)]}
+    claims: tuple[tuple[str, str, _Figure, _Figure], ...] = (
+        (
+            "emphasise the graph's morphology (variance explained by layout over best label)",
+            "greater",
+            lambda one: one.explained["layout"],
+            lambda one: max(one.explained[name] for name in names),
+        ),
+        (
+            "are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
+            "less",
+            lambda one: _mean(one, names),
+            lambda one: frame[one.seed],
+        ),
+        (
+            "leave an SVM at chance (mean accuracy over the commoner class)",
+            "no better",
+            lambda one: _mean(one, names),
+            _chance,
+        ),
+    )
+    said = []
+    for attribute in dict.fromkeys(one.attribute for one in found if one.attribute):
+        mine = [group for key, group in groups.items() if key[0] == attribute]
+        for says, claim, figure, reference in claims:
+            each = [_compare(group, claim, figure, reference) for group in mine]
+            whole = combine_verdicts([word for word, _ in each])
+            details = "; ".join(detail for _, detail in each)
+            said.append(f"Nodes labelled by {attribute}: the embeddings {says}: **{whole}**. {details}.")
+    return said
+
+
+def _compare(
+    group: Sequence[ProbeResult], claim: str, figure: _Figure, reference: _Figure
+) -> tuple[str, str]:
+    """Return the verdict on a claim about one embedding, and its figures."""
+    able = [one for one in group if one.explained or claim != "greater"]
+    one, other = ({str(each.seed): of(each) for each in able} for of in (figure, reference))
+    difference = paired(one, other)
+    word = judge_claim(claim, difference, by=0.02)
+    if difference is None:
+        return word, f"{group[0].name} has one layout only ({word})"
+    spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
+    return word, f"{group[0].name} {100 * difference.mean:+.1f}{spread} points ({word})"
+
+
+def _groups(found: Iterable[ProbeResult]) -> dict[tuple[str, str], list[ProbeResult]]:
+    """Return the results of each input, by seed."""
+    groups: dict[tuple[str, str], list[ProbeResult]] = {}
+    for one in found:
+        groups.setdefault((one.attribute, one.name), []).append(one)
+    return groups
+
+
+def _mean(one: ProbeResult, names: Sequence[str]) -> float:
+    """Return the mean accuracy over the labels that could be learnt."""
+    return float(np.nanmean([one.accuracy[name] for name in names]))
+
+
+def _chance(one: ProbeResult) -> float:
+    """Return the mean share of the held-out touches that are of their label's commoner class."""
+    share = one.space.labels[one.space.train :].mean(axis=0)
+    return float(np.maximum(share, 1 - share).mean())
+
+
+def _title(one: ProbeResult) -> str:
+    return f"{one.name}, {one.attribute}" if one.attribute else one.name
+
+
+def _percent(values: Sequence[float]) -> str:
+    """Return the mean of shares in per cent, with the deviation over seeds if there are several."""
+    if not values or np.isnan(values).any():
+        return ""
+    spread = f" ± {100 * stdev(values):.1f}" if len(values) > 1 else ""
+    return f"{100 * fmean(values):.1f}{spread}"
+
+
+def _scatter(axis: Axes, plane: np.ndarray, classes: np.ndarray) -> None:
+    for number in np.unique(classes):
+        x, y = plane[classes == number].T
+        colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
+        axis.scatter(x, y, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
+    axis.set_xticks([])
+    axis.set_yticks([])

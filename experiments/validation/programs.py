@@ -16,16 +16,15 @@ import scipy.sparse as sp
 import torch
 from scipy.sparse.linalg import spsolve
 
-from experiments.validation.blocks import solve_frame
-from experiments.validation.finding import CheckResult, Finding, relative_finding
-from experiments.validation.solid import skin
+from experiments.validation import CheckResult, Finding, pynite_model, relative_finding
+from experiments.validation.references import solve_frame
+from experiments.validation.solid import default_sheet
 from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.mechanics.contact.rigid import solve_contact, stabilise_checkerboard
 from skin.mechanics.relaxation import Relaxing
-from skin.mechanics.simulator import _pynite
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.plates import Structure
@@ -38,7 +37,7 @@ _FOAM: Any = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thic
 
 def single_frames(quick: bool) -> CheckResult:
     """Compare the precomputed operator with a scikit-fem solution of single frames."""
-    body = skin(8 if quick else 12, 0.12)
+    body = default_sheet(8 if quick else 12, 0.12)
     place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
     mesh, extent = hexahedra(body, 2, {}), 2 * body.cell[0]
     sensors = Sensors(place[None], (extent, extent))
@@ -100,9 +99,9 @@ def equation_ten(quick: bool) -> CheckResult:
     )
 
 
-def naive(quick: bool) -> CheckResult:
+def naive_readings(quick: bool) -> CheckResult:
     """Check that readings of simulator=naive are the pressure of one cell times the footprint area."""
-    body = skin(16)
+    body = default_sheet(16)
     place = np.random.default_rng(0).uniform(0.01, 0.15, (25, 2))
     sensors = Sensors(np.column_stack([place, np.full(25, 0.005)]), (0.01, 0.01))
     pressure = np.random.default_rng(1).uniform(0, 1e5, body.shape)
@@ -163,19 +162,19 @@ def threads(quick: bool) -> CheckResult:
 def _pynite_displacements(structure: Structure, pressure: np.ndarray) -> np.ndarray:
     """Return PyNite's displacements, (layers, ny + 1, nx + 1, 6), with w positive upwards."""
     try:
-        model = _pynite.model(structure, pressure)
+        model = pynite_model.model(structure, pressure)
     except ModuleNotFoundError as missing:
         raise InputError(
             "checking simulator=fem needs PyNite, which is not installed: pip install PyNiteFEA"
         ) from missing
-    _pynite.solve(model)
-    return _pynite.displacements(model, structure)
+    pynite_model.solve(model)
+    return pynite_model.displacements(model, structure)
 
 
 def write_results(threads: int, cells: int, path: str) -> None:
     """Write an operator, readings of random frames and the pressure under a sphere to an .npz file."""
     torch.set_num_threads(threads)
-    body = skin(cells)
+    body = default_sheet(cells)
     places = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))
     sensors = Sensors(np.column_stack([places, np.full(25, 0.005)]), (0.01, 0.01))
     mesh = hexahedra(body, 2, {})

@@ -9,15 +9,22 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-from experiments.validation.blocks import ALL, WALLS, block, graded, held, locking, row_means, solve_block
-from experiments.validation.finding import CheckResult, Curve, Finding, Plot, relative_finding
+from experiments.validation import CheckResult, Curve, Finding, Plot, relative_finding
 from experiments.validation.references import (
+    ALL,
+    WALLS,
     HalfSpace,
-    Hertz,
+    HertzContact,
     Slab,
+    block,
     bonded_layer,
+    graded,
+    held,
+    locking,
     patch,
     round_punch,
+    row_means,
+    solve_block,
     square_punch,
 )
 from skin.body.arm import Arm
@@ -38,7 +45,7 @@ _LAYERS: Any = tuple(
 )  # fmt: skip
 
 
-def skin(cells: int = 16, size: float = 0.16) -> Sheet:
+def default_sheet(cells: int = 16, size: float = 0.16) -> Sheet:
     """Return a square sheet of the default layers."""
     return Sheet((size, size), (cells, cells), _LAYERS)
 
@@ -99,7 +106,7 @@ def confined_compression(quick: bool) -> CheckResult:
 
 def even_pressure(quick: bool) -> CheckResult:
     """Check that far from free edges a uniform pressure p gives sigma_zz = -p at every depth."""
-    body = skin(16 if quick else 24, 0.24)
+    body = default_sheet(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
     mesh = hexahedra(body, 2, {})
@@ -144,7 +151,7 @@ def reciprocity(quick: bool) -> CheckResult:
 
 def wide_arm(quick: bool) -> CheckResult:
     """Check that a sleeve approaches a sheet as its radius grows."""
-    sheet = skin(8 if quick else 16)
+    sheet = default_sheet(8 if quick else 16)
     place = np.array([[0.07, 0.09, 0.005], [0.03, 0.12, 0.003], [0.11, 0.05, 0.005]])
     lean = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
     sensors = Sensors(place, (0.02, 0.02), lean)
@@ -213,7 +220,7 @@ def _rows(body: AbstractBody, sensors: Sensors) -> np.ndarray:
 
 
 def _bodies(quick: bool) -> list[tuple[str, AbstractBody]]:
-    sheet = skin(8 if quick else 16)
+    sheet = default_sheet(8 if quick else 16)
     return [("sheet", sheet), ("arm", _sleeve(0.05, sheet))]
 
 
@@ -483,7 +490,7 @@ def _worst(case: str, ours: np.ndarray, exact: np.ndarray) -> Finding:
 
 def hertz(quick: bool) -> CheckResult:
     """Compare contact radius, peak pressure and force of a rigid sphere with Hertz, on several meshes."""
-    sphere = Hertz(0.05, _STAR)
+    sphere = HertzContact(0.05, _STAR)
     force = 4 / 3 * _STAR * _HALF**3 / 0.05  # for which Hertz' contact has the radius of _HALF
     findings: list[Finding] = []
     remarks, curves = [], []

@@ -2,9 +2,9 @@
 
 import pytest
 
-from experiments.studies.outcomes import conclusions, differences, values
+from experiments.studies.comparison import conclusions, differences, values
 from experiments.studies.study import Statement, Study, Variant
-from experiments.studies.trials import Trial
+from experiments.studies.trials import TrialResult
 
 ACCURACY = "same/overall/accuracy"
 
@@ -13,7 +13,7 @@ def trials(pooling, *accuracies, seconds=1.0, condition="", device=""):
     """Return the trials of a variant whose runs, of seeds 0, 1, ..., have these accuracies."""
     variant = Variant(f"pooling={pooling}", {"model.pooling": pooling, "experiment": "x"}, {})
     return [
-        Trial(
+        TrialResult(
             variant,
             str(seed),
             condition,

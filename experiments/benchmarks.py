@@ -83,19 +83,19 @@ def main(arguments: Sequence[str]) -> None:
         InputError: an unknown setting, benchmark or checkout.
     """
     settings = benchmark_settings(arguments)
-    known = benchmarks(int(settings["repeats"]))
-    names = [name for name in settings["only"].split(",") if name] or list(known)
-    if unknown := [name for name in names if name not in known]:
-        raise InputError(f"only={','.join(unknown)} is none of {', '.join(known)}")
+    choice = benchmarks(int(settings["repeats"]))
+    names = [name for name in settings["only"].split(",") if name] or list(choice)
+    if unknown := [name for name in names if name not in choice]:
+        raise InputError(f"only={','.join(unknown)} is none of {', '.join(choice)}")
     about = {"repeats": int(settings["repeats"]), "machine": machine(), "versions": versions(_PACKAGES)}
     measured: dict[str, Any] = about
     for name in names:
         print(name, file=sys.stderr)
-        measured[name] = run_alone(*known[name])
+        measured[name] = run_alone(*choice[name])
         if settings["against"]:
-            other = run_alone(*known[name], checkout=Path(settings["against"]))
-            ratios = {key: value / other[key] for key, value in measured[name].items() if other[key]}
-            measured[name] = {"here": measured[name], "there": other, "ratios": ratios}
+            baseline = run_alone(*choice[name], checkout=Path(settings["against"]))
+            ratios = {key: value / baseline[key] for key, value in measured[name].items() if baseline[key]}
+            measured[name] = {"here": measured[name], "there": baseline, "ratios": ratios}
     text = json.dumps(measured, indent=2)
     write(text + "\n", results(settings["out"]) / "bench.json")
     print(text)
@@ -176,11 +176,11 @@ def peak_memory() -> int:
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
     """Return the versions of the installed packages among the given ones."""
-    found = {}
+    installed = {}
     for name in packages:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            installed[name] = version(name)
+    return installed
 
 
 def machine() -> str:

@@ -77,7 +77,7 @@ class Paired:
     """A difference or a ratio of two variants.
 
     Attributes:
-        mean: of one - other, or one / other.
+        mean: of left - right, or left / right.
         error: standard error of that mean; infinite with a single pair.
         margin: half of its interval (:class:`Uncertainty`); infinite with a single pair.
         seeds: number of pairs.
@@ -95,8 +95,8 @@ def t_quantile(count: int) -> float:
 
 
 def paired(
-    one: Mapping[str, float],
-    other: Mapping[str, float],
+    left: Mapping[str, float],
+    right: Mapping[str, float],
     ratio: bool = False,
     across: tuple[Mapping[str, float], Mapping[str, float]] = ({}, {}),
     gestures: Gestures = (None, None),
@@ -110,17 +110,17 @@ def paired(
     the same way, each part with the quantile of its own number of values.
 
     Args:
-        one: seed -> figure, or device -> figure.
-        other: the same.
-        ratio: take one / other instead of one - other.
+        left: seed -> figure, or device -> figure.
+        right: the same.
+        ratio: take left / right instead of left - right.
         across: the same by what the first two are not by, device or seed.
         gestures: the same by gesture, in the same unit.
     """
-    shared = [seed for seed in one if seed in other]
+    shared = [seed for seed in left if seed in right]
     if not shared:
         return None
-    mean = fmean(_pairs(one, other, ratio))
-    seeds = Uncertainty.of(_pairs(one, other, ratio)) if len(shared) > 1 else NOT_KNOWN
+    mean = fmean(_pairs(left, right, ratio))
+    seeds = Uncertainty.of(_pairs(left, right, ratio)) if len(shared) > 1 else NOT_KNOWN
     devices, touches = _across(*across, ratio), _over_gestures(gestures, ratio)
     return Paired(mean, *Uncertainty.together(seeds, devices, touches), len(shared))
 
@@ -135,22 +135,22 @@ def estimate(
         by_device: the same by device.
         gestures: the same by gesture, (G,); None: not known.
     """
-    known = [] if gestures is None else list(gestures[~np.isnan(gestures)])
-    parts = map(Uncertainty.of, ([*by_seed.values()], [*by_device.values()], known))
+    counted = [] if gestures is None else list(gestures[~np.isnan(gestures)])
+    parts = map(Uncertainty.of, ([*by_seed.values()], [*by_device.values()], counted))
     return Estimate(fmean(by_seed.values()), *Uncertainty.together(*parts))
 
 
-def _pairs(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -> list[float]:
-    pairs = [(one[key], other[key]) for key in one if key in other]
+def _pairs(left: Mapping[str, float], right: Mapping[str, float], ratio: bool) -> list[float]:
+    pairs = [(left[key], right[key]) for key in left if key in right]
     return [first / second if ratio else first - second for first, second in pairs]
 
 
-def _across(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -> Uncertainty:
+def _across(left: Mapping[str, float], right: Mapping[str, float], ratio: bool) -> Uncertainty:
     """Return the uncertainty over devices, of which one variant may have several and the other one."""
-    if len(pairs := _pairs(one, other, ratio)) > 1 or not one or not other:
+    if len(pairs := _pairs(left, right, ratio)) > 1 or not left or not right:
         return Uncertainty.of(pairs)
-    first, second = fmean(one.values()), fmean(other.values())
-    above, below = Uncertainty.of([*one.values()]), Uncertainty.of([*other.values()])
+    first, second = fmean(left.values()), fmean(right.values())
+    above, below = Uncertainty.of([*left.values()]), Uncertainty.of([*right.values()])
     if not ratio:
         return Uncertainty.together(above, below)
     return Uncertainty.together(above.times(1 / second), below.times(first / second**2))
@@ -158,22 +158,22 @@ def _across(one: Mapping[str, float], other: Mapping[str, float], ratio: bool) -
 
 def _over_gestures(gestures: Gestures, ratio: bool) -> Uncertainty:
     """Return the uncertainty over gestures: unpaired if their numbers differ, 0 if they are unknown."""
-    one, other = gestures
-    if one is None or other is None:
+    left, right = gestures
+    if left is None or right is None:
         return Uncertainty(0.0, 0.0)
-    if len(one) != len(other):
-        each = (Uncertainty.of(list(part[~np.isnan(part)])) for part in (one, other))
-        return Uncertainty.together(*each)
-    counted = ~(np.isnan(one) | np.isnan(other))
-    one, other = one[counted], other[counted]
+    if len(left) != len(right):
+        parts = (Uncertainty.of(list(part[~np.isnan(part)])) for part in (left, right))
+        return Uncertainty.together(*parts)
+    counted = ~(np.isnan(left) | np.isnan(right))
+    left, right = left[counted], right[counted]
     if not ratio:
-        return Uncertainty.of(list(one - other))
+        return Uncertainty.of(list(left - right))
     # The ratio of two means, linearised (delta method).
-    below = other.mean()
-    return Uncertainty.of(list((one - one.mean() / below * other) / below) if below else [])
+    below = right.mean()
+    return Uncertainty.of(list((left - left.mean() / below * right) / below) if below else [])
 
 
-def judge_claim(claim: str, found: Paired | None, by: float = 0.0) -> str:
+def judge_claim(claim: str, compared: Paired | None, by: float = 0.0) -> str:
     """Return ``agree``, ``disagree`` or ``undecided``.
 
     A claim is an interval in which the difference (for ``RATIOS``: the ratio) must lie. The verdict is
@@ -183,7 +183,7 @@ def judge_claim(claim: str, found: Paired | None, by: float = 0.0) -> str:
     Args:
         claim: ``greater`` (by to infinity), ``less`` (minus infinity to by), ``alike`` (-by to by),
             ``no better`` and ``at most`` (minus infinity to by), ``about`` or ``ratio`` (by / 2 to 2 by).
-        found: the comparison, None without paired seeds.
+        compared: the variants, None without paired seeds.
         by: in the unit of the comparison.
     """
     least, most = {
@@ -195,9 +195,9 @@ def judge_claim(claim: str, found: Paired | None, by: float = 0.0) -> str:
         "about": (by / 2, 2 * by),
         "ratio": (by / 2, 2 * by),
     }[claim]
-    if found is None or found.seeds < FEWEST:
+    if compared is None or compared.seeds < FEWEST:
         return "undecided"
-    low, high = found.mean - found.margin, found.mean + found.margin
+    low, high = compared.mean - compared.margin, compared.mean + compared.margin
     if least < low and high < most:
         return "agree"
     return "disagree" if high < least or low > most else "undecided"
@@ -248,13 +248,13 @@ class Difference:
     Attributes:
         variant: name.
         condition: name, or empty.
-        found: the comparison, shares in percentage points.
+        compared: the two lines, shares in percentage points.
         verdict: better, worse or undecided.
     """
 
     variant: str
     condition: str
-    found: Paired | None
+    compared: Paired | None
     verdict: str
 
 
@@ -311,16 +311,16 @@ def by_gesture(trials: Sequence[TrialResult], metric: str) -> np.ndarray | None:
 
 
 def compare(
-    one: Sequence[TrialResult],
-    other: Sequence[TrialResult],
+    left: Sequence[TrialResult],
+    right: Sequence[TrialResult],
     metric: str,
     ratio: bool = False,
     by: Literal["seed", "device"] = "seed",
 ) -> Paired | None:
     """Compare the trials of two lines, paired by seed, device and gesture; ``by`` says what is counted."""
     across: Literal["seed", "device"] = "device" if by == "seed" else "seed"
-    first, second = ((values(one, metric, axis), values(other, metric, axis)) for axis in (by, across))
-    return paired(*first, ratio, second, (by_gesture(one, metric), by_gesture(other, metric)))
+    first, second = ((values(left, metric, axis), values(right, metric, axis)) for axis in (by, across))
+    return paired(*first, ratio, second, (by_gesture(left, metric), by_gesture(right, metric)))
 
 
 def conclusions(statements: Sequence[Statement], trials: Sequence[TrialResult]) -> list[StatementResult]:

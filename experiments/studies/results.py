@@ -94,8 +94,8 @@ def _publish(chosen: PublishedResults, config: DictConfig) -> int:
     progress = SweepProgress([3600 * hours if full else None for hours, _ in lines])
     for number, (hours, line) in enumerate(lines):
         left = progress.left()
-        rest = "" if left is None else f", about {format_duration(left)} left"
-        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{rest}", flush=True)
+        estimate = "" if left is None else f", about {format_duration(left)} left"
+        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{estimate}", flush=True)
         began = time.monotonic()
         if _fails(line):
             failed.append(f"skin {join(line)}")
@@ -122,7 +122,7 @@ def _fails(line: Sequence[str]) -> bool:
 def _lines(chosen: PublishedResults, config: DictConfig) -> Iterator[tuple[float, list[str]]]:
     """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
     smoke = chosen.budget == "smoke"
-    given = [one for one in overrides() if one.split("=")[0].split(".")[0] not in ("results", "out")]
+    passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
     for step in chosen.steps():
         verb, *words = split(step.run)
         if smoke and _PEERS in words and not peers.python().is_file():
@@ -145,7 +145,7 @@ def _lines(chosen: PublishedResults, config: DictConfig) -> Iterator[tuple[float
             yield step.hours, [verb, *_within(folder, words)]
             continue
         words += [f"out={folder}"] if verb == "study" else []
-        yield step.hours, [verb, *words, *given]
+        yield step.hours, [verb, *words, *passed]
 
 
 def _within(folder: Path, words: Sequence[str]) -> list[str]:

@@ -37,8 +37,15 @@ from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.evaluation.metrics import decode
 from skin.mechanics.simulator.naive import Naive
-from skin.plot import figures
-from skin.plot.figures import COLOURS
+from skin.plot.figures import (
+    COLOURS,
+    confusions,
+    force_and_reading,
+    misclassified,
+    misclassified_shares,
+    save_figure,
+    traces,
+)
 from skin.runs.build import build_device
 from skin.touch.labels import TOUCH
 
@@ -157,8 +164,8 @@ def differences_table(changes: Sequence[Difference], metric: str) -> list[list[s
             [
                 change.variant,
                 change.condition,
-                _figure(change.found, unit),
-                str(change.found.seeds if change.found else 0),
+                _figure(change.compared, unit),
+                str(change.compared.seeds if change.compared else 0),
                 change.verdict,
             ]
             for change in changes
@@ -342,7 +349,7 @@ def draw_report(trials: Sequence[TrialResult], folder: Path) -> list[Path]:
         skin = skins[simulator]
         speeds = skin.recording("test", complete=False).parameters["speed"].numpy() * skin.model_rate
         paths += _draw_runs(
-            {row: np.array(each) for row, each in outcomes.items()}, speeds, simulator, folder
+            {row: np.array(runs) for row, runs in outcomes.items()}, speeds, simulator, folder
         )
     name = "fem" if "fem" in skins else next(iter(skins))
     return [*paths, *draw_skin(skins[name], folder, name)]
@@ -352,15 +359,15 @@ def _draw_runs(
     codes: Mapping[str, np.ndarray], speeds: np.ndarray, simulator: str, folder: Path
 ) -> list[Path]:
     """Draw figures 7 and 8 from the outcomes (N, B) of the runs of each row."""
-    wrong = {row: 1 - decode(each, "big/accuracy", TOUCH).mean(axis=0) for row, each in codes.items()}
-    courses = {row: figures.misclassified_shares(speeds, each, _SPEEDS) for row, each in wrong.items()}
+    wrong = {row: 1 - decode(outcomes, "big/accuracy", TOUCH).mean(axis=0) for row, outcomes in codes.items()}
+    courses = {row: misclassified_shares(speeds, shares, _SPEEDS) for row, shares in wrong.items()}
     some = {row: courses[row] for row in _SHOWN if row in courses} or courses
-    matrices = {row: _confusion(each) for row, each in codes.items()}
+    matrices = {row: _confusion(outcomes) for row, outcomes in codes.items()}
     eight, seven = folder / f"figure08_confusion_{simulator}", folder / f"figure07_speed_{simulator}"
     return [
-        figures.save_figure(figures.confusions(matrices, ("safe", "dangerous")), eight.with_suffix(".png")),
+        save_figure(confusions(matrices, ("safe", "dangerous")), eight.with_suffix(".png")),
         write(csv_text(confusion_rows(codes)), eight.with_suffix(".csv")),
-        figures.save_figure(figures.misclassified(some, "big", _SPEEDS), seven.with_suffix(".png")),
+        save_figure(misclassified(some, "big", _SPEEDS), seven.with_suffix(".png")),
         write(csv_text(_courses(courses)), seven.with_suffix(".csv")),
     ]
 
@@ -418,9 +425,9 @@ def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> lis
     presses = (blurred & ~labels["dynamic"] & labels["press"]).nonzero()[:, 0]
     presses = presses[drawn["force"][presses].argsort()]
     four = presses[torch.linspace(0, len(presses) - 1, 4).round().long()]
-    traces = figures.traces(readings, device.model_rate)
-    forces = figures.force_and_reading(recording.force[four], touches.readings[four], device.model_rate)
+    courses = traces(readings, device.model_rate)
+    forces = force_and_reading(recording.force[four], touches.readings[four], device.model_rate)
     return [
-        figures.save_figure(traces, folder / f"figure10_naive_{name}.png"),
-        figures.save_figure(forces, folder / "figure11_force_reading.png"),
+        save_figure(courses, folder / f"figure10_naive_{name}.png"),
+        save_figure(forces, folder / "figure11_force_reading.png"),
     ]

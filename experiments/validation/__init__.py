@@ -181,9 +181,9 @@ def _line(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
     worst = max(
         outcome.findings,
-        key=lambda one: math.inf if math.isnan(one.error) else max(one.error, _rounding(one)) / one.tolerance,
+        key=_excess,
     )
-    verdict = "holds" if all(one.ok for one in outcome.findings) else "**fails**"
+    verdict = "holds" if all(finding.ok for finding in outcome.findings) else "**fails**"
     return (
         f"| [{law.name}](#{law.name}) | {law.reference} | {len(outcome.findings)} | {_error(worst)} | "
         f"{worst.tolerance:.0e} | {verdict} |\n"
@@ -194,15 +194,22 @@ def _section(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
     lines = [f"\n## {law.name}\n\n{law.statement}\n\n"]
     lines.append("| | ours | reference | error | tolerance | |\n|---|---|---|---|---|---|\n")
-    for one in outcome.findings:
-        ours = f"{one.ours:.5g}" if one.reference else _error(one)
+    for finding in outcome.findings:
+        ours = f"{finding.ours:.5g}" if finding.reference else _error(finding)
         lines.append(
-            f"| {one.case} | {ours} | {one.reference:.5g} | {_error(one)} | {one.tolerance:.0e} | "
-            f"{'ok' if one.ok else '**missed**'} |\n"
+            f"| {finding.case} | {ours} | {finding.reference:.5g} | {_error(finding)} | "
+            f"{finding.tolerance:.0e} | {'ok' if finding.ok else '**missed**'} |\n"
         )
     lines += [f"\n- {remark}" for remark in outcome.remarks]
     lines += [f"\n\n![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
     return "".join(lines).rstrip("\n") + "\n"
+
+
+def _excess(finding: Finding) -> float:
+    """Return the error, at least that of rounding, over its tolerance."""
+    if math.isnan(finding.error):
+        return math.inf
+    return max(finding.error, _rounding(finding)) / finding.tolerance
 
 
 def _rounding(finding: Finding) -> float:

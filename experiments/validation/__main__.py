@@ -75,15 +75,14 @@ def select_laws(names: str) -> list[Law]:
     Raises:
         InputError: an unknown name.
     """
-    known = {law.name: law for law in LAWS}
+    laws = {law.name: law for law in LAWS}
     if names == "all":
         return list(LAWS)
-    if unknown := [name for name in names.split(",") if name not in known]:
+    if unknown := [name for name in names.split(",") if name not in laws]:
         raise InputError(
-            f"laws must be all or some of {', '.join(known)}, got {', '.join(unknown)}: as in "
-            "laws=hertz,punch"
+            f"laws must be all or some of {', '.join(laws)}, got {', '.join(unknown)}: as in laws=hertz,punch"
         )
-    return [known[name] for name in names.split(",")]
+    return [laws[name] for name in names.split(",")]
 
 
 def main(words: Sequence[str]) -> bool:

@@ -49,13 +49,13 @@ def single_frames(quick: bool) -> CheckResult:
         pressure = 1e4 * np.random.default_rng(seed).random(body.shape)
         ours = (inwards + shear * along) @ pressure.ravel()
         theirs = solve_frame(mesh, pressure, shear, place, extent)
-        for name, one, other in zip(
+        for name, number, reference in zip(
             ("reading, N", "D_s, m", "D_t, m"),
             ours,
             (theirs.reading, theirs.sensor, theirs.surface),
             strict=True,
         ):
-            findings.append(relative_finding(f"{name}, friction {shear:g}", one, other, 1e-8))
+            findings.append(relative_finding(f"{name}, friction {shear:g}", number, reference, 1e-8))
     return CheckResult(findings)
 
 
@@ -142,7 +142,7 @@ def threads(quick: bool) -> CheckResult:
     """Check that operators, readings and contact pressures are the same on one thread and on two."""
     cells = "8" if quick else "16"
     with tempfile.TemporaryDirectory() as folder:
-        found = []
+        outputs = []
         for count in ("1", "2"):
             path = Path(folder) / f"{count}.npz"
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -150,12 +150,12 @@ def threads(quick: bool) -> CheckResult:
             environment = os.environ | dict.fromkeys(names, count) | {"PYTHONPATH": str(ROOT)}
             subprocess.run(command, check=True, env=environment)
             with np.load(path) as file:
-                found.append({name: file[name] for name in file.files})
+                outputs.append({name: file[name] for name in file.files})
     findings = []
     for name, tolerance in (("operator", 1e-10), ("readings", 1e-5), ("contact", 1e-5)):
-        one, two = (of[name] for of in found)
-        error = float(np.abs(one - two).max() / np.abs(one).max())
-        findings.append(Finding(name, np.abs(two).max(), np.abs(one).max(), error, tolerance))
+        single, double = (arrays[name] for arrays in outputs)
+        error = float(np.abs(single - double).max() / np.abs(single).max())
+        findings.append(Finding(name, np.abs(double).max(), np.abs(single).max(), error, tolerance))
     return CheckResult(findings)
 
 

@@ -80,10 +80,10 @@ class HalfSpace:
     def under_shear(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the same under a traction of 1 Pa along x."""
         x, y, z, r, weights = self._about(places)
-        rest = 1 - 2 * self.poisson
-        along = 1 / r + x**2 / r**3 + rest * (1 / (r + z) - x**2 / (r * (r + z) ** 2))
-        across = x * y / r**3 - rest * x * y / (r * (r + z) ** 2)
-        down = x * z / r**3 + rest * x / (r * (r + z))
+        share = 1 - 2 * self.poisson
+        along = 1 / r + x**2 / r**3 + share * (1 / (r + z) - x**2 / (r * (r + z) ** 2))
+        across = x * y / r**3 - share * x * y / (r * (r + z) ** 2)
+        down = x * z / r**3 + share * x / (r * (r + z))
         motion = np.stack([along, across, down], axis=-1) / (4 * np.pi * self.shear)
         stress = -3 * (x * z / r**5)[..., None] / (2 * np.pi) * np.stack([z, x, y], axis=-1)
         return _sum(motion, weights), _sum(stress, weights)
@@ -195,11 +195,11 @@ def waves(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarray
         slabs: from the surface down; the last is bonded to a rigid base.
         depth: m; at an interface it may belong to either layer.
     """
-    found = np.empty((len(number), 2))
+    states = np.empty((len(number), 2))
     even = number == 0
-    found[even] = _even(slabs, depth)
-    found[~even] = _waving(number[~even], slabs, depth)
-    return found
+    states[even] = _even(slabs, depth)
+    states[~even] = _waving(number[~even], slabs, depth)
+    return states
 
 
 def patch_mean(lengths: np.ndarray, side: float, low: float, high: float) -> np.ndarray:
@@ -257,18 +257,18 @@ def _waving(number: np.ndarray, slabs: Sequence[Slab], depth: float) -> np.ndarr
     scale = slabs[0].shear * number[:, None, None]
     row, last = 0, len(slabs) - 1
     for index, slab in enumerate(slabs):
-        own = slice(4 * index, 4 * index + 4)
+        columns = slice(4 * index, 4 * index + 4)
         top, bottom = (_basis(number, slab, at, scale) for at in (0.0, slab.thickness))
         if index == 0:
-            system[:, 0:2, own] = top[:, 2:]
+            system[:, 0:2, columns] = top[:, 2:]
             row = 2
         else:
-            system[:, row : row + 4, own] = -top
+            system[:, row : row + 4, columns] = -top
             row += 4
         if index < last:
-            system[:, row : row + 4, own] = bottom
+            system[:, row : row + 4, columns] = bottom
         else:
-            system[:, row : row + 2, own] = bottom[:, :2]
+            system[:, row : row + 2, columns] = bottom[:, :2]
     right = np.zeros((len(number), unknowns, 1))
     right[:, 0] = -1 / scale[:, 0]
     amounts = np.linalg.solve(system, right)
@@ -297,9 +297,9 @@ def _basis(number: np.ndarray, slab: Slab, at: float, scale: np.ndarray) -> np.n
         grown = plane - sign * way[:, None, None] * (shifted @ plane)
         states.append(np.exp(-way)[:, None, None] * grown)
     basis = np.concatenate(states, axis=2)
-    own = np.ones((len(number), 4, 1))
-    own[:, 2:] = slab.shear * number[:, None, None] / scale
-    return basis * own
+    units = np.ones((len(number), 4, 1))
+    units[:, 2:] = slab.shear * number[:, None, None] / scale
+    return basis * units
 
 
 def _matrix(slab: Slab) -> np.ndarray:
@@ -440,13 +440,13 @@ def solve_frame(
     columns, rows = (np.diff(line[:2])[0] for line in mesh.lines[:2])
 
     def traction(v, w):
-        here = pressure[(w.x[1] // rows).astype(int), (w.x[0] // columns).astype(int)]
-        return here * (shear * v[0] - v[2])
+        push = pressure[(w.x[1] // rows).astype(int), (w.x[0] // columns).astype(int)]
+        return push * (shear * v[0] - v[2])
 
     load = np.concatenate([LinearForm(traction).assemble(top), np.zeros(inner.N)])
     table = basis.get_dofs(lambda x: np.abs(x[2] + mesh.lines[2][-1]) < 1e-12).all()
-    found = _solve(*condense(whole, load, D=table))
-    moved, squeeze = found[: basis.N], found[basis.N :]
+    solution = _solve(*condense(whole, load, D=table))
+    moved, squeeze = solution[: basis.N], solution[basis.N :]
     below = np.array([place[0], place[1], -place[2]])
     above = np.array([place[0], place[1], 0.0])
     sensor, surface = (-_at(points, basis, moved, spot)[2] for spot in (below, above))
@@ -471,9 +471,9 @@ def locking(mesh: Hexahedra) -> sp.csc_matrix:
 def _solve(matrix, right, whole, free) -> np.ndarray:
     """Solve with one step of iterative refinement, because the mixed form is ill-conditioned."""
     factors = splu(matrix.tocsc())
-    found = factors.solve(right)
+    first = factors.solve(right)
     answer = whole.copy()
-    answer[free] = found + factors.solve(right - matrix @ found)
+    answer[free] = first + factors.solve(right - matrix @ first)
     return answer
 
 

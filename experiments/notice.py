@@ -58,10 +58,11 @@ def licence(name: str) -> str:
         stated = metadata(name)
     except PackageNotFoundError:
         raise InputError(f"{name} of constraints.txt is not installed: run make install") from None
-    found = _READ.get(name) or next((one for one in _statements(stated) if one not in ("", "UNKNOWN")), None)
-    if found is None:
+    statements = (text for text in _statements(stated) if text not in ("", "UNKNOWN"))
+    licence_text = _READ.get(name) or next(statements, None)
+    if licence_text is None:
         raise InputError(f"{name} states no licence: read it, and add it to experiments/notice.py")
-    return found
+    return licence_text
 
 
 def _statements(stated: PackageMetadata) -> Iterator[str]:
@@ -71,8 +72,8 @@ def _statements(stated: PackageMetadata) -> Iterator[str]:
     )
     yield expression
     yield text if len(text) <= _LONGEST else ""
-    classified = [one for one in stated.get_all("Classifier") or [] if one.startswith(_LICENCE)]
-    yield ", ".join(one.rpartition(" :: ")[2] for one in classified)
+    classified = [text for text in stated.get_all("Classifier") or [] if text.startswith(_LICENCE)]
+    yield ", ".join(classifier.rpartition(" :: ")[2] for classifier in classified)
     yield text.splitlines()[0] if text else ""
 
 

@@ -46,7 +46,7 @@ def test_a_verb_of_the_repository_shows_its_settings(verb, capsys):
     text = capsys.readouterr().out
     assert f"skin {verb}" in text
     assert f"{verb}:" in text
-    assert verbs()[verb] == f"experiments.commands.{verb}"
+    assert verbs()[verb] == f"experiments.studies.{verb}"
 
 
 def test_what_only_the_repository_has_is_refused_elsewhere(tmp_path):

@@ -9,8 +9,8 @@ Simulated displacements and forces against independent solutions (:doc:`/physics
 from pathlib import Path
 from tempfile import mkdtemp
 
-from experiments.validation import select_laws
-from experiments.validation.finding import draw
+from experiments.validation import draw
+from experiments.validation.__main__ import select_laws
 
 folder, paths = Path(mkdtemp()), []
 for law in select_laws("boussinesq,hertz,locking"):

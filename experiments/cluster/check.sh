@@ -23,6 +23,6 @@ if [ "$(id -u)" = 0 ] && command -v slurmctld munged >/dev/null; then
 else
     echo "without SLURM (Debian's slurm-wlm and munge, as root): the tasks run one after the other"
 fi
-"$PYTHON" -m experiments.cluster.killed_array "$folder/array" "$uri"
-"$PYTHON" -m experiments.cluster.writers "$uri" --seconds "${SECONDS_OF_WRITING:-600}"
+"$PYTHON" -m experiments.cluster_checks array "$folder/array" "$uri"
+"$PYTHON" -m experiments.cluster_checks writers "$uri" --seconds "${SECONDS_OF_WRITING:-600}"
 rm -rf "$folder/array"

@@ -66,9 +66,9 @@ class Rocket(AbstractLearner):
         if self._channels == "readings":
             return touches.readings.where(touches.valid, 0.0).mT
         x = above_idle(touches)
-        kept = x.sort(dim=2, descending=True).values[..., : self._largest]
-        kept = torch.nn.functional.pad(kept, (0, self._largest - kept.shape[2]))
-        return torch.cat([kept, x.sum(dim=2, keepdim=True)], dim=2).mT
+        highest = x.sort(dim=2, descending=True).values[..., : self._largest]
+        highest = torch.nn.functional.pad(highest, (0, self._largest - highest.shape[2]))
+        return torch.cat([highest, x.sum(dim=2, keepdim=True)], dim=2).mT
 
     def check(self, data: "TouchData") -> None:
         """Raise InputError if the environment or labels are not available."""
@@ -126,8 +126,8 @@ class Rocket(AbstractLearner):
 
     def _array(self, touches: Touches) -> np.ndarray:
         """Return all inputs, computed in parts to save memory."""
-        here = touches.to("cpu")
-        parts = [self.inputs(here[start : start + _PART]) for start in range(0, len(here), _PART)]
+        local = touches.to("cpu")
+        parts = [self.inputs(local[start : start + _PART]) for start in range(0, len(local), _PART)]
         return torch.cat(parts).to(torch.float32).numpy()
 
     def _start(self, do: str, path: Path) -> float:
@@ -154,10 +154,10 @@ class Rocket(AbstractLearner):
             answer = ""
         if not answer:
             raise InputError(f"the process of aeon ended with exit code {process.wait()}")
-        found = json.loads(answer)
-        if "error" in found:
-            raise RuntimeError(found["error"])
-        return found
+        result = json.loads(answer)
+        if "error" in result:
+            raise RuntimeError(result["error"])
+        return result
 
 
 def _python() -> str:

@@ -5,22 +5,30 @@ frames of one layout have it; what differs are the nodes' labels. Documents of s
 embedded together. An SVM tells what is in them, and the variance that labels and layouts explain.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from statistics import fmean, stdev
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from sklearn.decomposition import PCA
+from sklearn.manifold import TSNE
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from experiments.studies.comparison import combine_verdicts, judge_claim, paired
 from experiments.studies.measures import ProbeSettings
+from experiments.studies.pages import Page
 from skin.body.layout.scattered import Scattered
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.learner.base import AbstractLearner
 from skin.learning.representation.graph import adjacency, neighbours
+from skin.plot.figures import COLOURS, MARKS
 
 _POWERS = 5
 _EIGENVALUES = 10
@@ -88,7 +96,7 @@ def probe(
     for seed in settings.seeds if device.simulation else settings.seeds[:1]:
         touches, mixed = _touches(device, settings, seed), _layouts(device, settings, seed)
         for (attribute, name), vectors in _inputs([*touches, *mixed], settings, seed, learner):
-            yield _found(attribute, name, seed, _space(vectors, touches, mixed), device.task.names)
+            yield _probed(attribute, name, seed, _space(vectors, touches, mixed), device.task.names)
 
 
 def strongest(touches: Touches) -> np.ndarray:
@@ -97,7 +105,7 @@ def strongest(touches: Touches) -> np.ndarray:
     return readings[np.arange(len(readings)), readings.sum(axis=2).argmax(axis=1)]
 
 
-def accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
+def svm_accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
     """Return the share of ``vectors[train:]`` that an SVM trained on the others puts into its class (B,).
 
     Radial basis functions on standardised vectors, the cost chosen by cross-validation among the training
@@ -113,7 +121,7 @@ def accuracy(vectors: np.ndarray, classes: np.ndarray, train: int) -> float:
 def explained(vectors: np.ndarray, classes: np.ndarray) -> float:
     """Return the share of the variance of vectors (B, E) that lies between classes (B,); 0 if all are one."""
     centred = vectors - vectors.mean(axis=0)
-    means = [(classes == one, centred[classes == one].mean(axis=0)) for one in np.unique(classes)]
+    means = [(classes == number, centred[classes == number].mean(axis=0)) for number in np.unique(classes)]
     between = sum(which.sum() * (mean**2).sum() for which, mean in means)
     # Where nothing but the last bit differs there is no variance to explain.
     whole = (centred**2).sum()
@@ -132,20 +140,22 @@ def _graph_vectors(
     frames = [strongest(touches) for touches in sets]
     places = [touches.positions.double().numpy() for touches in sets]
     edges, count, weight = (settings.graph[name] for name in ("edges", "count", "weight"))
-    weights = [adjacency(one, neighbours(one, edges, count), weight) for one in places]
+    weights = [adjacency(matrix, neighbours(matrix, edges, count), weight) for matrix in places]
     if attribute == "degree":
-        labels = [np.tile((one > 0).sum(0), (len(f), 1)) for one, f in zip(weights, frames, strict=True)]
+        labels = [
+            np.tile((matrix > 0).sum(0), (len(f), 1)) for matrix, f in zip(weights, frames, strict=True)
+        ]
     else:
         ends = np.cumsum([len(frame) for frame in frames])[:-1]
         labels = np.split(levels(np.concatenate(frames), settings.levels), ends)
     pairs = list(zip(labels, weights, strict=True))
-    words = [row for label, one in pairs for row in subtrees(label, one > 0, settings.depth)]
+    words = [row for label, matrix in pairs for row in subtrees(label, matrix > 0, settings.depth)]
     yield "Graph2Vec", doc2vec(words, settings.width, settings.epochs, seed)
     lines = [row for pair in pairs for row in subtrees(*line_graph(*pair), settings.depth)]
-    half = [doc2vec(each, settings.width // 2, settings.epochs, seed) for each in (words, lines)]
+    half = [doc2vec(documents, settings.width // 2, settings.epochs, seed) for documents in (words, lines)]
     yield "GL2Vec", np.concatenate(half, axis=1)
     kinds = 1 + max(int(label.max()) for label in labels)
-    yield "IGE", np.concatenate([invariant(label, one, kinds) for label, one in pairs])
+    yield "IGE", np.concatenate([invariant(label, matrix, kinds) for label, matrix in pairs])
 
 
 def _inputs(
@@ -155,30 +165,33 @@ def _inputs(
         for name, vectors in _graph_vectors(sets, attribute, settings, seed):
             yield (attribute, name), vectors
     if learner is not None:
-        yield ("", "trained encoder"), np.concatenate([learner.embeddings(one).numpy() for one in sets])
-    yield ("", FRAME), np.concatenate([strongest(one) for one in sets])
-    windows = [one.readings.where(one.valid, 0).flatten(1).numpy() for one in sets]
+        encoded = [learner.embeddings(touches).numpy() for touches in sets]
+        yield ("", "trained encoder"), np.concatenate(encoded)
+    yield ("", FRAME), np.concatenate([strongest(touches) for touches in sets])
+    windows = [touches.readings.where(touches.valid, 0).flatten(1).numpy() for touches in sets]
     yield ("", "readings, window"), np.concatenate(windows)
 
 
 def _space(vectors: np.ndarray, touches: Sequence[Touches], mixed: Sequence[Touches]) -> Space:
-    here = sum(map(len, touches))
-    layouts = np.repeat(np.arange(len(mixed)), [len(one) for one in mixed])
-    known = _labels(touches)
-    other = _labels(mixed) if mixed else known[:0]
-    return Space(vectors[:here], known, len(touches[0]), vectors[here:] if mixed else None, layouts, other)
+    count = sum(map(len, touches))
+    layouts = np.repeat(np.arange(len(mixed)), [len(layout) for layout in mixed])
+    labels = _labels(touches)
+    mixed_labels = _labels(mixed) if mixed else labels[:0]
+    return Space(
+        vectors[:count], labels, len(touches[0]), vectors[count:] if mixed else None, layouts, mixed_labels
+    )
 
 
-def _found(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> ProbeResult:
-    each = zip(names, space.labels.T, strict=True)
-    right = {label: accuracy(space.vectors, classes, space.train) for label, classes in each}
+def _probed(attribute: str, name: str, seed: int, space: Space, names: Sequence[str]) -> ProbeResult:
+    columns = zip(names, space.labels.T, strict=True)
+    right = {label: svm_accuracy(space.vectors, classes, space.train) for label, classes in columns}
     shares: dict[str, float] = {}
     if space.mixed is not None:
         shares = {"layout": explained(space.mixed, space.layouts)}
-        each = zip(names, space.mixed_labels.T, strict=True)
-        shares |= {label: explained(space.mixed, classes) for label, classes in each}
+        columns = zip(names, space.mixed_labels.T, strict=True)
+        shares |= {label: explained(space.mixed, classes) for label, classes in columns}
         order = np.random.default_rng(seed).permutation(len(space.mixed))
-        right["layout"] = accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
+        right["layout"] = svm_accuracy(space.mixed[order], space.layouts[order], len(order) * 2 // 3)
     return ProbeResult(attribute, name, seed, right, shares, space)
 
 
@@ -200,21 +213,22 @@ def _layouts(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list
     rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
     if count // rows > 3 * rows:
         return []  # this number of sensors cannot form a grid
-    sensors, found = simulation.sensors, list[AbstractDevice]()
+    sensors, devices = simulation.sensors, list[AbstractDevice]()
     for number in range(settings.layouts):
         seed_of = _FIRST_LAYOUT + number
         layout = Scattered(
             rows, count // rows, seed=seed_of, footprint=sensors.footprint, depth=sensors.positions[:, 2]
         )
         draw = _FIRST_SEED * (2 + number) + seed
-        found.append(simulation.replace(layout=layout, data_seed=draw, gestures=settings.test))
-    return [one.recording().touches for one in found]
+        devices.append(simulation.replace(layout=layout, data_seed=draw, gestures=settings.test))
+    return [device.recording().touches for device in devices]
 
 
 def _labels(sets: Sequence[Touches]) -> np.ndarray:
     if any(touches.labels is None for touches in sets):
         raise InputError("touches without labels cannot be probed: record them with labels")
-    return np.concatenate([one.labels.numpy() for one in sets if one.labels is not None]).astype(int)
+    labels = [touches.labels.numpy() for touches in sets if touches.labels is not None]
+    return np.concatenate(labels).astype(int)
 
 
 def levels(readings: np.ndarray, count: int) -> np.ndarray:
@@ -257,16 +271,16 @@ def line_graph(labels: np.ndarray, weights: np.ndarray, steps: int = 4) -> tuple
         weights: (S, S), symmetric, 0 where there is no edge.
         steps: in which weights are told apart.
     """
-    one, other = np.nonzero(np.triu(weights, 1))
-    weight = weights[one, other]
+    start, end = np.nonzero(np.triu(weights, 1))
+    weight = weights[start, end]
     step = np.minimum((weight / weight.max(initial=1e-300) * steps).astype(np.uint64), np.uint64(steps - 1))
-    ends = np.sort(_mix(np.stack([labels[:, one], labels[:, other]], axis=-1).astype(np.uint64)), axis=-1)
-    found = _mix(_mix(ends[..., 0] ^ step) ^ ends[..., 1])
-    meet = np.zeros((len(one), len(labels[0])), dtype=int)
-    meet[np.arange(len(one)), one] = meet[np.arange(len(one)), other] = 1
+    ends = np.sort(_mix(np.stack([labels[:, start], labels[:, end]], axis=-1).astype(np.uint64)), axis=-1)
+    hashes = _mix(_mix(ends[..., 0] ^ step) ^ ends[..., 1])
+    meet = np.zeros((len(start), len(labels[0])), dtype=int)
+    meet[np.arange(len(start)), start] = meet[np.arange(len(start)), end] = 1
     linked = meet @ meet.T > 0
     np.fill_diagonal(linked, False)
-    return found, linked
+    return hashes, linked
 
 
 def doc2vec(documents: Sequence[np.ndarray], width: int, epochs: int, seed: int) -> np.ndarray:
@@ -338,3 +352,169 @@ def _mix(values: np.ndarray) -> np.ndarray:
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return values ^ (values >> np.uint64(31))
+
+
+_ABOUT = """\
+The labels: accuracy on held-out touches of an SVM (radial basis functions on standardised vectors, cost
+chosen by cross-validation on the training touches). Graph embeddings and "readings, one frame" see the
+strongest frame of a touch alone, the encoder and "readings, window" all: one frame does not tell how long
+or where to. Layout: the same SVM on touches of several scattered layouts, whose graphs differ in
+morphology; beside it the share of an embedding's variance there that the layout explains, and the share
+that the best label does. On one layout all graphs have one morphology: labelled by degree, as Graph2Vec
+usually is, they are all equal.
+"""
+_Figure = Callable[[ProbeResult], float]
+
+
+def build_embeddings_page(results: Sequence[ProbeResult], names: Sequence[str]) -> Page:
+    """Return the table, the verdicts, and figure 5 of the report, of the first seed."""
+    table = embeddings_table(results, names)
+    about = f"{_ABOUT}\n" + "".join(f"- {line}\n" for line in embedding_statements(results, names))
+    figure = spaces([result for result in results if result.seed == results[0].seed], names)
+    return Page(about, {"What an SVM reads in embeddings, accuracy in per cent": table}, table, figure)
+
+
+def planes(vectors: np.ndarray, points: int = 400) -> np.ndarray:
+    """Return the first touches in the plane, (points, 2): PCA to 30 axes, then t-SNE (report, 2.2.2)."""
+    few = np.asarray(vectors[:points], dtype=float)
+    # Neither method works on vectors that are all equal.
+    if np.ptp(few, axis=0).max() < 1e-9:
+        return np.zeros((len(few), 2))
+    reduced = PCA(min(30, *few.shape), random_state=0).fit_transform(few)
+    near = min(30.0, (len(few) - 1) / 3)
+    return TSNE(perplexity=near, init="pca", random_state=0).fit_transform(reduced)
+
+
+def spaces(results: Sequence[ProbeResult], names: Sequence[str], points: int = 400) -> Figure:
+    """Draw one row of planes per embedding, coloured by each label and by the layout (report, figure 5).
+
+    Args:
+        results: of one seed.
+        names: of the labels.
+        points: touches in each panel.
+    """
+    columns = len(names) + (results[0].space.mixed is not None)
+    figure = Figure(figsize=(2.1 * columns, 2.0 * len(results)), layout="constrained")
+    axes = figure.subplots(len(results), columns, squeeze=False)
+    for row, result in zip(axes, results, strict=True):
+        plane = planes(result.space.vectors, points)
+        for axis, classes in zip(row, result.space.labels.T, strict=False):
+            _scatter(axis, plane, classes[:points])
+        if result.space.mixed is not None:
+            order = np.random.default_rng(0).permutation(len(result.space.mixed))[:points]
+            _scatter(row[-1], planes(result.space.mixed[order], points), result.space.layouts[order])
+        row[0].set_ylabel(_title(result), fontsize=8)
+    for axis, name in zip(axes[0], [*names, "layout"], strict=False):
+        axis.set_title(name)
+    figure.supxlabel("square: the label holds, circle: it does not; each layout has a mark", fontsize=8)
+    return figure
+
+
+def embeddings_table(results: Sequence[ProbeResult], names: Sequence[str]) -> list[list[str]]:
+    """Return the table, its head first: accuracies and shares of variance in per cent, means over seeds."""
+    head = ["input", *names, "mean", "layout", "variance: layout", "variance: best label"]
+    table = [head]
+    for group in _groups(results).values():
+        labels = [[result.accuracy[name] for result in group] for name in names]
+        means = [_mean(result, names) for result in group]
+        layout = [result.accuracy["layout"] for result in group if "layout" in result.accuracy]
+        shares = [result.explained for result in group if result.explained]
+        variance = (
+            [share["layout"] for share in shares],
+            [max(share[name] for name in names) for share in shares],
+        )
+        table.append([_title(group[0]), *map(_percent, [*labels, means, layout, *variance])])
+    return table
+
+
+def embedding_statements(results: Sequence[ProbeResult], names: Sequence[str]) -> list[str]:
+    """Return verdicts on the report's statements about pretrained embeddings (3.2.4), one line each.
+
+    A statement holds if it holds for each embedding. Agree and disagree need the margin of at least
+    three seeds; "chance" has a tolerance of two points.
+    """
+    groups = _groups(results)
+    frame = {result.seed: _mean(result, names) for result in groups[("", FRAME)]}
+    claims: tuple[tuple[str, str, _Figure, _Figure], ...] = (
+        (
+            "emphasise the graph's morphology (variance explained by layout over best label)",
+            "greater",
+            lambda result: result.explained["layout"],
+            lambda result: max(result.explained[name] for name in names),
+        ),
+        (
+            "are not purposeful on a fixed layout (mean accuracy below the readings of the same frame)",
+            "less",
+            lambda result: _mean(result, names),
+            lambda result: frame[result.seed],
+        ),
+        (
+            "leave an SVM at chance (mean accuracy over the commoner class)",
+            "no better",
+            lambda result: _mean(result, names),
+            _chance,
+        ),
+    )
+    lines = []
+    for attribute in dict.fromkeys(result.attribute for result in results if result.attribute):
+        mine = [group for key, group in groups.items() if key[0] == attribute]
+        for says, claim, figure, reference in claims:
+            verdicts = [_compare(group, claim, figure, reference) for group in mine]
+            whole = combine_verdicts([word for word, _ in verdicts])
+            details = "; ".join(detail for _, detail in verdicts)
+            lines.append(f"Nodes labelled by {attribute}: the embeddings {says}: **{whole}**. {details}.")
+    return lines
+
+
+def _compare(
+    group: Sequence[ProbeResult], claim: str, figure: _Figure, reference: _Figure
+) -> tuple[str, str]:
+    """Return the verdict on a claim about one embedding, and its figures."""
+    able = [result for result in group if result.explained or claim != "greater"]
+    left, right = ({str(result.seed): value(result) for result in able} for value in (figure, reference))
+    difference = paired(left, right)
+    word = judge_claim(claim, difference, by=0.02)
+    if difference is None:
+        return word, f"{group[0].name} has one layout only ({word})"
+    spread = f" ± {100 * difference.margin:.1f}" if difference.seeds > 1 else ""
+    return word, f"{group[0].name} {100 * difference.mean:+.1f}{spread} points ({word})"
+
+
+def _groups(results: Iterable[ProbeResult]) -> dict[tuple[str, str], list[ProbeResult]]:
+    """Return the results of each input, by seed."""
+    groups: dict[tuple[str, str], list[ProbeResult]] = {}
+    for result in results:
+        groups.setdefault((result.attribute, result.name), []).append(result)
+    return groups
+
+
+def _mean(result: ProbeResult, names: Sequence[str]) -> float:
+    """Return the mean accuracy over the labels that could be learnt."""
+    return float(np.nanmean([result.accuracy[name] for name in names]))
+
+
+def _chance(result: ProbeResult) -> float:
+    """Return the mean share of the held-out touches that are of their label's commoner class."""
+    share = result.space.labels[result.space.train :].mean(axis=0)
+    return float(np.maximum(share, 1 - share).mean())
+
+
+def _title(result: ProbeResult) -> str:
+    return f"{result.name}, {result.attribute}" if result.attribute else result.name
+
+
+def _percent(values: Sequence[float]) -> str:
+    """Return the mean of shares in per cent, with the deviation over seeds if there are several."""
+    if not values or np.isnan(values).any():
+        return ""
+    spread = f" ± {100 * stdev(values):.1f}" if len(values) > 1 else ""
+    return f"{100 * fmean(values):.1f}{spread}"
+
+
+def _scatter(axis: Axes, plane: np.ndarray, classes: np.ndarray) -> None:
+    for number in np.unique(classes):
+        x, y = plane[classes == number].T
+        colour, mark = COLOURS[number % len(COLOURS)], MARKS[number % len(MARKS)]
+        axis.scatter(x, y, s=7, color=colour, marker=mark, alpha=0.6, linewidths=0)
+    axis.set_xticks([])
+    axis.set_yticks([])

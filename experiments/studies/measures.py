@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
     from omegaconf import DictConfig
 
-    from experiments.studies.tables import Page
+    from experiments.studies.pages import Page
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learning.learner.base import AbstractLearner
@@ -109,7 +109,7 @@ class Measurement:
     cannot: str = ""
 
 
-class Measure(Protocol):
+class StudyMeasure(Protocol):
     """A frozen dataclass of settings that measures."""
 
     def __call__(self, subject: Subject) -> Measurement:
@@ -164,7 +164,7 @@ class Margins:
     gestures: Annotated[int, Ge(1)] = 20000
 
     def __call__(self, subject: Subject) -> Measurement:
-        from experiments.studies.measure_pages import margins_page
+        from experiments.studies.pages import margins_page
         from skin.evaluation.margins import measure_margins
 
         report = measure_margins(subject.learner, subject.device, self.gestures, subject.point())
@@ -178,7 +178,7 @@ class Streams(StreamSettings):
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.measure_pages import streams_page
+        from experiments.studies.pages import streams_page
         from skin.evaluation.streams import evaluate_windows
 
         console = Console(stderr=True)
@@ -209,7 +209,7 @@ class Holds:
     def __call__(self, subject: Subject) -> Measurement:
         from rich.progress import track
 
-        from experiments.studies.tables import Page
+        from experiments.studies.pages import Page
         from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
         from skin.hardware.live.selftest import FIELDS, time_courses
@@ -245,7 +245,7 @@ class TouchAlarms:
     def __call__(self, subject: Subject) -> Measurement:
         import numpy as np
 
-        from experiments.studies.tables import Page
+        from experiments.studies.pages import Page
         from skin.core.rng import Stream, generator
         from skin.evaluation.operating_point import (
             LABEL,
@@ -319,8 +319,7 @@ class Embeddings(ProbeSettings):
         from rich.console import Console
         from rich.progress import track
 
-        from experiments.studies.embedding_page import build_embeddings_page
-        from experiments.studies.embeddings import probe
+        from experiments.studies.embeddings import build_embeddings_page, probe
         from skin.device.balance import report_balance
 
         device, learner = subject.device, subject.learner if subject.finished else None

@@ -1,4 +1,4 @@
-"""Trials: results of a study for its runs, under each condition, on each device.
+"""The runs of a study, and its trials: results for a run, under each condition, on each device.
 
 A trial that needs an evaluation is a Parquet file of one row in ``results/trials/<study>``, named by the
 training and by all that the result depends on. A file has one writer and is written whole, so parallel jobs
@@ -7,9 +7,11 @@ and shards share none. All files of a folder together are one table: ``pandas.re
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,23 +21,188 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.singleton import Singleton
+from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
-from experiments.studies.measures import Accuracy, Finished, Measure, Subject
-from experiments.studies.runs import Planned, load_outcomes, row_and_simulator
-from experiments.studies.study import Study, Variant, as_overrides, passed_overrides
-from experiments.studies.tables import publish_page
+from experiments.studies.measures import Accuracy, Finished, StudyMeasure, Subject
+from experiments.studies.pages import publish_page
+from experiments.studies.study import Study, Variant, as_overrides, passed_overrides, sweeps, variants
+from skin.commands import train
 from skin.core.files import whole
+from skin.core.messages import PARENT
 from skin.core.safe_loading import check_seal, write_parquet
 from skin.errors import InputError
-from skin.evaluation.metrics import decode, disagreement, vote
+from skin.evaluation.metrics import OUTCOMES, decode, disagreement, vote
 from skin.runs.build import build_device
 from skin.runs.configuration import fingerprint, source_tags
-from skin.runs.finished_run import TAG, FinishedRun
+from skin.runs.finished_run import TAG, FinishedRun, find_run
 from skin.runs.model_of_run import RunModel, load_model
-from skin.runs.store import Store, note_source
+from skin.runs.store import Store, note_reuse, note_source
+from skin.runs.sweep import LEFT_OUT, Shard
+from skin.runs.train import SWEPT, simulator
 from skin.touch.labels import TOUCH
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A run of a study.
+
+    Attributes:
+        variant: that it is of.
+        seed: of the training.
+        run: the newest that finished; None where none did: it failed, was killed, or never started.
+    """
+
+    variant: Variant
+    seed: str
+    run: Run | None
+
+
+def train_study(study: Study, shard: Shard | None, smoke: bool = False) -> tuple[Store, list[Planned]]:
+    """Train the missing runs of a study, or of a shard of it.
+
+    Returns:
+        The store, and all runs of the study or the shard.
+    """
+    every = variants(study, smoke)
+    store = Store.open(next(iter(every[0].configs.values())).tracking)
+    if shard:
+        fingerprints = shard.part(
+            fingerprint(config) for variant in every for config in variant.configs.values()
+        )
+        every = [replace(variant, configs=_only(variant.configs, fingerprints)) for variant in every]
+    if study.train and any(run.run is None for run in _look(store, every) if run.variant.trained):
+        parallel = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={study.jobs}"] if study.jobs > 1 else []
+        for _, line in sweeps(study, study.trainings, smoke):
+            divided = [f"+hydra.callbacks.sweep.runs={sorted(fingerprints)}"] if shard else []
+            multirun([*line, *parallel, *divided])
+    return store, [run for run in _look(store, every) if run.run is not None or run.variant.trained]
+
+
+def _only(configs: Mapping[str, DictConfig], fingerprints: Collection[str]) -> dict[str, DictConfig]:
+    """Return the configurations with these fingerprints."""
+    return {seed: config for seed, config in configs.items() if fingerprint(config) in fingerprints}
+
+
+def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
+    """Return finished runs: the named one, or the newest of rows and seeds on the simulator of ``config``.
+
+    Runs of a row whose names differ in more than the seed are different variants.
+
+    Raises:
+        InputError: there is none, or a row that is named has none.
+    """
+    if study.rows is None:
+        assert study.run is not None
+        run = find_run(store, study.run).run
+        row, seed = run.data.tags.get("row", ""), run.data.tags.get("seed", "")
+        return [Planned(Variant(_name(run), {"row": row}, {}), seed, run)]
+    newest: dict[tuple[str, str], Planned] = {}
+    data = simulator(config)
+    for run in store.find("FINISHED", simulator=data):
+        tags, name = run.data.tags, _name(run)
+        chosen = study.rows == "all" or tags["row"] in study.rows
+        if chosen and "learned" in tags and int(tags["seed"]) in study.seeds:
+            planned = Planned(Variant(name, {"row": tags["row"]}, {}), tags["seed"], run)
+            newest.setdefault((name, tags["seed"]), planned)
+    rows = {planned.variant.chosen["row"] for planned in newest.values()}
+    missing = [] if study.rows == "all" else [row for row in study.rows if row not in rows]
+    missing = missing or ([] if rows else ["features"])
+    if missing:
+        raise InputError(
+            f"no finished run of {', '.join(missing)} on {data} data in {store.uri}: "
+            f"skin train experiment={missing[0]} simulator={data} makes one"
+        )
+    return [newest[key] for key in sorted(newest)]
+
+
+def row_and_simulator(variant: Variant) -> tuple[str, str]:
+    """Return the names of row and simulator of a variant; empty where they are not known."""
+    for config in variant.configs.values():
+        return str(config.row), simulator(config)
+    return variant.chosen.get("row", variant.chosen.get("experiment", "")), variant.chosen.get(
+        "simulator", ""
+    )
+
+
+def newest_finished(store: Store, config: DictConfig) -> Run | None:
+    """Return the newest finished run of a configuration."""
+    runs = store.find("FINISHED", fingerprint=fingerprint(config))
+    if runs:
+        note_reuse(runs[0])
+    return runs[0] if runs else None
+
+
+def multirun(line: Sequence[str]) -> int:
+    """Train the sweep of some overrides, as ``skin train -m`` does, and return the exit code.
+
+    Failed runs are reported and skipped.
+    """
+    sources = HydraConfig.get().runtime.config_sources
+    folder = [source.path for source in sources if source.provider == "command-line"]  # of --config-dir
+    return run_command(train.main, ["-m", *(["--config-dir", *folder] if folder else []), *line])
+
+
+def run_command(main: Callable[[Sequence[str]], None], words: Sequence[str]) -> int:
+    """Run a command of Hydra inside of another one and return its exit code.
+
+    Raises:
+        SystemExit: a signal ended it.
+    """
+    with _another_command():
+        try:
+            main(words)
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+            if code > 128:
+                raise
+            return code
+    return 0
+
+
+@contextmanager
+def _another_command() -> Iterator[None]:
+    """Let Hydra run a command inside of one."""
+    state, traceback = Singleton.get_state(), os.environ.pop("HYDRA_FULL_ERROR", None)
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        Singleton.set_state(state)
+        for name in (PARENT, SWEPT, LEFT_OUT):  # of a sweep, which has ended
+            os.environ.pop(name, None)
+        if traceback is not None:
+            os.environ["HYDRA_FULL_ERROR"] = traceback
+
+
+def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
+    """Return the outcomes of the test gestures of a run, (B,), uint8; None if it has none."""
+    if OUTCOMES not in {file.path for file in store.client.list_artifacts(run.info.run_id)}:
+        return None
+    with TemporaryDirectory() as folder:
+        path = download_artifacts(
+            run_id=run.info.run_id, artifact_path=OUTCOMES, dst_path=folder, tracking_uri=store.uri
+        )
+        outcomes: np.ndarray = np.load(path)
+        return outcomes
+
+
+def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
+    return [
+        Planned(variant, seed, newest_finished(store, config))
+        for variant in every
+        for seed, config in variant.configs.items()
+    ]
+
+
+def _name(run: Run) -> str:
+    """Return the name of a run without its seed."""
+    return re.sub(r"( seed)? \d+$", "", run.info.run_name)
+
 
 FOLDER = Path("results/trials")
 """Of all trials, in the current folder; those of a study are in a folder of its name."""
@@ -64,7 +231,7 @@ _SHARES = (
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialResult:
     """Results for one run under one condition on one device.
 
     Attributes:
@@ -92,7 +259,7 @@ class Trial:
     cannot: Sequence[str] = ()
 
 
-def run_trials(store: Store, planned: Planned, study: Study, config: DictConfig) -> Iterator[Trial]:
+def run_trials(store: Store, planned: Planned, study: Study, config: DictConfig) -> Iterator[TrialResult]:
     """Yield the results of a study for a run; those that exist are not measured again.
 
     Args:
@@ -103,14 +270,14 @@ def run_trials(store: Store, planned: Planned, study: Study, config: DictConfig)
     """
     variant, seed, run = planned.variant, planned.seed, planned.run
     if run is None:
-        yield Trial(variant, seed, "", "", "", {})
+        yield TrialResult(variant, seed, "", "", "", {})
         return
     tags, metrics = run.data.tags, run.data.metrics if variant.configs else {}
     identity = tags.get("fingerprint", "")
     if study.measure is None and not study.conditions:
         refused = [name.removeprefix("cannot_") for name in tags if name.startswith("cannot_")]
         outcomes = load_outcomes(store, run)
-        yield Trial(variant, seed, "", "", identity, metrics, outcomes=outcomes, cannot=refused)
+        yield TrialResult(variant, seed, "", "", identity, metrics, outcomes=outcomes, cannot=refused)
         return
     words, selected = passed_overrides(), f"simulator={tags.get('simulator')}"
     # Trainings had these overrides. They change the device of other runs, whose simulator selected them.
@@ -120,7 +287,7 @@ def run_trials(store: Store, planned: Planned, study: Study, config: DictConfig)
         for number, numbered in numbered_settings(study, settings):
             line = [*as_overrides({**study.test, **numbered}), *changes]
             row = restored.measure(study, condition, number, base, line)
-            yield Trial(
+            yield TrialResult(
                 variant,
                 seed,
                 condition,
@@ -190,7 +357,7 @@ class RestoredRun:
             note_source(str(path), f"{study.name} of {run.info.run_name}", row["source"])
         return row
 
-    def _measured(self, measure: Measure, config: DictConfig, name: str) -> dict[str, Any]:
+    def _measured(self, measure: StudyMeasure, config: DictConfig, name: str) -> dict[str, Any]:
         """Measure, and return the row; its files have a name."""
         subject = Subject(
             config, build_device(config), Finished(self.store, self.run, self.finished.stored, self.trained)
@@ -240,12 +407,12 @@ def write_row(row: Mapping[str, Any], path: Path) -> None:
         write_parquet(table, partial, compression="zstd")
 
 
-def votes(study: Study, trials: Sequence[Trial]) -> Iterator[Trial]:
+def votes(study: Study, trials: Sequence[TrialResult]) -> Iterator[TrialResult]:
     """Yield what the models in ``study.vote`` decide together, for each seed and for equal other settings.
 
     It is computed from the outcomes of the runs on the same test gestures (report, 4.2).
     """
-    groups: dict[tuple[tuple[tuple[str, str], ...], str], list[Trial]] = {}
+    groups: dict[tuple[tuple[tuple[str, str], ...], str], list[TrialResult]] = {}
     for trial in trials:
         row, simulator = row_and_simulator(trial.variant)
         others = {**trial.variant.chosen, "simulator": simulator}
@@ -266,4 +433,4 @@ def votes(study: Study, trials: Sequence[Trial]) -> Iterator[Trial]:
         name = " ".join([*(value for _, value in settings if several), "vote"])
         variant = Variant(name, {**dict(settings), "name": "vote"}, {})
         run = " ".join(trial.run for trial in members)
-        yield Trial(variant, seed, "", "", run, metrics, outcomes=outcomes)
+        yield TrialResult(variant, seed, "", "", run, metrics, outcomes=outcomes)

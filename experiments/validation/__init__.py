@@ -1,71 +1,239 @@
-"""The laws of mechanics, in the order of the page, each checked against an independent solution."""
+"""The result of checking a law: our number, the reference and the tolerance; and the page of all results."""
 
-from experiments.validation import programs, solid
-from experiments.validation.finding import Law
-from skin.errors import InputError
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import cycle
+from pathlib import Path
+from typing import Any
 
-LAWS = (
-    Law("patch",
-        "A uniform strain prescribed on the surface of distorted elements gives the same strain inside.",
-        "linear algebra", solid.patch_test),
-    Law("confined",
-        "Between smooth walls a uniform pressure p compresses each layer by p h / (lambda + 2 G).",
-        "closed form", solid.confined_compression),
-    Law("even", "In the middle of a wide sheet a uniform pressure p gives sigma_zz = -p at every depth.",
-        "equilibrium", solid.even_pressure),
-    Law("balance",
-        "The reactions of the support balance the applied force and moment, on a sheet and on an arm.",
-        "equilibrium", solid.global_balance),
-    Law("reciprocity", "Two loads do the same work on each other's displacements (Maxwell and Betti).",
-        "symmetry", solid.reciprocity),
-    Law("convergence", "Halving the element size divides the displacement error by four.",
-        "closed form of the bonded layer", solid.convergence),
-    Law("layer",
-        "The compliance of a thin, nearly incompressible bonded layer is correct for all wavelengths.",
-        "closed form (Aleksandrov and Vorovich)", solid.thin_layer),
-    Law("locking", "The error does not grow when nu rises from 0.45 to 0.4999.",
-        "the same closed form", solid.no_locking),
-    Law("mesh", "The default mesh gives the readings of the default skin under a square load.",
-        "sums of exact waves of both layers", solid.default_mesh),
-    Law("boussinesq", "Pressure on a thick soft block: displacement and stress below and beside the load.",
-        "Boussinesq, integrated over the square", solid.boussinesq),
-    Law("cerruti", "Tangential traction on a thick soft block: displacement and stress.",
-        "Cerruti, integrated over the square", solid.cerruti),
-    Law("hertz", "A rigid sphere on a thick block: contact radius, peak pressure and force.",
-        "Hertz", solid.hertz),
-    Law("punch", "Flat rigid punches, square and round: force for a given approach.",
-        "capacitance of a square plate (Read, 1997); Johnson, section 3.4", solid.flat_punch),
-    Law("direct", "The precomputed operator gives the same result as solving each frame.",
-        "scikit-fem alone, in the mixed form", programs.single_frames),
-    Law("arm", "A sleeve of large radius behaves like a sheet.", "the sheet", solid.wide_arm),
-    Law("tube", "A sleeve on a rigid core under uniform pressure behaves like a bonded tube of two layers.",
-        "Lame's equations", solid.sleeve),
-    Law("pynite", "simulator=fem gives the same nodal displacements as PyNite.",
-        "PyNite", programs.plates_and_beams),
-    Law("equation10",
-        "The reading of simulator=fem is D_s / D_t times the force on the footprint, and proportional to it.",
-        "PyNite and the report's equation 10", programs.equation_ten),
-    Law("naive", "The reading of simulator=naive is the pressure of one cell times the footprint area.",
-        "the report", programs.naive),
-    Law("creep", "A viscoelastic skin creeps under a constant load.",
-        "creep of the standard linear solid", programs.creep),
-    Law("threads", "Results are the same on one thread and on two.",
-        "another process", programs.threads),
-)  # fmt: skip
+import numpy as np
+from matplotlib.figure import Figure
+
+from skin.core.files import whole, write
+from skin.plot.figures import MARKS
 
 
-def select_laws(names: str) -> list[Law]:
-    """Return the laws with the given names, separated by commas, or every law for ``all``.
+@dataclass(frozen=True)
+class Finding:
+    """One number and its reference.
 
-    Raises:
-        InputError: an unknown name.
+    Attributes:
+        case: what was computed.
+        ours: our number.
+        reference: the independent number.
+        error: of our number, relative unless the law says otherwise.
+        tolerance: the largest error that passes.
     """
-    known = {law.name: law for law in LAWS}
-    if names == "all":
-        return list(LAWS)
-    if unknown := [name for name in names.split(",") if name not in known]:
-        raise InputError(
-            f"laws must be all or some of {', '.join(known)}, got {', '.join(unknown)}: as in "
-            "laws=hertz,punch"
+
+    case: str
+    ours: float
+    reference: float
+    error: float
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        for name in ("ours", "reference", "error"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    @property
+    def ok(self) -> bool:
+        """Whether the error is within the tolerance; an error that is not finite is not."""
+        return math.isfinite(self.error) and self.error <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a plot; ``marks`` draws points instead of a line."""
+
+    label: str
+    x: Sequence[float] | np.ndarray
+    y: Sequence[float] | np.ndarray
+    marks: bool = False
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot of a check.
+
+    Attributes:
+        name: of the file, without its suffix.
+        title, x, y: title and axis labels.
+        curves: the lines.
+        log: whether both axes are logarithmic.
+    """
+
+    name: str
+    title: str
+    x: str
+    y: str
+    curves: Sequence[Curve]
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """The result of checking a law: findings, and remarks and plots for the page, which have no verdict."""
+
+    findings: Sequence[Finding]
+    remarks: Sequence[str] = ()
+    plots: Sequence[Plot] = ()
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law and how it is checked.
+
+    Attributes:
+        name: short, lower case, as ``laws=`` takes it.
+        statement: what must hold.
+        reference: source of the independent solution.
+        check: takes whether to be quick (coarser meshes, fewer cases, the same tolerances) and returns the
+            result.
+    """
+
+    name: str
+    statement: str
+    reference: str
+    check: Callable[[bool], CheckResult] = field(repr=False)
+
+
+def relative_finding(case: str, ours: float, reference: float, tolerance: float) -> Finding:
+    """Return a finding whose error is relative to the reference."""
+    error = abs(ours - reference) / abs(reference) if reference else abs(ours)
+    return Finding(case, ours, reference, error, tolerance)
+
+
+Results = Sequence[tuple[Law, CheckResult]]
+
+_HEAD = """# Physics, verified
+
+Written by `make physics`. Each law is checked against an independent solution. The
+command exits with code 1 if a law does not hold. The page shows only digits that are the same on every
+processor; rounding errors are shown as an upper bound. `results/physics.json` holds all digits of one
+machine.
+
+| law | reference | numbers | worst error | tolerance | |
+|---|---|---|---|---|---|
+"""
+
+# Rounding errors in double and in single precision; the tolerance of a finding tells which applies.
+_DOUBLE, _SINGLE = 1e-10, 1e-6
+_LINES = ("-", "--", "-.", ":")  # curves differ without colour
+
+_LIMITS = """
+## Limits
+
+- **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
+  [limitations](limitations.md).
+- **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Material under a
+  wide object must move sideways. Elements that are as long as the skin is thick restrict this motion, most
+  of all beside the edge of the object: see `mesh` for the default mesh, a finer one and coarser ones.
+  Readings are more accurate, because the layers transmit the applied force. Beside an edge, however, an
+  error of 1 % of the reading under the object can be a large part of a small reading.
+- **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of a
+  half-space. Refining the mesh does not reduce this error.
+- **A sensor at the interface of two layers** interpolates linearly between the stresses above and below. The
+  stress along the layers is discontinuous there; a tilted sensor reads a mean of both sides.
+- **A footprint is defined on the unrolled surface.** Deep in an arm it covers a shorter arc than the sensor
+  (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full area.
+- **Contact is solved without friction.** The tangential traction of a sliding touch is added afterwards.
+"""
+
+
+def publish_physics(folder: Path, json_path: Path, results: Results) -> None:
+    """Write physics.md and its plots into a folder, and the findings as JSON, each file atomically."""
+    write(as_json(results), json_path)
+    for _, outcome in results:
+        for plot in outcome.plots:
+            draw(plot, folder / "results" / "physics" / f"{plot.name}.png")
+    write(physics_page(results), folder / "physics.md")
+
+
+def as_json(results: Results) -> str:
+    """Return the findings as a list of {law, case, ours, reference, error, tolerance, ok}."""
+    lines = [
+        {"law": law.name} | asdict(finding) | {"ok": finding.ok}
+        for law, outcome in results
+        for finding in outcome.findings
+    ]
+    return json.dumps(_finite(lines), indent=1, allow_nan=False) + "\n"
+
+
+def _finite(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return lines with null instead of values that are not finite, which JSON does not have."""
+    return [
+        {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in line.items()
+        }
+        for line in lines
+    ]
+
+
+def physics_page(results: Results) -> str:
+    """Return the page: a table with one line per law, then one section per law."""
+    return _HEAD + "".join(map(_line, results)) + "".join(map(_section, results)) + _LIMITS
+
+
+def _line(result: tuple[Law, CheckResult]) -> str:
+    law, outcome = result
+    worst = max(
+        outcome.findings,
+        key=_excess,
+    )
+    verdict = "holds" if all(finding.ok for finding in outcome.findings) else "**fails**"
+    return (
+        f"| [{law.name}](#{law.name}) | {law.reference} | {len(outcome.findings)} | {_error(worst)} | "
+        f"{worst.tolerance:.0e} | {verdict} |\n"
+    )
+
+
+def _section(result: tuple[Law, CheckResult]) -> str:
+    law, outcome = result
+    lines = [f"\n## {law.name}\n\n{law.statement}\n\n"]
+    lines.append("| | ours | reference | error | tolerance | |\n|---|---|---|---|---|---|\n")
+    for finding in outcome.findings:
+        ours = f"{finding.ours:.5g}" if finding.reference else _error(finding)
+        lines.append(
+            f"| {finding.case} | {ours} | {finding.reference:.5g} | {_error(finding)} | "
+            f"{finding.tolerance:.0e} | {'ok' if finding.ok else '**missed**'} |\n"
         )
-    return [known[name] for name in names.split(",")]
+    lines += [f"\n- {remark}" for remark in outcome.remarks]
+    lines += [f"\n\n![{plot.title}](results/physics/{plot.name}.png)" for plot in outcome.plots]
+    return "".join(lines).rstrip("\n") + "\n"
+
+
+def _excess(finding: Finding) -> float:
+    """Return the error, at least that of rounding, over its tolerance."""
+    if math.isnan(finding.error):
+        return math.inf
+    return max(finding.error, _rounding(finding)) / finding.tolerance
+
+
+def _rounding(finding: Finding) -> float:
+    return _DOUBLE if finding.tolerance <= 1e-8 else _SINGLE
+
+
+def _error(finding: Finding) -> str:
+    bound = _rounding(finding)
+    return f"< {bound:.0e}" if finding.error < bound else f"{finding.error:.2g}"
+
+
+def draw(plot: Plot, path: Path) -> None:
+    """Write a plot as PNG."""
+    figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    for curve, mark, line in zip(plot.curves, cycle(MARKS), cycle(_LINES), strict=False):
+        if curve.marks:
+            axes.plot(curve.x, curve.y, mark, markersize=3.5, label=curve.label)
+        else:
+            axes.plot(curve.x, curve.y, line, linewidth=1.2, label=curve.label)
+    if plot.log:
+        axes.set(xscale="log", yscale="log")
+    axes.set(xlabel=plot.x, ylabel=plot.y, title=plot.title)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    with whole(path) as partial:
+        figure.savefig(partial, dpi=100)

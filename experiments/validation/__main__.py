@@ -15,10 +15,74 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
-from experiments.validation import select_laws
-from experiments.validation.finding import CheckResult, Law, publish_physics
+from experiments.validation import CheckResult, Law, programs, publish_physics, solid
 from skin.core.files import ROOT, results
 from skin.errors import InputError
+
+LAWS = (
+    Law("patch",
+        "A uniform strain prescribed on the surface of distorted elements gives the same strain inside.",
+        "linear algebra", solid.patch_test),
+    Law("confined",
+        "Between smooth walls a uniform pressure p compresses each layer by p h / (lambda + 2 G).",
+        "closed form", solid.confined_compression),
+    Law("even", "In the middle of a wide sheet a uniform pressure p gives sigma_zz = -p at every depth.",
+        "equilibrium", solid.even_pressure),
+    Law("balance",
+        "The reactions of the support balance the applied force and moment, on a sheet and on an arm.",
+        "equilibrium", solid.global_balance),
+    Law("reciprocity", "Two loads do the same work on each other's displacements (Maxwell and Betti).",
+        "symmetry", solid.reciprocity),
+    Law("convergence", "Halving the element size divides the displacement error by four.",
+        "closed form of the bonded layer", solid.convergence),
+    Law("layer",
+        "The compliance of a thin, nearly incompressible bonded layer is correct for all wavelengths.",
+        "closed form (Aleksandrov and Vorovich)", solid.thin_layer),
+    Law("locking", "The error does not grow when nu rises from 0.45 to 0.4999.",
+        "the same closed form", solid.no_locking),
+    Law("mesh", "The default mesh gives the readings of the default skin under a square load.",
+        "sums of exact waves of both layers", solid.default_mesh),
+    Law("boussinesq", "Pressure on a thick soft block: displacement and stress below and beside the load.",
+        "Boussinesq, integrated over the square", solid.boussinesq),
+    Law("cerruti", "Tangential traction on a thick soft block: displacement and stress.",
+        "Cerruti, integrated over the square", solid.cerruti),
+    Law("hertz", "A rigid sphere on a thick block: contact radius, peak pressure and force.",
+        "Hertz", solid.hertz),
+    Law("punch", "Flat rigid punches, square and round: force for a given approach.",
+        "capacitance of a square plate (Read, 1997); Johnson, section 3.4", solid.flat_punch),
+    Law("direct", "The precomputed operator gives the same result as solving each frame.",
+        "scikit-fem alone, in the mixed form", programs.single_frames),
+    Law("arm", "A sleeve of large radius behaves like a sheet.", "the sheet", solid.wide_arm),
+    Law("tube", "A sleeve on a rigid core under uniform pressure behaves like a bonded tube of two layers.",
+        "Lame's equations", solid.sleeve),
+    Law("pynite", "simulator=fem gives the same nodal displacements as PyNite.",
+        "PyNite", programs.plates_and_beams),
+    Law("equation10",
+        "The reading of simulator=fem is D_s / D_t times the force on the footprint, and proportional to it.",
+        "PyNite and the report's equation 10", programs.equation_ten),
+    Law("naive", "The reading of simulator=naive is the pressure of one cell times the footprint area.",
+        "the report", programs.naive_readings),
+    Law("creep", "A viscoelastic skin creeps under a constant load.",
+        "creep of the standard linear solid", programs.creep),
+    Law("threads", "Results are the same on one thread and on two.",
+        "another process", programs.threads),
+)  # fmt: skip
+
+
+def select_laws(names: str) -> list[Law]:
+    """Return the laws with the given names, separated by commas, or every law for ``all``.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    laws = {law.name: law for law in LAWS}
+    if names == "all":
+        return list(LAWS)
+    if unknown := [name for name in names.split(",") if name not in laws]:
+        raise InputError(
+            f"laws must be all or some of {', '.join(laws)}, got {', '.join(unknown)}: as in laws=hertz,punch"
+        )
+    return [laws[name] for name in names.split(",")]
 
 
 def main(words: Sequence[str]) -> bool:
@@ -27,13 +91,13 @@ def main(words: Sequence[str]) -> bool:
     Raises:
         InputError: an unknown setting or law.
     """
-    settings = read_settings(words)
+    settings = validation_settings(words)
     quick, out = settings["quick"] == "true", settings["out"]
     laws = select_laws(settings["laws"])
     outcomes = []
     for law in track(laws, "checking laws", console=Console(stderr=True), disable=not sys.stderr.isatty()):
         outcomes.append((law, law.check(quick)))
-        report(*outcomes[-1])
+        print_outcome(*outcomes[-1])
     if out or settings["laws"] == "all":
         published = not quick and not out
         page = ROOT / "docs" if published else Path(out or results(None) / "quick").expanduser()
@@ -43,7 +107,7 @@ def main(words: Sequence[str]) -> bool:
     return all(finding.ok for _, outcome in outcomes for finding in outcome.findings)
 
 
-def read_settings(words: Sequence[str]) -> dict[str, str]:
+def validation_settings(words: Sequence[str]) -> dict[str, str]:
     """Return all settings from words ``name=value``.
 
     Raises:
@@ -60,7 +124,7 @@ def read_settings(words: Sequence[str]) -> dict[str, str]:
     return settings
 
 
-def report(law: Law, outcome: CheckResult) -> None:
+def print_outcome(law: Law, outcome: CheckResult) -> None:
     """Print whether a law holds, and every number that is wrong."""
     failures = [finding for finding in outcome.findings if not finding.ok]
     print(f"{law.name}: {'FAILS' if failures else 'holds'}, {len(outcome.findings)} numbers", flush=True)

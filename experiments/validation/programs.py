@@ -16,16 +16,15 @@ import scipy.sparse as sp
 import torch
 from scipy.sparse.linalg import spsolve
 
-from experiments.validation.blocks import solve_frame
-from experiments.validation.finding import CheckResult, Finding, relative_finding
-from experiments.validation.solid import skin
+from experiments.validation import CheckResult, Finding, pynite_model, relative_finding
+from experiments.validation.references import solve_frame
+from experiments.validation.solid import default_sheet
 from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.mechanics.contact.rigid import solve_contact, stabilise_checkerboard
 from skin.mechanics.relaxation import Relaxing
-from skin.mechanics.simulator import _pynite
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.plates import Structure
@@ -38,7 +37,7 @@ _FOAM: Any = {"material": {"name": "foam", "young": 40e3, "poisson": 0.2}, "thic
 
 def single_frames(quick: bool) -> CheckResult:
     """Compare the precomputed operator with a scikit-fem solution of single frames."""
-    body = skin(8 if quick else 12, 0.12)
+    body = default_sheet(8 if quick else 12, 0.12)
     place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
     mesh, extent = hexahedra(body, 2, {}), 2 * body.cell[0]
     sensors = Sensors(place[None], (extent, extent))
@@ -50,13 +49,13 @@ def single_frames(quick: bool) -> CheckResult:
         pressure = 1e4 * np.random.default_rng(seed).random(body.shape)
         ours = (inwards + shear * along) @ pressure.ravel()
         theirs = solve_frame(mesh, pressure, shear, place, extent)
-        for name, one, other in zip(
+        for name, number, reference in zip(
             ("reading, N", "D_s, m", "D_t, m"),
             ours,
             (theirs.reading, theirs.sensor, theirs.surface),
             strict=True,
         ):
-            findings.append(relative_finding(f"{name}, friction {shear:g}", one, other, 1e-8))
+            findings.append(relative_finding(f"{name}, friction {shear:g}", number, reference, 1e-8))
     return CheckResult(findings)
 
 
@@ -100,9 +99,9 @@ def equation_ten(quick: bool) -> CheckResult:
     )
 
 
-def naive(quick: bool) -> CheckResult:
+def naive_readings(quick: bool) -> CheckResult:
     """Check that readings of simulator=naive are the pressure of one cell times the footprint area."""
-    body = skin(16)
+    body = default_sheet(16)
     place = np.random.default_rng(0).uniform(0.01, 0.15, (25, 2))
     sensors = Sensors(np.column_stack([place, np.full(25, 0.005)]), (0.01, 0.01))
     pressure = np.random.default_rng(1).uniform(0, 1e5, body.shape)
@@ -143,7 +142,7 @@ def threads(quick: bool) -> CheckResult:
     """Check that operators, readings and contact pressures are the same on one thread and on two."""
     cells = "8" if quick else "16"
     with tempfile.TemporaryDirectory() as folder:
-        found = []
+        outputs = []
         for count in ("1", "2"):
             path = Path(folder) / f"{count}.npz"
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -151,31 +150,31 @@ def threads(quick: bool) -> CheckResult:
             environment = os.environ | dict.fromkeys(names, count) | {"PYTHONPATH": str(ROOT)}
             subprocess.run(command, check=True, env=environment)
             with np.load(path) as file:
-                found.append({name: file[name] for name in file.files})
+                outputs.append({name: file[name] for name in file.files})
     findings = []
     for name, tolerance in (("operator", 1e-10), ("readings", 1e-5), ("contact", 1e-5)):
-        one, two = (of[name] for of in found)
-        error = float(np.abs(one - two).max() / np.abs(one).max())
-        findings.append(Finding(name, np.abs(two).max(), np.abs(one).max(), error, tolerance))
+        single, double = (arrays[name] for arrays in outputs)
+        error = float(np.abs(single - double).max() / np.abs(single).max())
+        findings.append(Finding(name, np.abs(double).max(), np.abs(single).max(), error, tolerance))
     return CheckResult(findings)
 
 
 def _pynite_displacements(structure: Structure, pressure: np.ndarray) -> np.ndarray:
     """Return PyNite's displacements, (layers, ny + 1, nx + 1, 6), with w positive upwards."""
     try:
-        model = _pynite.model(structure, pressure)
+        model = pynite_model.model(structure, pressure)
     except ModuleNotFoundError as missing:
         raise InputError(
             "checking simulator=fem needs PyNite, which is not installed: pip install PyNiteFEA"
         ) from missing
-    _pynite.solve(model)
-    return _pynite.displacements(model, structure)
+    pynite_model.solve(model)
+    return pynite_model.displacements(model, structure)
 
 
 def write_results(threads: int, cells: int, path: str) -> None:
     """Write an operator, readings of random frames and the pressure under a sphere to an .npz file."""
     torch.set_num_threads(threads)
-    body = skin(cells)
+    body = default_sheet(cells)
     places = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))
     sensors = Sensors(np.column_stack([places, np.full(25, 0.005)]), (0.01, 0.01))
     mesh = hexahedra(body, 2, {})

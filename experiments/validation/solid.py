@@ -9,15 +9,22 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-from experiments.validation.blocks import ALL, WALLS, block, graded, held, locking, row_means, solve_block
-from experiments.validation.finding import CheckResult, Curve, Finding, Plot, relative_finding
+from experiments.validation import CheckResult, Curve, Finding, Plot, relative_finding
 from experiments.validation.references import (
+    ALL,
+    WALLS,
     HalfSpace,
-    Hertz,
+    HertzContact,
     Slab,
+    block,
     bonded_layer,
+    graded,
+    held,
+    locking,
     patch,
     round_punch,
+    row_means,
+    solve_block,
     square_punch,
 )
 from skin.body.arm import Arm
@@ -38,7 +45,7 @@ _LAYERS: Any = tuple(
 )  # fmt: skip
 
 
-def skin(cells: int = 16, size: float = 0.16) -> Sheet:
+def default_sheet(cells: int = 16, size: float = 0.16) -> Sheet:
     """Return a square sheet of the default layers."""
     return Sheet((size, size), (cells, cells), _LAYERS)
 
@@ -67,8 +74,8 @@ def patch_test(quick: bool) -> CheckResult:
         exact = (mesh.nodes @ strain).ravel()
         faces = dict.fromkeys(("left", "right", "near", "far", "base", "top"), (0, 1, 2))
         fixed = held(mesh, faces)
-        given = np.where(fixed, exact, 0)
-        moved = given + solve_block(mesh, fixed, -(mesh.stiffness() @ given)[:, None])[:, 0]
+        prescribed = np.where(fixed, exact, 0)
+        moved = prescribed + solve_block(mesh, fixed, -(mesh.stiffness() @ prescribed)[:, None])[:, 0]
         error = np.abs(moved - exact).max() / np.abs(exact).max()
         findings.append(Finding(f"motion inside, nu = {ratio}", error, 0, error, 1e-10))
         error = _stress_error(mesh, moved, strain)
@@ -99,15 +106,15 @@ def confined_compression(quick: bool) -> CheckResult:
 
 def even_pressure(quick: bool) -> CheckResult:
     """Check that far from free edges a uniform pressure p gives sigma_zz = -p at every depth."""
-    body = skin(16 if quick else 24, 0.24)
+    body = default_sheet(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
     mesh = hexahedra(body, 2, {})
     felt = Elastic(mesh).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
     return CheckResult(
         [
-            relative_finding(f"reading / p A, {1e3 * depth:g} mm deep", one, 1, 2e-3)
-            for depth, one in zip(depths, felt, strict=True)
+            relative_finding(f"reading / p A, {1e3 * depth:g} mm deep", reading, 1, 2e-3)
+            for depth, reading in zip(depths, felt, strict=True)
         ]
     )
 
@@ -121,8 +128,8 @@ def global_balance(quick: bool) -> CheckResult:
         load = sum(share * (mesh.loads(axis) @ cells) for axis, share in enumerate((0.4, -0.3, 1.0)))
         moved = Elastic(mesh).solve(load[:, None])[:, 0]
         table = np.where(mesh.held, mesh.stiffness() @ moved, 0)
-        for kind, of in (("force", _force), ("moment", _moment)):
-            applied, answered = of(mesh, load), of(mesh, table)
+        for kind, total in (("force", _force), ("moment", _moment)):
+            applied, answered = total(mesh, load), total(mesh, table)
             error = np.abs(applied + answered).max() / np.abs(applied).max()
             ours, reference = (float(np.linalg.norm(value)) for value in (answered, applied))
             findings.append(Finding(f"{kind}, {name}", ours, reference, float(error), 1e-8))
@@ -137,14 +144,14 @@ def reciprocity(quick: bool) -> CheckResult:
         random = np.random.default_rng(1).random((3, 2, body.cells[0] * body.cells[1]))
         loads = sum(mesh.loads(axis) @ random[axis].T for axis in range(3))
         moves = Elastic(mesh).solve(loads)
-        there, back = loads[:, 0] @ moves[:, 1], loads[:, 1] @ moves[:, 0]
-        findings.append(relative_finding(f"work, J, {name}", there, back, 1e-8))
+        forth, back = loads[:, 0] @ moves[:, 1], loads[:, 1] @ moves[:, 0]
+        findings.append(relative_finding(f"work, J, {name}", forth, back, 1e-8))
     return CheckResult(findings)
 
 
 def wide_arm(quick: bool) -> CheckResult:
     """Check that a sleeve approaches a sheet as its radius grows."""
-    sheet = skin(8 if quick else 16)
+    sheet = default_sheet(8 if quick else 16)
     place = np.array([[0.07, 0.09, 0.005], [0.03, 0.12, 0.003], [0.11, 0.05, 0.005]])
     lean = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8]])
     sensors = Sensors(place, (0.02, 0.02), lean)
@@ -213,7 +220,7 @@ def _rows(body: AbstractBody, sensors: Sensors) -> np.ndarray:
 
 
 def _bodies(quick: bool) -> list[tuple[str, AbstractBody]]:
-    sheet = skin(8 if quick else 16)
+    sheet = default_sheet(8 if quick else 16)
     return [("sheet", sheet), ("arm", _sleeve(0.05, sheet))]
 
 
@@ -257,21 +264,21 @@ def thin_layer(quick: bool) -> CheckResult:
     """Compare the compliance of a thin bonded layer under a pressure wave with the closed form."""
     slab = Slab(0.005, 170e3, 0.499)
     shares = np.array([2.0, 8.0]) if quick else np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
-    found, exact = [], []
+    measured, exact = [], []
     for share in shares:
         number = 2 * np.pi / (share * slab.thickness)
-        found.append(_wave(number, slab, 16, 8))
+        measured.append(_wave(number, slab, 16, 8))
         exact.append(bonded_layer(number, slab))
     findings = [
-        relative_finding(f"compliance, m/Pa, wave of {share:g} thicknesses", one, other, 0.02)
-        for share, one, other in zip(shares, found, exact, strict=True)
+        relative_finding(f"compliance, m/Pa, wave of {share:g} thicknesses", ours, reference, 0.02)
+        for share, ours, reference in zip(shares, measured, exact, strict=True)
     ]
     fine = np.geomspace(0.7, 40, 200)
     line = [bonded_layer(2 * np.pi / (share * slab.thickness), slab) for share in fine]
     picture = Plot(
         "layer", "Bonded layer, nu = 0.499, under a wave of pressure", "wavelength / thickness",
         "surface motion per pressure, m/Pa",
-        [Curve("closed form", fine, line), Curve("elements", shares, found, marks=True)], log=True,
+        [Curve("closed form", fine, line), Curve("elements", shares, measured, marks=True)], log=True,
     )  # fmt: skip
     return CheckResult(findings, (), (picture,))
 
@@ -327,9 +334,9 @@ def default_mesh(quick: bool) -> CheckResult:
     """Compare readings of the default skin under a square load with the exact layers, on several meshes."""
     meshes = ((16, 3), (32, 2)) if quick else ((16, 3), (32, 1), (32, 3), (64, 3))
     exact = _exact(200 if quick else 320)
-    remarks, found = [], {}
+    remarks, readings = [], {}
     for cells, divisions in meshes:
-        found[cells, divisions] = ours = _pressed(cells, divisions)
+        readings[cells, divisions] = ours = _pressed(cells, divisions)
         error = (ours - exact) / exact[:, :1]
         remarks.append(
             f"{cells} x {cells} cells, {divisions} rows a layer, a 40 mm square pressed: "
@@ -337,7 +344,7 @@ def default_mesh(quick: bool) -> CheckResult:
             "its middle, for sensors under its middle, 5 mm and 20 mm beside its edge"
         )
     fine = (32, 2) if quick else (32, 3)
-    ours = found[fine]
+    ours = readings[fine]
     findings = [
         relative_finding("reading under the middle / p A", ours[0, 0], exact[0, 0], 0.05),
         Finding("reading 5 mm beside / p A", ours[0, 1], exact[0, 1],
@@ -393,7 +400,7 @@ def _pressed(cells: int, divisions: int) -> np.ndarray:
 
 def _exact(count: int) -> np.ndarray:
     """Return the same by waves."""
-    found = []
+    rows = []
     for x, y in _PLACES:
         print_ = (x - 0.005, x + 0.005, y - 0.005, y + 0.005)
         point = (x - 1e-9, x + 1e-9, y - 1e-9, y + 1e-9)
@@ -401,8 +408,8 @@ def _exact(count: int) -> np.ndarray:
         size = (_SIDE, _SIDE)
         felt = -patch(SLABS, size, _LOADED, print_, depth, count)[1]
         sensor, surface = (patch(SLABS, size, _LOADED, point, z, count)[0] for z in (depth, 0.0))
-        found.append([felt, sensor, surface])
-    return np.array(found).T
+        rows.append([felt, sensor, surface])
+    return np.array(rows).T
 
 
 _YOUNG, _RATIO, _HALF = 170e3, 0.45, 0.01
@@ -483,7 +490,7 @@ def _worst(case: str, ours: np.ndarray, exact: np.ndarray) -> Finding:
 
 def hertz(quick: bool) -> CheckResult:
     """Compare contact radius, peak pressure and force of a rigid sphere with Hertz, on several meshes."""
-    sphere = Hertz(0.05, _STAR)
+    sphere = HertzContact(0.05, _STAR)
     force = 4 / 3 * _STAR * _HALF**3 / 0.05  # for which Hertz' contact has the radius of _HALF
     findings: list[Finding] = []
     remarks, curves = [], []
@@ -499,8 +506,8 @@ def hertz(quick: bool) -> CheckResult:
         ]
         remarks.append(_refined(count, findings))
         near = square < (1.4 * _HALF) ** 2
-        distance, shown = 1e3 * np.sqrt(square[near]), pressure[near] / 1e3
-        curves.append(Curve(f"{count} cells a radius", distance, shown, marks=True))
+        distance, height = 1e3 * np.sqrt(square[near]), pressure[near] / 1e3
+        curves.append(Curve(f"{count} cells a radius", distance, height, marks=True))
     r = np.linspace(0, 1.4, 200)
     exact = sphere.peak(force) * np.sqrt(np.clip(1 - r**2, 0, None))
     curves.append(Curve("Hertz", 1e3 * _HALF * r, exact / 1e3))
@@ -530,7 +537,7 @@ def flat_punch(quick: bool) -> CheckResult:
 
 def _refined(count: int, findings: list[Finding]) -> str:
     """Return a remark with the errors on one mesh."""
-    errors = (f"{100 * (one.ours / one.reference - 1):+.1f} %" for one in findings)
+    errors = (f"{100 * (finding.ours / finding.reference - 1):+.1f} %" for finding in findings)
     return f"with {count} cells over 10 mm: {', '.join(errors)}"
 
 
@@ -569,12 +576,12 @@ class _Ground:
     def press(self, gap: np.ndarray, force: float) -> tuple[np.ndarray, float]:
         """Return the pressure (cells,), Pa, of an object on the quarter, and its approach, m."""
         area = (_HALF / self.count) ** 2
-        found = press(
+        contact = press(
             self.compliance, torch.from_numpy(gap)[None], torch.tensor([force / area]), tolerance=1e-6,
             iterations=1000,
         )  # fmt: skip
-        pressure = found.pressure[0].numpy()
-        if float(found.residual[0]) > 1e-6:
+        pressure = contact.pressure[0].numpy()
+        if float(contact.residual[0]) > 1e-6:
             return pressure * np.nan, np.nan
         under = pressure > 0
         return pressure, float(np.mean((self.compliance.numpy() @ pressure + gap)[under]))

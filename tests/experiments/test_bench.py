@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from experiments.benchmarks.__main__ import benchmarks, main, run_alone
+from experiments import benchmarks as module
+from experiments.benchmarks import benchmarks, main, run_alone
 from skin.core.files import ROOT
 from skin.errors import InputError
 
@@ -13,7 +14,7 @@ from skin.errors import InputError
 def test_generation_reports_rates_and_its_own_memory():
     # 400 MB in this process must not count in the one that is measured.
     ballast = bytearray(400_000_000)
-    figures = run_alone("training", "measure_generation", ["naive", 1])
+    figures = run_alone("measure_generation", ["naive", 1])
     assert set(figures) == {"gestures_per_second", "frames_per_second", "peak_memory_bytes"}
     # a gesture shows between one frame (static) and twenty (the longest slide)
     assert 1 < figures["frames_per_second"] / figures["gestures_per_second"] < 20
@@ -24,7 +25,7 @@ def test_generation_reports_rates_and_its_own_memory():
 @pytest.mark.slow
 def test_building_starts_cold_each_time(tmp_path, monkeypatch):
     monkeypatch.setenv("SKIN_CACHE", str(tmp_path))
-    figures = run_alone("training", "measure_operator", ["fem", 1])
+    figures = run_alone("measure_operator", ["fem", 1])
     # a warm operator is there in a hundredth of that
     assert figures["build_seconds"] > 0.02
     assert figures["layout_seconds"] > 0
@@ -35,7 +36,7 @@ def test_building_starts_cold_each_time(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("function", ["measure_latency", "measure_onnx_latency"])
 def test_a_verdict_is_timed_by_the_wall_and_by_the_core(function):
-    figures = run_alone("live", function, ["best_fresh", 30])
+    figures = run_alone(function, ["best_fresh", 30])
     assert set(figures) == {"p50_ms", "p99_ms", "core_ms", "core_share", "memory_mb"}
     assert 0 < figures["p50_ms"] <= figures["p99_ms"]
 
@@ -58,15 +59,12 @@ def test_another_checkout_is_measured_in_the_same_run(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_epochs_of_a_row_are_timed():
-    assert run_alone("training", "measure_training", ["temporal_graph", 1])["seconds_per_epoch"] > 0
+    assert run_alone("measure_training", ["temporal_graph", 1])["seconds_per_epoch"] > 0
 
 
 def test_every_benchmark_is_a_function():
-    import experiments.benchmarks.live as live
-    import experiments.benchmarks.training as training
-
-    for module, function, _ in benchmarks(3).values():
-        assert callable(getattr({"live": live, "training": training}[module], function))
+    for function, _ in benchmarks(3).values():
+        assert callable(getattr(module, function))
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from experiments.studies.comparison import Paired, Uncertainty, combine_verdicts, estimate, paired, verdict
+from experiments.studies.comparison import (
+    Paired,
+    Uncertainty,
+    combine_verdicts,
+    estimate,
+    judge_claim,
+    paired,
+)
 
 
 def test_a_paired_difference_is_that_of_the_paired_t_test():
@@ -59,12 +66,12 @@ def test_one_seed_has_no_known_error_and_none_no_difference():
     ],
 )
 def test_a_verdict_needs_the_margin_as_room(claim, by, mean, error, said):
-    assert verdict(claim, Paired(mean, error / 2, 2 * error, 3), by) == said
+    assert judge_claim(claim, Paired(mean, error / 2, 2 * error, 3), by) == said
 
 
 def test_two_seeds_decide_nothing():
-    assert verdict("greater", Paired(50.0, 0.1, 0.4, 2)) == "undecided"
-    assert verdict("greater", None) == "undecided"
+    assert judge_claim("greater", Paired(50.0, 0.1, 0.4, 2)) == "undecided"
+    assert judge_claim("greater", None) == "undecided"
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from experiments.studies.embedding_page import embedding_statements, embeddings_table, planes, spaces
-from experiments.studies.embeddings import FRAME, ProbeResult, Space
+from experiments.studies.embeddings import (
+    FRAME,
+    ProbeResult,
+    Space,
+    embedding_statements,
+    embeddings_table,
+    planes,
+    spaces,
+)
 
 NAMES = ("big", "press")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.studies.embeddings import FRAME, accuracy, explained, probe, strongest
+from experiments.studies.embeddings import FRAME, explained, probe, strongest, svm_accuracy
 from experiments.studies.measures import ProbeSettings
 from skin.device.touches import Touches
 from skin.runs.build import build_device
@@ -22,9 +22,9 @@ def found(configured):
 def test_an_svm_reads_what_is_there_and_no_more():
     generator = np.random.default_rng(0)
     vectors, chance = generator.standard_normal((400, 4)), generator.integers(0, 2, 400)
-    assert accuracy(vectors, (vectors[:, 0] ** 2 + vectors[:, 1] ** 2 > 1.4).astype(int), 300) > 0.85
-    assert abs(accuracy(vectors, chance, 300) - 0.5) < 0.15  # three standard errors
-    assert np.isnan(accuracy(vectors, np.zeros(400, dtype=int), 300))
+    assert svm_accuracy(vectors, (vectors[:, 0] ** 2 + vectors[:, 1] ** 2 > 1.4).astype(int), 300) > 0.85
+    assert abs(svm_accuracy(vectors, chance, 300) - 0.5) < 0.15  # three standard errors
+    assert np.isnan(svm_accuracy(vectors, np.zeros(400, dtype=int), 300))
 
 
 def test_explained_variance_of_known_vectors():

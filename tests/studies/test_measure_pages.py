@@ -6,8 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from experiments.studies.measure_pages import streams_page, streams_summary
-from experiments.studies.tables import publish_page
+from experiments.studies.pages import publish_page, streams_page, streams_summary
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.streams import Alarms, Bin, WindowReport
 

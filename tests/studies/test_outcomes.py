@@ -2,9 +2,9 @@
 
 import pytest
 
-from experiments.studies.outcomes import conclusions, differences, values
+from experiments.studies.comparison import conclusions, differences, values
 from experiments.studies.study import Statement, Study, Variant
-from experiments.studies.trials import Trial
+from experiments.studies.trials import TrialResult
 
 ACCURACY = "same/overall/accuracy"
 
@@ -13,7 +13,7 @@ def trials(pooling, *accuracies, seconds=1.0, condition="", device=""):
     """Return the trials of a variant whose runs, of seeds 0, 1, ..., have these accuracies."""
     variant = Variant(f"pooling={pooling}", {"model.pooling": pooling, "experiment": "x"}, {})
     return [
-        Trial(
+        TrialResult(
             variant,
             str(seed),
             condition,
@@ -103,9 +103,9 @@ def test_conditions_are_compared_over_devices_of_several_trainings():
     (one,) = differences(
         study(devices=3, conditions={"0 dead": {}, "1 dead": {}}, differences="greater"), found
     )
-    assert (one.condition, one.verdict, one.found.seeds) == ("1 dead", "worse", 3)
+    assert (one.condition, one.verdict, one.compared.seeds) == ("1 dead", "worse", 3)
     # losses 2, 3 and 4: mean 3, deviation 1, by the root of 3
-    assert (one.found.mean, one.found.error) == (pytest.approx(-3), pytest.approx(3**-0.5))
+    assert (one.compared.mean, one.compared.error) == (pytest.approx(-3), pytest.approx(3**-0.5))
 
 
 def test_variants_are_compared_with_the_first_one_where_there_are_no_conditions():

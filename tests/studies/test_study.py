@@ -6,7 +6,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from experiments import peers
-from experiments.studies.comparison import Paired, verdict
+from experiments.studies.comparison import Paired, judge_claim
 from experiments.studies.study import chosen_studies, variants
 from experiments.studies.study_page import read_reference
 from skin.core.files import CONF
@@ -64,7 +64,7 @@ def test_a_study_composes_and_says_what_it_is_about(composed, name, part):
     assert set(study.metrics) <= known or study.measure is not None  # which may have metrics of its own
     for said in study.statements:
         assert set(said.metric.split(" - ")) <= known
-        assert verdict(said.claim, Paired(0.0, 1e9, 4e9, 3), said.by) == "undecided"
+        assert judge_claim(said.claim, Paired(0.0, 1e9, 4e9, 3), said.by) == "undecided"
         assert said.by > 0 or said.claim in ("greater", "less")
         assert bool(said.others) != (said.level is not None)
         lines = [

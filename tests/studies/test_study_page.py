@@ -9,18 +9,17 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from experiments.studies.comparison import Paired
-from experiments.studies.figures import study_figure
-from experiments.studies.outcomes import StatementResult
+from experiments.studies.comparison import Paired, StatementResult
 from experiments.studies.study import Statement, Study, Variant
 from experiments.studies.study_page import (
     comparison_text,
     publish_files,
     publish_study,
     read_reference,
+    study_figure,
     variants_table,
 )
-from experiments.studies.trials import Trial
+from experiments.studies.trials import TrialResult
 from skin.errors import InputError
 
 LABELS = ("overall", "big", "dynamic", "press", "dangerous")
@@ -41,7 +40,7 @@ def trial(name, seed, accuracy, share=None, **more):
         metrics |= {"same/dangerous/alarm_recall": 0.25, "same/dangerous/false_alarm_rate": 0.02}
         metrics |= {"seconds_per_epoch": 1.5, "parameters": 105621.0}
         metrics |= {} if share is None else {"self_share": share}
-    return Trial(
+    return TrialResult(
         variant, seed, more.get("condition", ""), more.get("device", ""), "abc" if metrics else "", metrics
     )
 

@@ -12,7 +12,7 @@ import pytest
 from experiments.studies import trials
 from experiments.studies.measures import Margins
 from experiments.studies.study import Study, Variant
-from experiments.studies.trials import RestoredRun, Trial, numbered_settings, read_row, votes, write_row
+from experiments.studies.trials import RestoredRun, TrialResult, numbered_settings, read_row, votes, write_row
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
 from skin.runs.finished_run import find_pretrained
@@ -136,7 +136,7 @@ def test_a_row_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path):
 
 def trial(model, seed, outcomes, **chosen):
     codes = None if outcomes is None else np.array(outcomes, dtype=np.uint8)
-    return Trial(
+    return TrialResult(
         Variant(model, {"experiment": model, **chosen}, {}), seed, "", "", f"run_{model}", {}, outcomes=codes
     )
 

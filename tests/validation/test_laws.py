@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from experiments.validation import LAWS
-from experiments.validation.__main__ import main
+from experiments.validation.__main__ import LAWS, main
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra

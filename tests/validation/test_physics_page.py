@@ -6,18 +6,18 @@ import re
 
 import pytest
 
-from experiments.validation import LAWS, select_laws
-from experiments.validation.finding import (
+from experiments.validation import (
     CheckResult,
     Curve,
     Finding,
     Law,
     Plot,
     as_json,
-    page,
+    physics_page,
     publish_physics,
     relative_finding,
 )
+from experiments.validation.__main__ import LAWS, select_laws
 from skin.core.files import ROOT
 from skin.errors import InputError
 
@@ -56,7 +56,7 @@ def test_a_miss_is_written_as_one(tmp_path):
         "law": "gravity", "case": "this", "ours": 1.2, "reference": 1.0,
         "error": pytest.approx(0.2), "tolerance": 0.1, "ok": False,
     }  # fmt: skip
-    assert "nan" in page([(LAW, CheckResult([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
+    assert "nan" in physics_page([(LAW, CheckResult([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
     assert "NaN" not in as_json([(LAW, CheckResult([Finding("lost", math.nan, 1, math.nan, 0.1)]))])
 
 
@@ -68,7 +68,9 @@ def test_the_page_is_the_same_where_rounding_differs():
         single = relative_finding("single", 66867.31 * (1 + 1e-7 * noise), 66867.31, 1e-6)
         nothing = relative_finding("nothing", 1e-14 * noise, 0.0, 1e-10)
         real = relative_finding("real", 0.98361523 * (1 + 1e-9 * noise), 0.98768812, 0.05)
-        return page([(LAW, CheckResult(found)) for found in ([exact, nothing], [exact, single], [real])])
+        return physics_page(
+            [(LAW, CheckResult(found)) for found in ([exact, nothing], [exact, single], [real])]
+        )
 
     text = written(0.0)
     assert all(written(noise) == text for noise in (-3.1, -1.0, 0.4, 1.7, 3.0))

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from experiments.validation.references import (
     SQUARE_PUNCH,
     HalfSpace,
-    Hertz,
+    HertzContact,
     Slab,
     bonded_layer,
     patch,
@@ -125,7 +125,7 @@ def test_half_spaces_are_in_equilibrium(kind):
 
 
 def test_hertz_agrees_with_itself():
-    sphere, approach = Hertz(0.05, 2e5), 1e-3
+    sphere, approach = HertzContact(0.05, 2e5), 1e-3
     force = sphere.force(approach)
     assert sphere.contact(force) == pytest.approx(np.sqrt(0.05 * approach), rel=1e-12)
     assert sphere.peak(force) == pytest.approx(2 * 2e5 / np.pi * np.sqrt(approach / 0.05), rel=1e-12)

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from experiments.benchmarks.live import measure_decoder
+from experiments.benchmarks import measure_decoder
 from tests.hardware.wire import faulty_wire
 
 pytestmark = pytest.mark.slow

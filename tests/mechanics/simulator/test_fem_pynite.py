@@ -6,9 +6,9 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
+from experiments.validation import pynite_model
 from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
-from skin.mechanics.simulator import _pynite
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.plates import Structure
 
@@ -36,9 +36,9 @@ def load(body: Sheet, kind: str) -> np.ndarray:
 
 
 def solved(structure: Structure, pressure: np.ndarray):
-    model = _pynite.model(structure, pressure)
-    _pynite.solve(model)
-    return model, _pynite.displacements(model, structure)
+    model = pynite_model.model(structure, pressure)
+    pynite_model.solve(model)
+    return model, pynite_model.displacements(model, structure)
 
 
 # Every body with either constraint and with either load, and every constraint with either load.

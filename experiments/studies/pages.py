@@ -1,18 +1,140 @@
-"""Pages of the measures of single runs: errors by margin, and windows of streams."""
+"""Pages: tables and panels of lines, and the pages of the measures of single runs."""
 
+import csv
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import cycle
+from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich import table as terminal
+from rich.console import Console
+from rich.markup import escape
 from torch import Tensor
 
-from experiments.studies.figures import Panel, draw_panels
-from experiments.studies.tables import Page
+from skin.core.files import write
 from skin.evaluation.margins import ALARM_NAME, Faint, MarginReport, Span
 from skin.evaluation.streams import WindowReport
+from skin.plot.figures import COLOURS, MARKS, save_figure
 from skin.touch.labels import OPPOSITE, TOUCH
+
+Table = Sequence[Sequence[str]]
+
+_WIDEST = 250  # characters, more than the table of the report needs
+
+
+@dataclass(frozen=True)
+class Page:
+    """What is published of a measurement.
+
+    Attributes:
+        about: what matters most, for a person.
+        tables: heading -> table.
+        data: every figure, as the table of the CSV file; empty: there is no such file.
+        figure: of the most important ones; None: there is none.
+    """
+
+    about: str
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    data: Sequence[Sequence[object]] = ()
+    figure: Figure | None = None
+
+
+def publish_page(page: Page, title: str, path: Path) -> list[Path]:
+    """Write ``path`` with the endings .md, .csv and .png, each whole, and return their paths."""
+    sections = [f"#{markdown(table, heading)}" for heading, table in page.tables.items()]
+    parts = [f"# {title}\n", *([f"{page.about}\n"] if page.about else []), *sections]
+    paths = [write("\n".join(parts), path.with_name(f"{path.name}.md"))]
+    paths += [write(csv_text(page.data), path.with_name(f"{path.name}.csv"))] if page.data else []
+    return paths + ([save_figure(page.figure, path.with_name(f"{path.name}.png"))] if page.figure else [])
+
+
+def csv_text(table: Iterable[Sequence[object]]) -> str:
+    """Return a table as CSV."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(table)
+    return buffer.getvalue()
+
+
+def markdown(table: Table, title: str) -> str:
+    """Return a table as Markdown, below its title."""
+    lines = ["| " + " | ".join(line) + " |" for line in table]
+    return "\n".join([f"# {title}", "", lines[0], "|" + "---|" * len(table[0]), *lines[1:]]) + "\n"
+
+
+def print_table(
+    table: Table, title: str, console: Console | None = None, wrapped: Sequence[str] = ()
+) -> None:
+    """Print a table, all numbers whole, however narrow the terminal is.
+
+    Args:
+        table: the head first.
+        title: of it.
+        console: where to print; None takes standard output.
+        wrapped: the columns that may be broken into lines.
+    """
+    console = console or Console()
+    printed = terminal.Table(title=escape(title), box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in table[0]:
+        printed.add_column(escape(name), no_wrap=name not in wrapped)
+    for line in table[1:]:
+        printed.add_row(*map(escape, line))
+    if not set(wrapped) & set(table[0]):
+        # A number cut short would be another number: rather let a narrow terminal wrap.
+        needed = console.measure(printed, options=console.options.update(width=_WIDEST)).maximum
+        console.width = max(console.width, needed)
+    console.print(printed)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines with the same axes.
+
+    Attributes:
+        across: label of the axis across.
+        up: label of the axis up.
+        lines: name -> rows of x and y, and of the ends of their intervals where there are some, (2 or 4, N).
+        title: of the panel.
+        ticks: labels of x = 0, 1, ...; none: x is a number on a logarithmic axis.
+        limits: of x, a ratio to a threshold.
+    """
+
+    across: str
+    up: str
+    lines: Mapping[str, np.ndarray]
+    title: str = ""
+    ticks: Sequence[str] = ()
+    limits: tuple[float, float] | None = None
+
+
+def draw_panels(title: str, panels: Sequence[Panel]) -> Figure:
+    """Draw panels side by side, under a title."""
+    figure = Figure(figsize=(max(7, 4.5 * len(panels)), 4), layout="constrained")
+    figure.suptitle(title, fontsize=9, wrap=True)
+    for panel, axis in zip(panels, figure.subplots(ncols=len(panels), squeeze=False)[0], strict=True):
+        lines = {name: line for name, line in panel.lines.items() if len(line)}
+        for (name, line), colour, marker in zip(lines.items(), cycle(COLOURS), cycle(MARKS), strict=False):
+            x, y, *ends = line
+            spread = (y - ends[0], ends[1] - y) if ends else None
+            axis.errorbar(x, y, spread, label=name, color=colour, marker=marker, ms=4, lw=1, capsize=2)
+        if panel.ticks:
+            axis.set_xticks(range(len(panel.ticks)), panel.ticks, fontsize=7)
+            axis.set_ylim(bottom=0)
+        else:
+            numbers = sorted({x for line in lines.values() for x in line[0]})
+            numbers = [0.5, 0.8, 1, 1.25, 2] if panel.limits else numbers
+            axis.set_xscale("log")
+            axis.set_xticks(numbers, [f"{number:g}" for number in numbers], fontsize=7)
+            axis.set_xticks([], minor=True)
+        axis.set(title=panel.title, xlabel=panel.across, ylabel=panel.up, xlim=panel.limits)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    return figure
+
 
 _MEASURES = {
     "big": "area",

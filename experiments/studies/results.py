@@ -29,7 +29,7 @@ _FRESH = {"uri": "sqlite:///results/fresh.db", "artifacts": "results/fresh"}  # 
 
 
 @dataclass(frozen=True)
-class Step:
+class ResultStep:
     """A command of a part.
 
     Attributes:
@@ -42,7 +42,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Results:
+class PublishedResults:
     """The settings of ``conf/results.yaml``.
 
     Raises:
@@ -60,24 +60,24 @@ class Results:
     def __post_init__(self) -> None:
         for name, steps in self.parts.items():
             for number, step in enumerate(steps):
-                check_settings(Step, dict(step), f"results.parts.{name}[{number}]")
+                check_settings(ResultStep, dict(step), f"results.parts.{name}[{number}]")
         if self.part not in ("all", *self.parts):
             raise InputError(f"results.part={self.part} is none of all, {', '.join(self.parts)}")
         if unknown := set(self.optional) - set(self.parts):
             raise InputError(f"results.optional={[*self.optional]}: there is no part {', '.join(unknown)}")
 
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[ResultStep]:
         """Return the commands of the chosen part, or of all that are not optional."""
         every = [name for name in self.parts if name not in self.optional]
         chosen = every if self.part == "all" else [self.part]
-        return [Step(**step) for name in chosen for step in self.parts[name]]
+        return [ResultStep(**step) for name in chosen for step in self.parts[name]]
 
 
 @command("results")
 def main(config: DictConfig) -> None:
     """Publish; exit code 1 if a command failed."""
     settings = plain(config)["results"]
-    chosen = configured(Results, settings, "results")
+    chosen = configured(PublishedResults, settings, "results")
 
     from skin.core.messages import quiet
 
@@ -85,7 +85,7 @@ def main(config: DictConfig) -> None:
     sys.exit(_publish(chosen, config))
 
 
-def _publish(chosen: Results, config: DictConfig) -> int:
+def _publish(chosen: PublishedResults, config: DictConfig) -> int:
     """Run the commands of a part; return 1 if one failed."""
     from skin.runs.progress import SweepProgress, format_duration
 
@@ -94,8 +94,8 @@ def _publish(chosen: Results, config: DictConfig) -> int:
     progress = SweepProgress([3600 * hours if full else None for hours, _ in lines])
     for number, (hours, line) in enumerate(lines):
         left = progress.left()
-        rest = "" if left is None else f", about {format_duration(left)} left"
-        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{rest}", flush=True)
+        estimate = "" if left is None else f", about {format_duration(left)} left"
+        print(f"== [{number + 1}/{len(lines)}] skin {join(line)}{estimate}", flush=True)
         began = time.monotonic()
         if _fails(line):
             failed.append(f"skin {join(line)}")
@@ -109,7 +109,7 @@ def _publish(chosen: Results, config: DictConfig) -> int:
 
 def _fails(line: Sequence[str]) -> bool:
     """Run a command and return whether it failed; a crash is reported, and must not stop the others."""
-    from experiments.studies.runs import run_command
+    from experiments.studies.trials import run_command
     from skin import __main__ as cli
 
     try:
@@ -119,10 +119,10 @@ def _fails(line: Sequence[str]) -> bool:
         return True
 
 
-def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[str]]]:
+def _lines(chosen: PublishedResults, config: DictConfig) -> Iterator[tuple[float, list[str]]]:
     """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
     smoke = chosen.budget == "smoke"
-    given = [one for one in overrides() if one.split("=")[0].split(".")[0] not in ("results", "out")]
+    passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
     for step in chosen.steps():
         verb, *words = split(step.run)
         if smoke and _PEERS in words and not peers.python().is_file():
@@ -145,7 +145,7 @@ def _lines(chosen: Results, config: DictConfig) -> Iterator[tuple[float, list[st
             yield step.hours, [verb, *_within(folder, words)]
             continue
         words += [f"out={folder}"] if verb == "study" else []
-        yield step.hours, [verb, *words, *given]
+        yield step.hours, [verb, *words, *passed]
 
 
 def _within(folder: Path, words: Sequence[str]) -> list[str]:
@@ -153,7 +153,7 @@ def _within(folder: Path, words: Sequence[str]) -> list[str]:
     return [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
 
 
-def _folder(chosen: Results, config: DictConfig) -> Path:
+def _folder(chosen: PublishedResults, config: DictConfig) -> Path:
     """Return the folder of the published files; smoke budgets are published in a folder in it."""
     from skin.core.files import results
 

@@ -1,0 +1,386 @@
+"""Measure speed and memory.
+
+    python -m experiments.benchmarks repeats=3 out=results
+    python -m experiments.benchmarks only=live.onnx,wire against=../other
+
+Writes bench.json into ``out``. With ``against=`` every figure is also measured with the package ``skin`` of
+that checkout, in turns, and ``ratios`` has what this checkout measures over what the other does.
+"""
+
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from skin.body.layout.random import Random
+from skin.core.files import CONF, ROOT, results, write
+from skin.core.messages import quiet
+from skin.device.base import AbstractSimulated
+from skin.device.resampling import Frame
+from skin.errors import InputError
+from skin.hardware.live.engine import Detection, Engine
+from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.decoder import Decoder
+from skin.hardware.wire.protocol import encode_line
+from skin.learning.data import TouchData
+from skin.learning.learner.network import Network
+from skin.runs.build import build_data, build_device, build_learner
+from skin.runs.configuration import validate_config
+from skin.runs.model_of_run import RunModel, window_classifier
+
+Figures = dict[str, float]
+Benchmark = tuple[str, tuple[object, ...]]
+"""Function of this module and its arguments."""
+
+ROWS = ("temporal_graph", "temporal_image", "sequence_graph", "sequence_image")
+"""Rows whose epochs are timed."""
+
+_FRAMES = 1000  # of which each is classified
+_PACKAGES = ("torch", "pytorch-lightning", "numpy", "scipy", "scikit-fem")
+_ALONE = (
+    "import json, sys; from experiments import benchmarks; "
+    "print(json.dumps(getattr(benchmarks, sys.argv[1])(*json.loads(sys.argv[2]))))"
+)
+_DEFAULTS = {"repeats": "3", "out": "results", "only": "", "against": ""}
+
+
+def benchmarks(repeats: int) -> dict[str, Benchmark]:
+    """Return all benchmarks by name."""
+    chosen: dict[str, Benchmark] = {}
+    for name in ("naive", "fem", "solid"):
+        chosen[f"generation.{name}"] = ("measure_generation", (name, repeats))
+    for name in ("fem", "solid"):
+        chosen[f"operator.{name}"] = ("measure_operator", (name, repeats))
+    for row in (*ROWS, "any_skin"):
+        chosen[f"training.{row}"] = ("measure_training", (row, repeats))
+    for row in ("best_fresh", "any_skin"):
+        chosen[f"live.{row}"] = ("measure_latency", (row, _FRAMES))
+    chosen["live.onnx"] = ("measure_onnx_latency", ("best_fresh", _FRAMES))
+    return chosen | {"wire": ("measure_decoder", ())}
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the benchmarks and write their figures.
+
+    Raises:
+        InputError: an unknown setting, benchmark or checkout.
+    """
+    settings = benchmark_settings(arguments)
+    choice = benchmarks(int(settings["repeats"]))
+    names = [name for name in settings["only"].split(",") if name] or list(choice)
+    if unknown := [name for name in names if name not in choice]:
+        raise InputError(f"only={','.join(unknown)} is none of {', '.join(choice)}")
+    about = {"repeats": int(settings["repeats"]), "machine": machine(), "versions": versions(_PACKAGES)}
+    measured: dict[str, Any] = about
+    for name in names:
+        print(name, file=sys.stderr)
+        measured[name] = run_alone(*choice[name])
+        if settings["against"]:
+            baseline = run_alone(*choice[name], checkout=Path(settings["against"]))
+            ratios = {key: value / baseline[key] for key, value in measured[name].items() if baseline[key]}
+            measured[name] = {"here": measured[name], "there": baseline, "ratios": ratios}
+    text = json.dumps(measured, indent=2)
+    write(text + "\n", results(settings["out"]) / "bench.json")
+    print(text)
+
+
+def benchmark_settings(arguments: Sequence[str]) -> dict[str, str]:
+    """Return all settings from words ``name=value``.
+
+    Raises:
+        InputError: an unknown name or a bad value.
+    """
+    settings = dict(_DEFAULTS)
+    for word in arguments:
+        name, _, value = word.partition("=")
+        if name not in settings or not value:
+            raise InputError(f"{word} is no setting: give some of {', '.join(f'{key}=' for key in settings)}")
+        settings[name] = value
+    if not settings["repeats"].isdecimal() or int(settings["repeats"]) < 3:
+        raise InputError(
+            f"repeats={settings['repeats']} must be a number of at least 3: medians are returned"
+        )
+    if settings["against"] and not (Path(settings["against"]) / "skin").is_dir():
+        raise InputError(
+            f"against={settings['against']} has no folder skin: give another checkout of this project"
+        )
+    return settings
+
+
+def run_alone(function: str, arguments: Sequence[object], checkout: Path = ROOT) -> Figures:
+    """Run a benchmark in its own process, so that its peak memory and its threads are its own.
+
+    Args:
+        function, arguments: of this module.
+        checkout: folder of the package ``skin`` that is measured.
+    """
+    with TemporaryDirectory() as folder:
+        # These benchmarks, and not those of the other checkout.
+        (Path(folder) / "experiments").symlink_to(ROOT / "experiments")
+        paths = os.pathsep.join([folder, str(checkout.resolve())])
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", _ALONE, function, json.dumps(arguments)],
+            env=os.environ | {"PYTHONPATH": paths},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
+    return json.loads(done.stdout)
+
+
+def training_config(*overrides: str) -> DictConfig:
+    """Return the configuration of a training with overrides."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return validate_config(compose("train", list(overrides)))
+
+
+def median_seconds(task: Callable[[], object], repeats: int) -> float:
+    """Return the median duration of a task, s, after one warm-up call."""
+    task()
+    taken = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        task()
+        taken.append(time.perf_counter() - began)
+    return median(taken)
+
+
+def peak_memory() -> int:
+    """Return the peak resident memory of this process, bytes.
+
+    On Linux ru_maxrss is inherited from the parent process; VmHWM is that of this process.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Return the versions of the installed packages among the given ones."""
+    installed = {}
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            installed[name] = version(name)
+    return installed
+
+
+def machine() -> str:
+    """Return a description of the machine."""
+    return f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}"
+
+
+def _processor() -> str:
+    """Return the name of the processor, if known."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+GESTURES = 4038
+_SKINS = 20  # of the 200 of any_skin: a batch mixes skins in the same way
+_SKIN_GESTURES = 8000  # a fifth of those of any_skin
+
+
+def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
+    """Return gestures per second (median), distinct frames per second and peak memory, bytes.
+
+    The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
+    readings, imperfections.
+    """
+    config = training_config(f"simulator={simulator}", f"data.gestures={GESTURES}")
+    device = build_device(config).simulated("gestures are generated")
+    durations = []
+    for seed in range(repeats + 1):
+        began = time.perf_counter()
+        device.replace(data_seed=seed).touches("train")
+        durations.append(time.perf_counter() - began)
+    speed = GESTURES / median(durations[1:])
+    movie = device.sampler.sample(1024, np.random.default_rng(0))
+    return {
+        "gestures_per_second": speed,
+        "frames_per_second": speed * len(movie.frames) / len(movie),
+        "peak_memory_bytes": peak_memory(),
+    }
+
+
+def measure_operator(simulator: str, repeats: int) -> dict[str, float]:
+    """Return the seconds (medians) to build an operator, and the peak memory, bytes.
+
+    ``build_seconds``: of the default skin, with nothing cached. ``layout_seconds``: of a layout that was not
+    seen before, on a body that was.
+    """
+    config = training_config(f"simulator={simulator}")
+    body, make = instantiate(config.body), instantiate(config.simulator)
+    sensors = instantiate(config.layout).sensors(body)
+    unseen = iter([Random(seed=seed).sensors(body) for seed in range(repeats + 1)])
+
+    def build() -> None:
+        with TemporaryDirectory() as empty:
+            os.environ["SKIN_CACHE"] = empty
+            make(body, sensors)
+
+    build_seconds = median_seconds(build, repeats)
+    with TemporaryDirectory() as warm:
+        os.environ["SKIN_CACHE"] = warm
+        make(body, sensors)
+        layout_seconds = median_seconds(lambda: make(body, next(unseen)), repeats)
+    return {
+        "build_seconds": build_seconds,
+        "layout_seconds": layout_seconds,
+        "peak_memory_bytes": peak_memory(),
+    }
+
+
+def measure_training(row: str, repeats: int) -> dict[str, float]:
+    """Return the median seconds per epoch of a row, on 4038 finite-element gestures (any_skin: its own)."""
+    quiet()
+    settings, share = ["simulator=fem"], 1.0
+    if row == "any_skin":
+        settings = ["simulator=solid", f"device.count={_SKINS}", f"data.gestures={_SKIN_GESTURES}"]
+        share = training_config("experiment=any_skin").data.gestures / _SKIN_GESTURES
+    config = training_config(f"experiment={row}", *settings, f"trainer.max_epochs={repeats + 1}")
+    learner = build_learner(config)
+    assert isinstance(learner, Network)
+    learner.fit(build_data(config, build_device(config)))
+    return {"seconds_per_epoch": share * learner.seconds_per_epoch}
+
+
+RATE = 100.0  # Hz, of the device
+_SENSORS = 25
+_PIECE = 512  # bytes that a port gives at a time
+# Where a row is not measured on the default skin: the largest of its distribution.
+_SETTINGS = {"any_skin": ("device=simulated", "simulator=solid", "layout=random", "layout.count=64")}
+_WARM = 50  # verdicts that are not counted
+_TOUCH = 0.3  # N
+
+
+def measure_decoder(rate: float = 1000.0, frames: int = 20_000) -> dict[str, float]:
+    """Return the share of one core that decoding 25 channels at ``rate`` Hz takes."""
+    values = [
+        [(number * (7 + channel) + 31 * channel) % 1024 for channel in range(_SENSORS)]
+        for number in range(frames)
+    ]
+    data = b"".join(
+        encode_line(line, number, round(1e6 * number / rate)) for number, line in enumerate(values)
+    )
+    decoder, decoded, began = Decoder(_SENSORS), 0, time.process_time()
+    for start in range(0, len(data), _PIECE):
+        decoded += len(decoder.feed(data[start : start + _PIECE], start / len(data) * frames / rate))
+    assert decoded == frames
+    return {"decode_core_share": (time.process_time() - began) / frames * rate}
+
+
+def measure_latency(row: str, frames: int) -> dict[str, float]:
+    """Return the time from a frame at 100 Hz to the verdict on it, ms: median and the 99th percentile.
+
+    One thread classifies every frame of a simulated stream of touches. ``core_ms`` is the 99th percentile of
+    the processor time, which excludes other processes; ``memory_mb`` is that of the process at its end.
+
+    Args:
+        row: of the table, untrained, because speed does not depend on the weights.
+        frames: number of classified frames.
+    """
+    torch.set_num_threads(1)
+    device, learner, data = _untrained(row)
+    positions = data.example.positions
+    classify = window_classifier(learner, positions, device.model_rate)
+    engine = Engine(
+        classify, device.task, len(positions), device.window, device.model_rate, Detection(_TOUCH)
+    )
+    return _time_verdicts(device, engine, frames)
+
+
+def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
+    """Return the times of :func:`measure_latency` for the exported row, without torch in the engine."""
+    from skin.runs.exported.model import ExportedModel
+    from skin.runs.exported.writer import write_model
+
+    torch.set_num_threads(1)
+    device, learner, data = _untrained(row)
+    touches = data.touches("train")
+    model = RunModel(device, learner, data.example, touch=_TOUCH)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "model.onnx"
+        write_model(learner.pipeline(model.places), model.describe(), touches, path)
+        exported = ExportedModel(path)
+    about = exported.metadata
+    engine = Engine(
+        exported.probabilities, about.task, len(about.positions), about.window, about.rate, Detection(_TOUCH)
+    )
+    return _time_verdicts(device, engine, frames)
+
+
+def _untrained(row: str) -> tuple[AbstractSimulated, Network, TouchData]:
+    """Return the device of a row, its network with random weights, and a few touches."""
+    config = training_config(
+        *_SETTINGS.get(row, ("simulator=naive",)), f"experiment={row}", "data.gestures=100"
+    )
+    device, learner = build_device(config).simulated("the stream is simulated"), build_learner(config)
+    assert isinstance(learner, Network)
+    data = build_data(config, device)
+    learner.build(data)
+    return device, learner, data
+
+
+def _time_verdicts(device: AbstractSimulated, engine: Engine, frames: int) -> dict[str, float]:
+    """Return the times of :func:`measure_latency` for an engine on a stream of a device."""
+    durations = np.array([_seconds(engine, frame) for frame in _stream(device, engine, frames + _WARM)])
+    wall, core = 1e3 * durations[_WARM:].T
+    return {
+        "p50_ms": float(np.median(wall)),
+        "p99_ms": float(np.percentile(wall, 99)),
+        "core_ms": float(np.percentile(core, 99)),
+        "core_share": float(core.mean() * RATE / 1e3),
+        "memory_mb": psutil.Process().memory_info().rss / 1e6,
+    }
+
+
+def _stream(device: AbstractSimulated, engine: Engine, count: int) -> list[Frame]:
+    """Return frames at 100 Hz, after the engine's window has been filled with frames."""
+    repeats = round(RATE / device.model_rate)
+    ahead = repeats * device.window
+    touches = device.simulate_stream((ahead + count) // repeats + 1).whole.touches
+    values = np.repeat(touches.readings[0].double().numpy(), repeats, axis=0)[: ahead + count]
+    valid = np.ones(values.shape[1], dtype=bool)
+    frames = [Frame(n, n / RATE, n / RATE, row, valid) for n, row in enumerate(values)]
+    for frame in frames[:ahead]:
+        engine.push([frame], None)
+    return frames[ahead:]
+
+
+def _seconds(engine: Engine, frame: Frame) -> tuple[float, float]:
+    """Return the duration of a verdict as wall time and as processor time, s."""
+    sensors = engine.window.sensors
+    conversion = UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
+    wall, core = time.perf_counter(), time.thread_time()
+    engine.push([frame], conversion)
+    return time.perf_counter() - wall, time.thread_time() - core
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

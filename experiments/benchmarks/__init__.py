@@ -1,1 +1,0 @@
-"""What ``make bench`` measures: the speed of the simulation, of the training and of the live view."""

@@ -1,1 +1,0 @@
-"""Scripts that start the parts of a cluster on one machine, and checks on them."""

@@ -1,0 +1,213 @@
+"""Check that a cluster loses no run: with killed processes, and with many writers at the same time.
+
+    python -m experiments.cluster_checks array FOLDER http://127.0.0.1:5000
+    python -m experiments.cluster_checks writers http://127.0.0.1:5000 --seconds 600
+
+``array`` trains 60 short runs on this machine, then as an array of 8 tasks on the server, of which two are
+killed with -9; submits the array again, and compares the tables. Uses SLURM where ``SLURM_CONF`` names a
+cluster (slurm.sh), otherwise one process after the other with the variables that SLURM would set.
+
+In ``writers``, each process begins runs, logs metrics, tags and a file as a training does, and ends them.
+Afterwards, the values are read back.
+
+Exit code 1 if a check fails.
+"""
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from multiprocessing import get_context
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import Any
+
+from skin.core.files import ROOT
+from skin.runs.configuration import Tracking
+from skin.runs.store import PROCESS, Store
+
+FOLDER = ROOT / "experiments" / "cluster"
+STUDY = ["study", "--config-dir", str(FOLDER / "conf"), "study=short_runs"]
+TASKS, RUNS = 8, 60
+STEPS = 20  # of each run of a writer
+EXPERIMENT = "studies"  # as in conf/study.yaml
+
+
+def main() -> None:
+    """Run a check."""
+    parser = argparse.ArgumentParser()
+    checks = parser.add_subparsers(required=True)
+    array = checks.add_parser("array")
+    array.add_argument("folder", type=Path)
+    array.add_argument("uri")
+    array.add_argument("--kill", type=int, default=2, help="number of processes to kill")
+    array.add_argument("--seed", type=int, default=0, help="of the choice of the processes")
+    array.set_defaults(check=check_array)
+    writers = checks.add_parser("writers")
+    writers.add_argument("uri")
+    writers.add_argument("--writers", type=int, default=16)
+    writers.add_argument("--seconds", type=float, default=600)
+    writers.set_defaults(check=check_writers)
+    arguments = vars(parser.parse_args())
+    sys.exit(0 if arguments.pop("check")(**arguments) else 1)
+
+
+def check_array(folder: Path, uri: str, kill: int, seed: int) -> bool:
+    """Kill processes of an array, and return whether each run is there once and the tables agree."""
+    folder = folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    expected = table(folder / "one_machine", f"sqlite:///{folder}/one_machine.db")
+    store = Store.open(Tracking(uri, None, EXPERIMENT, True, None))
+    killer = Killer(store, kill, random.Random(seed))
+    first = submit(folder, uri, killer)
+    lost = RUNS - len(store.find("FINISHED", row="rules"))
+    print(f"killed {killer.killed} processes: exit codes {first}, {lost} runs missing", flush=True)
+    second = submit(folder, uri, lambda: None)
+    finished = Counter(run.data.tags["fingerprint"] for run in store.find("FINISHED", row="rules"))
+    same = table(folder / "array", uri) == expected
+    runs = f"{len(finished)} different runs of {finished.total()}"
+    print(f"submitted again: exit codes {second}, {runs}; same table: {same}")
+    return same and set(finished.values()) == {1} and len(finished) == RUNS and any(first)
+
+
+class Killer:
+    """Kills processes that are in the middle of a run.
+
+    Args:
+        store: of the runs.
+        count: number of processes to kill.
+        generator: of the choice among the running ones.
+    """
+
+    def __init__(self, store: Store, count: int, generator: random.Random) -> None:
+        self._store, self._count, self._generator = store, count, generator
+        self.killed: list[int] = []
+
+    def __call__(self) -> None:
+        """Kill one process, if enough runs have finished since the last one."""
+        enough = len(self._store.find("FINISHED", row="rules")) >= 10 * (1 + len(self.killed))
+        if len(self.killed) < self._count and enough and (pids := self._running()):
+            pid = self._generator.choice(pids)
+            os.kill(pid, signal.SIGKILL)
+            self.killed.append(pid)
+
+    def _running(self) -> list[int]:
+        """Return the processes of this machine that train now."""
+        running = self._store.find("RUNNING", row="rules")
+        return sorted(json.loads(run.data.tags[PROCESS])[1] for run in running)
+
+
+def table(folder: Path, uri: str) -> bytes:
+    """Return the table of the study; runs that are missing are trained."""
+    words = [*STUDY, f"tracking.uri={uri}", f"out={folder}"]
+    subprocess.run([sys.executable, "-m", "skin", *words], cwd=folder.parent, env=environment(), check=True)
+    return (folder / "study_short_runs.csv").read_bytes()
+
+
+def submit(folder: Path, uri: str, meanwhile: Callable[[], None]) -> list[int]:
+    """Run the array and return the exit codes of its tasks."""
+    script = [str(FOLDER / "array.sh"), *STUDY, f"tracking.uri={uri}", f"out={folder}/array"]
+    return (slurm if "SLURM_CONF" in os.environ else in_turn)(script, folder, meanwhile)
+
+
+def slurm(script: Sequence[str], folder: Path, meanwhile: Callable[[], None]) -> list[int]:
+    """Submit the script to SLURM and wait for its tasks."""
+    command = ["sbatch", "--parsable", f"--array=1-{TASKS}", f"--output={folder}/slurm-%A_%a.log", *script]
+    answer: Any = {"check": True, "capture_output": True, "text": True}
+    job = subprocess.run(command, cwd=folder, env=environment(), **answer).stdout.strip()
+    print(f"sbatch: job {job}, {TASKS} tasks", flush=True)
+    ask = ["scontrol", "--oneliner", "show", "job", job]
+    while True:
+        lines = subprocess.run(ask, **answer).stdout.splitlines()
+        tasks = [dict(word.split("=", 1) for word in line.split() if "=" in word) for line in lines if line]
+        if all(task["JobState"] in ("COMPLETED", "FAILED", "CANCELLED", "NODE_FAIL") for task in tasks):
+            return [sum(map(int, task["ExitCode"].split(":"))) for task in tasks]
+        meanwhile()
+        time.sleep(1)
+
+
+def in_turn(script: Sequence[str], folder: Path, meanwhile: Callable[[], None]) -> list[int]:
+    """Run the tasks of the script as SLURM would, one after the other."""
+    codes = []
+    for task in range(1, TASKS + 1):
+        variables = {"SLURM_ARRAY_TASK_ID": str(task), "SLURM_ARRAY_TASK_COUNT": str(TASKS)}
+        with subprocess.Popen(script, cwd=folder, env=environment() | variables) as running:
+            while running.poll() is None:
+                meanwhile()
+                with suppress(subprocess.TimeoutExpired):
+                    running.wait(1)
+        codes.append(running.returncode)
+    return codes
+
+
+def environment() -> dict[str, str]:
+    """Return the variables of the commands: this interpreter and this code."""
+    return os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+
+def check_writers(uri: str, writers: int, seconds: float) -> bool:
+    """Run the writers, and return whether none of them met an error and no value is missing."""
+    context = get_context("fork")
+    results: Queue = context.Queue()
+    settings = Tracking(uri, None, "writers", True, None)
+    store = Store.open(settings)  # imports, once for all writers
+    began = time.monotonic()
+    processes = [
+        context.Process(target=write_runs, args=(settings, number, began + seconds, results))
+        for number in range(writers)
+    ]
+    for process in processes:
+        process.start()
+    reports = [results.get() for _ in processes]
+    for process in processes:
+        process.join()
+    runs = [run for made, _ in reports for run in made]
+    errors = [error for _, error in reports if error]
+    with ThreadPoolExecutor(4) as pool:
+        lost = sum(pool.map(lambda run: is_incomplete(store, run), runs))
+    took = time.monotonic() - began
+    print(f"{writers} writers, {took:.0f} s, {len(runs)} runs, {STEPS * len(runs)} batches of metrics")
+    print(f"{len(errors)} errors, {lost} incomplete runs", *errors, sep="\n")
+    return bool(runs) and not errors and not lost
+
+
+def write_runs(settings: Tracking, number: int, end: float, results: Queue) -> None:
+    """Log runs until a time of the monotonic clock; put the ids of complete ones and an error, or None."""
+    made: list[str] = []
+    error = None
+    try:
+        store = Store.open(settings)
+        while time.monotonic() < end:
+            with store.run(f"writer {number}", {"writer": str(number)}) as run:
+                for step in range(STEPS):
+                    store.log_metrics(run, {f"metric_{index}": step + 0.1 * index for index in range(10)})
+                    store.client.set_tag(run.info.run_id, "step", str(step))
+                store.client.log_text(run.info.run_id, "written", "note.txt")
+            made.append(run.info.run_id)
+    except Exception:
+        error = traceback.format_exc()
+    results.put((made, error))
+
+
+def is_incomplete(store: Store, run: str) -> bool:
+    """Return whether a value of a run is missing on the server."""
+    stored = store.client.get_run(run)
+    return (
+        stored.info.status != "FINISHED"
+        or stored.data.tags["step"] != str(STEPS - 1)
+        or len(store.client.get_metric_history(run, "metric_9")) != STEPS
+        or [file.path for file in store.client.list_artifacts(run)] != ["note.txt"]
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""The verbs of ``skin`` that need a clone of the repository (entry-point group ``skin.verbs``)."""

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.linalg import cho_factor, cho_solve, eigh, eigvalsh, solve
 
 from skin.body.base import AbstractBody, overlaps
-from skin.body.layout.base import place
+from skin.body.layout.base import place_sensors
 from skin.body.layout.grid import Grid
 from skin.body.sensors import Sensors
 from skin.core.files import candidates
@@ -335,7 +335,7 @@ def candidate_sites(
             f"{body.size[1]:g} m: shrink the zones of design.keep_out, or lower design.raster or "
             "layout.footprint"
         )
-    return place(body, x[columns], y[rows], depth, footprint)
+    return place_sensors(body, x[columns], y[rows], depth, footprint)
 
 
 def keep_out(zones: Zones | str | None, size: tuple[float, float]) -> np.ndarray | None:

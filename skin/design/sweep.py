@@ -21,7 +21,7 @@ from skin.core.files import whole
 from skin.core.settings import checked
 from skin.design.precision import Findings, LocalPrecision
 from skin.errors import InputError
-from skin.runs.build import Skin, build_skin
+from skin.runs.build import SkinModel, build_skin
 
 Pair = tuple[PositiveInt, PositiveInt]
 
@@ -95,7 +95,7 @@ class Sweep(LocalPrecision):
             writer.writerows(lines)
         print(path, draw_sweep(steps, folder / "design_sweep.png"), sep="\n")
 
-    def step(self, skin: Skin, thickness: float, grid: tuple[int, int]) -> Step:
+    def step(self, skin: SkinModel, thickness: float, grid: tuple[int, int]) -> Step:
         """Return the findings of one layer with a grid of sensors.
 
         Args:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import wrap_file
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, grid
+from skin.body.layout.base import AbstractLayout, tile_centres
 from skin.body.sensors import Sensors
 from skin.core.array_cache import folder
 from skin.core.files import whole
@@ -352,7 +352,7 @@ class Cost(AbstractDevice):
             raise InputError(f"device.gestures={self.gestures} is a single class: add device.variants=true")
         self._channels = _channels(self.taxels, self.taxel_seed)
         self.size = (_EDGE * self.pitch, _EDGE * self.pitch)
-        places = grid(_EDGE, _EDGE)[self._channels] * self.size
+        places = tile_centres(_EDGE, _EDGE)[self._channels] * self.size
         flat = np.column_stack([places, np.zeros(len(places))])
         self.sensors = Sensors(flat, (self.pitch, self.pitch))
         self._read(names)
@@ -456,7 +456,7 @@ def _channels(taxels: int | Sequence[int], seed: int) -> np.ndarray:
         if not 1 <= taxels <= count or isinstance(taxels, bool):
             raise InputError(f"device.taxels must be 1 to {count} or a list of channels, got {taxels}")
         order = generator(Stream.POSITION, seed).permutation(count)
-        places = grid(_EDGE, _EDGE)[order]
+        places = tile_centres(_EDGE, _EDGE)[order]
         chosen = [0]
         while len(chosen) < taxels:
             apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody, Layer
-from skin.body.layout.base import AbstractLayout, Footprint, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors
 from skin.body.layout.grid import Grid
 from skin.body.layout.hexagonal import Hexagonal
 from skin.body.layout.random import Random
@@ -184,7 +184,7 @@ class _Places(AbstractLayout):
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return them in their order."""
         x, y = self.places.T
-        return place(body, x, y, self.depth, self.footprint)
+        return place_sensors(body, x, y, self.depth, self.footprint)
 
 
 def _logarithmic(limits: tuple[float, float], generator: np.random.Generator) -> float:

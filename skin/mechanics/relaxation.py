@@ -72,7 +72,7 @@ def relaxes(body: AbstractBody) -> bool:
     return any(layer.material.relaxation for layer in body.layers)
 
 
-def elastic(body: AbstractBody, speed: float) -> AbstractBody:
+def make_elastic(body: AbstractBody, speed: float) -> AbstractBody:
     """Return the elastic body with the response of the viscoelastic one to a load exp(``speed`` t), 1/s."""
     return replace(
         body, layers=tuple(replace(layer, material=layer.material.elastic(speed)) for layer in body.layers)
@@ -136,7 +136,8 @@ class Relaxing(AbstractSimulator):
         super().__init__()
         self.lags, self.rate = times(body), float(rate)
         at = speeds(self.lags)
-        self.models = nn.ModuleList(simulator(elastic(body, speed), sensors) for speed in [*at, math.inf])
+        bodies = (make_elastic(body, speed) for speed in [*at, math.inf])
+        self.models = nn.ModuleList(simulator(elastic, sensors) for elastic in bodies)
         self._relaxed.linear(torch.zeros(body.shape))  # raises here instead of in the first batch
         terms = 1 / (1 + np.outer(at, self.lags))
         self.register_buffer("shares", torch.from_numpy(np.linalg.inv(terms)))

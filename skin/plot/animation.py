@@ -208,7 +208,7 @@ def _between(scene: Scene) -> np.ndarray:
 
 
 @torch.no_grad()
-def simulated(
+def simulate_scene(
     device: AbstractSimulated, labels: Sequence[str], shape: str | None, seed: int, field: bool
 ) -> Scene:
     """Draw a touch as a simulated device feels it.
@@ -245,7 +245,7 @@ def simulated(
     )  # fmt: skip
 
 
-def recorded(device: AbstractDevice, index: int) -> Scene:
+def read_scene(device: AbstractDevice, index: int) -> Scene:
     """Return one touch of a device: of a whole recording, or of another device's test touches.
 
     Raises:

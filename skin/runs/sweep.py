@@ -121,7 +121,7 @@ def _words(config: DictConfig) -> list[str]:
     return words
 
 
-class Sweep(Callback):
+class SweepCallback(Callback):
     """Hydra's callback of every command: opens and closes the parent run, prints progress.
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must

@@ -85,7 +85,7 @@ def train(config: DictConfig) -> bool:
         again = find_unfinished(store, config.tracking, identity["fingerprint"])
         with store.run(name, identity, os.environ.get(PARENT), again) as run:
             learner.unfinished = _unfinished_folder(config.tracking, run)
-            describe(store, run.info.run_id, config, data.hash)
+            log_configuration(store, run.info.run_id, config, data.hash)
             learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
             point = choose_operating_point(learner, judged, config.evaluation)
             report = evaluate(learner, device, config.evaluation, point)
@@ -263,7 +263,7 @@ def _option(part: DictConfig, name: str) -> str:
     return option_name(import_target(part["_target_"], name))
 
 
-def describe(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
+def log_configuration(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
     """Log the configuration of a run before it starts.
 
     Args:

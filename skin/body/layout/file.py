@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors
 from skin.body.sensors import MOST, Sensors
 from skin.core.files import candidates
 from skin.core.safe_loading import read_file
@@ -56,7 +56,7 @@ class File(AbstractLayout):
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""
         x, y, depth = self.places["x_m"], self.places["y_m"], self.places.get("depth_m", self.depth)
-        return place(body, x, y, depth, self.footprint, self._normals())
+        return place_sensors(body, x, y, depth, self.footprint, self._normals())
 
     def _normals(self) -> np.ndarray | None:
         """Return the unit vectors of the file, (S, 3), if it has any."""

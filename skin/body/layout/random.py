@@ -4,7 +4,7 @@ import numpy as np
 from pydantic import NonNegativeInt, PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors
 from skin.body.sensors import Sensors
 from skin.core.settings import checked
 from skin.errors import InputError
@@ -51,7 +51,7 @@ class Random(AbstractLayout):
                 places = np.vstack([places, found])
             if len(places) == self.count:
                 x, y = places[np.argsort(places[:, 1], kind="stable")].T
-                return place(body, x, y, self.depth, self.footprint)
+                return place_sensors(body, x, y, self.depth, self.footprint)
         raise self._full(body)
 
     def _full(self, body: AbstractBody) -> InputError:

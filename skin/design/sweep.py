@@ -45,9 +45,9 @@ class Step:
     def lines(self) -> Iterator[dict[str, float]]:
         """Yield one line of a table per force."""
         rows, columns = self.grid
-        for one in self.findings:
+        for finding in self.findings:
             about = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
-            yield about | asdict(one)
+            yield about | asdict(finding)
 
 
 @checked("design")
@@ -82,9 +82,10 @@ class Sweep(LocalPrecision):
         cases = [
             (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
         ]
-        console, shown = Console(stderr=True), sys.stderr.isatty()
+        console, interactive = Console(stderr=True), sys.stderr.isatty()
         steps = [
-            self.step(skin, *case) for case in track(cases, "solving", console=console, disable=not shown)
+            self.step(skin, *case)
+            for case in track(cases, "solving", console=console, disable=not interactive)
         ]
         print_sweep(steps)
         path = folder / "design_sweep.csv"

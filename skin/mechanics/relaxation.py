@@ -40,12 +40,12 @@ def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Te
 
 def running_peak(readings: Tensor) -> Tensor:
     """Return the largest |reading| since a sensor was last at rest, (B, T, S), N."""
-    size, found = readings.abs(), torch.empty_like(readings)
+    size, peaks = readings.abs(), torch.empty_like(readings)
     peak = torch.zeros_like(size[:, 0])
     for number, frame in enumerate(size.unbind(1)):
         peak = torch.where(frame > 0, torch.maximum(peak, frame), 0)
-        found[:, number] = peak
-    return found
+        peaks[:, number] = peak
+    return peaks
 
 
 def apply_hysteresis(readings: Tensor, hysteresis: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ def _apart(positions: np.ndarray) -> None:
     close = np.flatnonzero(distance[:, 1] < _APART)
     if len(close):
         first = int(close[0])
-        second = next(int(other) for other in nearest[first] if other != first)
+        second = next(int(index) for index in nearest[first] if index != first)
         x, y, _ = positions[first]
         raise InputError(
             f"sensors {first + 1} and {second + 1} are at one place, x = {x:g} m, y = {y:g} m: "

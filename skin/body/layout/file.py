@@ -66,13 +66,13 @@ class File(AbstractLayout):
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _find(given: str | Path) -> Path:
-    places = candidates(given)
+def _find(name: str | Path) -> Path:
+    places = candidates(name)
     for path in places:
         if path.is_file():
             return path
     looked = " and ".join(dict.fromkeys(map(str, places)))
-    raise InputError(f"no layout file {given}: looked for {looked}; give layout.path=FILE.csv")
+    raise InputError(f"no layout file {name}: looked for {looked}; give layout.path=FILE.csv")
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -84,8 +84,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
         needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
         if missing := needed - set(names):
-            found = ", ".join(names) or "nothing"
-            raise ValueError(f"no column {' and '.join(sorted(missing))}, found {found[:_SHOWN]}")
+            present = ", ".join(names) or "nothing"
+            raise ValueError(f"no column {' and '.join(sorted(missing))}, found {present[:_SHOWN]}")
         columns = [name for name in names if name in _PLACE + _FACING]
         if twice := [name for name in columns if columns.count(name) > 1]:
             raise ValueError(f"the column {twice[0]} is there twice")

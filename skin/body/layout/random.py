@@ -46,9 +46,9 @@ class Random(AbstractLayout):
             raise self._full(body)
         places = np.empty((0, 2))
         for _ in range(_TRIES):
-            found = np.round(extent / 2 + draw.random(2) * (np.array(body.size) - extent), 6)
-            if (np.abs(places - found) >= extent).any(axis=1).all():
-                places = np.vstack([places, found])
+            candidate = np.round(extent / 2 + draw.random(2) * (np.array(body.size) - extent), 6)
+            if (np.abs(places - candidate) >= extent).any(axis=1).all():
+                places = np.vstack([places, candidate])
             if len(places) == self.count:
                 x, y = places[np.argsort(places[:, 1], kind="stable")].T
                 return place_sensors(body, x, y, self.depth, self.footprint)

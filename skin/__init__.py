@@ -39,8 +39,8 @@ _PLACES = {
 def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'skin' has no attribute {name!r}")
-    module, _, there = _PLACES[name].partition(":")
-    return getattr(import_module(module), there or name)
+    module, _, member = _PLACES[name].partition(":")
+    return getattr(import_module(module), member or name)
 
 
 def __dir__() -> list[str]:

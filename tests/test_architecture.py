@@ -96,8 +96,12 @@ def test_a_file_is_read_in_one_sitting():
     assert not {path: lines for path, lines in long.items() if lines > 600}
 
 
+def test_no_two_public_things_share_a_name():
+    assert not house.doubled_names()
+
+
 @pytest.mark.parametrize(
-    ("figure", "limit"), [("statements", 19_400), ("files", 221), ("words of documentation", 23_900)]
+    ("figure", "limit"), [("statements", 19_400), ("files", 205), ("words of documentation", 23_900)]
 )
 def test_the_house_stays_small(figure, limit):
     """Raise a limit only for a new capability, and say so in the change log."""

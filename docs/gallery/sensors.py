@@ -3,9 +3,9 @@ Accuracy against the number of sensors
 ======================================
 
 Overall accuracy on 4000 test touches of the default sheet, on regular grids and on layouts that
-``skin design`` placed. ``any_skin`` is one network, not trained for any of these layouts (:doc:`/pretrained`).
-The others were trained for each layout: boosted trees (``features``) on 3230 gestures, and ``best_fresh`` on
-new gestures for 40 epochs.
+``skin design`` placed. ``any_skin`` is one network, not trained for any of these layouts
+(:doc:`/pretrained`). The others were trained for each layout: boosted trees (``features``) on 3230
+gestures, and ``best_fresh`` on new gestures for 40 epochs.
 """
 
 from csv import DictReader

@@ -28,7 +28,7 @@ from skin.mechanics.relaxation import Relaxing
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.plates import Structure
-from skin.mechanics.simulator.solid import Elastic, Solid, hexahedra, reading_rows
+from skin.mechanics.simulator.solid import Elastic, Solid, build_mesh, reading_rows
 
 _DRAGON: Any = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
 _ECOFLEX: Any = {"material": "EcoFlex 00-30", "thickness": 0.005}
@@ -39,7 +39,7 @@ def single_frames(quick: bool) -> CheckResult:
     """Compare the precomputed operator with a scikit-fem solution of single frames."""
     body = default_sheet(8 if quick else 12, 0.12)
     place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
-    mesh, extent = hexahedra(body, 2, {}), 2 * body.cell[0]
+    mesh, extent = build_mesh(body, 2, {}), 2 * body.cell[0]
     sensors = Sensors(place[None], (extent, extent))
     down, above = np.array([[0.0, 0, 1]]), place * [1, 1, 0]
     rows = [reading_rows(mesh, sensors), mesh.motion(place[None], down), mesh.motion(above[None], down)]
@@ -177,7 +177,7 @@ def write_results(threads: int, cells: int, path: str) -> None:
     body = default_sheet(cells)
     places = np.random.default_rng(0).uniform(0.02, 0.14, (25, 2))
     sensors = Sensors(np.column_stack([places, np.full(25, 0.005)]), (0.01, 0.01))
-    mesh = hexahedra(body, 2, {})
+    mesh = build_mesh(body, 2, {})
     operator = Elastic(mesh).transfer(reading_rows(mesh, sensors))
     frames = torch.rand(20000, *body.shape, generator=torch.Generator().manual_seed(0))
     with tempfile.TemporaryDirectory() as cache:

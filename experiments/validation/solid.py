@@ -34,7 +34,7 @@ from skin.body.sheet import Sheet
 from skin.mechanics.contact.rigid import solve_contact as press
 from skin.mechanics.contact.rigid import stabilise_checkerboard
 from skin.mechanics.simulator._hexahedra import Hexahedra
-from skin.mechanics.simulator.solid import Elastic, hexahedra, reading_rows
+from skin.mechanics.simulator.solid import Elastic, build_mesh, reading_rows
 
 # The default skin, from the surface down.
 SLABS = (Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49))
@@ -109,7 +109,7 @@ def even_pressure(quick: bool) -> CheckResult:
     body = default_sheet(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
-    mesh = hexahedra(body, 2, {})
+    mesh = build_mesh(body, 2, {})
     felt = Elastic(mesh).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
     return CheckResult(
         [
@@ -123,7 +123,7 @@ def global_balance(quick: bool) -> CheckResult:
     """Check that the reactions of the support balance the applied force and moment."""
     findings = []
     for name, body in _bodies(quick):
-        mesh = hexahedra(body, 2, {})
+        mesh = build_mesh(body, 2, {})
         cells = np.random.default_rng(0).random(body.cells[0] * body.cells[1])
         load = sum(share * (mesh.loads(axis) @ cells) for axis, share in enumerate((0.4, -0.3, 1.0)))
         moved = Elastic(mesh).solve(load[:, None])[:, 0]
@@ -140,7 +140,7 @@ def reciprocity(quick: bool) -> CheckResult:
     """Check reciprocity (Maxwell and Betti): two loads do the same work on each other's displacements."""
     findings = []
     for name, body in _bodies(quick):
-        mesh = hexahedra(body, 2, {})
+        mesh = build_mesh(body, 2, {})
         random = np.random.default_rng(1).random((3, 2, body.cells[0] * body.cells[1]))
         loads = sum(mesh.loads(axis) @ random[axis].T for axis in range(3))
         moves = Elastic(mesh).solve(loads)
@@ -180,7 +180,7 @@ def sleeve(quick: bool) -> CheckResult:
     surface, between = upper(outer)[0] @ amounts[2:], upper(middle)[1] @ amounts[2:]
     around = 32 if quick else 96
     body = Arm(cells=(around, 2), layers=_LAYERS, radius=outer, length=0.01, angle=np.pi)
-    mesh = hexahedra(body, 2 if quick else 4, {})
+    mesh = build_mesh(body, 2 if quick else 4, {})
     # Symmetry planes close the half tube: no vertical motion there, and no motion along the arm anywhere.
     walls = {"left": (2,), "right": (2,), "near": (1,), "far": (1,), "base": (0, 1, 2)}
     load = np.asarray(mesh.loads(2).sum(axis=1)).reshape(-1, 1)
@@ -215,7 +215,7 @@ def _sleeve(radius: float, sheet: Sheet) -> Arm:
 
 
 def _rows(body: AbstractBody, sensors: Sensors) -> np.ndarray:
-    mesh = hexahedra(body, 2, {})
+    mesh = build_mesh(body, 2, {})
     return Elastic(mesh).transfer(reading_rows(mesh, sensors))
 
 

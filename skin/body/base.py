@@ -251,20 +251,20 @@ def overlaps(edges: np.ndarray, centres: np.ndarray, extent: float) -> np.ndarra
     return np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0, None)
 
 
-def _layers(given: Sequence[Layer | Mapping[str, Any]]) -> tuple[Layer, ...]:
+def _layers(entries: Sequence[Layer | Mapping[str, Any]]) -> tuple[Layer, ...]:
     """Return the layers from the base up.
 
     Raises:
         InputError: no layer, or one that cannot be used.
     """
-    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
+    if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
         raise InputError(
-            f"body.layers must list at least one layer from the base up, got {given}: "
+            f"body.layers must list at least one layer from the base up, got {entries}: "
             "as in body.layers=[{material: EcoFlex 00-30, thickness: 0.005}]"
         )
     return tuple(
-        one if isinstance(one, Layer) else configured(_layer, one, f"body.layers.{number}")
-        for number, one in enumerate(given)
+        entry if isinstance(entry, Layer) else configured(_layer, entry, f"body.layers.{number}")
+        for number, entry in enumerate(entries)
     )
 
 
@@ -330,17 +330,17 @@ def check_plausibility(groups: Mapping[str, Any]) -> None:
 
 def _within(name: str, group: Any, ranges: Mapping[str, Any]) -> None:
     if isinstance(group, list):
-        for number, one in enumerate(group):
-            _within(f"{name}.{number}", one, ranges)
+        for number, entry in enumerate(group):
+            _within(f"{name}.{number}", entry, ranges)
     if not isinstance(group, Mapping):
         return
     for key, within in ranges.items():
-        given = group.get(key)
+        setting = group.get(key)
         if isinstance(within, Mapping):
-            _within(f"{name}.{key}", given, within)
+            _within(f"{name}.{key}", setting, within)
             continue
         low, high, unit = within
-        for value in given if isinstance(given, list) else [given]:
+        for value in setting if isinstance(setting, list) else [setting]:
             # What is no number, or not above 0, the classes refuse with a sentence of their own.
             if _positive(value) and not low <= value <= high:
                 raise InputError(

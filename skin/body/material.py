@@ -71,20 +71,20 @@ class Material:
         )
 
     @classmethod
-    def of(cls, given: "str | Mapping[str, Any] | Material") -> "Material":
+    def of(cls, value: "str | Mapping[str, Any] | Material") -> "Material":
         """Return the material that a configuration means.
 
         Args:
-            given: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa),
+            value: the name of a known material, or a mapping of ``name`` and any of ``young`` (Pa),
                 ``poisson`` and ``relaxation`` ({time (s), strength}); what is left out comes from the known
                 material of that name. None of them relaxes.
 
         Raises:
             InputError: the name is unknown and a constant is missing, or a key is mistyped.
         """
-        if isinstance(given, Material):
-            return given
-        return configured(_material, {"name": given} if isinstance(given, str) else given, "material")
+        if isinstance(value, Material):
+            return value
+        return configured(_material, {"name": value} if isinstance(value, str) else value, "material")
 
 
 MATERIALS = (

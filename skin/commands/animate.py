@@ -22,15 +22,15 @@ def main(config: DictConfig) -> None:
 
     from pathlib import Path
 
-    from skin.plot.animation import recorded, simulated, still, write_animation
+    from skin.plot.animation import read_scene, simulate_scene, still, write_animation
     from skin.runs.build import build_device
 
     device = build_device(config)
     if device.simulation is None:
-        scene = recorded(device, config.index)
+        scene = read_scene(device, config.index)
     else:
         field = config.view == "skin3d"
-        scene = simulated(device.simulation, list(config.labels), config.shape, config.seed, field)
+        scene = simulate_scene(device.simulation, list(config.labels), config.shape, config.seed, field)
     path = Path(config.out).expanduser()
     path = (still if path.suffix == ".png" else write_animation)(scene, config.view, path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

@@ -47,8 +47,8 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
     from skin.runs.train import log_report
 
     quiet()
-    run, folder, given = FinishedRun.named(config), results(config.out), overrides()
-    config = run.configured(config, given)
+    run, folder, changes = FinishedRun.named(config), results(config.out), overrides()
+    config = run.configured(config, changes)
     if "skins" in config.device and config.evaluation.profile is not None:
         raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
     model = load_model(run, config)
@@ -59,7 +59,7 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
     steps.silent = False
     steps.begin("evaluating them")
     title = f"{run.title} ({run.identity})"
-    tags = {"evaluated": run.identity, "overrides": " ".join(given)}
+    tags = {"evaluated": run.identity, "overrides": " ".join(changes)}
     store = Store.open(config.tracking)
     with store.run(f"evaluation of {run.title}", tags, run.identity) as evaluation:
         # Evaluations do not overwrite each other's files.
@@ -72,7 +72,7 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
             return
         report = evaluate(learner, device, config.evaluation, point)
         log_report(store, evaluation, report, device.task, {})
-        about = describe_evaluation(title, given, len(report.predictions))
+        about = describe_evaluation(title, changes, len(report.predictions))
         written = publish_evaluation(folder / f"{name}.md", report, device.task, run.title, about)
         for path in written:
             store.client.log_artifact(evaluation.info.run_id, str(path))
@@ -80,13 +80,13 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
     print(*written, sep="\n")
 
 
-def describe_evaluation(title: str, given: Sequence[str], count: int) -> str:
+def describe_evaluation(title: str, changes: Sequence[str], count: int) -> str:
     """Return a sentence about an evaluation of ``count`` gestures.
 
     Args:
         title: of the run.
-        given: the overrides; none keep the settings of the run.
+        changes: the overrides; none keep the settings of the run.
         count: number of gestures.
     """
-    settings = f"`{' '.join(given)}`" if given else "the settings of the run"
+    settings = f"`{' '.join(changes)}`" if changes else "the settings of the run"
     return f"Run {title}, evaluated with {settings}, {count} gestures."

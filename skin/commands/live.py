@@ -65,8 +65,8 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]
     from skin.runs.finished_run import FinishedRun
 
     quiet()
-    if given := [word for word in words if word.startswith("device=")]:
-        raise InputError(f"demo=true emulates a skin at a port: leave out {given[0]}, or demo=true")
+    if devices := [word for word in words if word.startswith("device=")]:
+        raise InputError(f"demo=true emulates a skin at a port: leave out {devices[0]}, or demo=true")
     words = ["device=serial", *words]
     config = validate_config(compose("live", [*_DEMO, *words]))
     run = FinishedRun.named(config)
@@ -86,24 +86,24 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]
         port.unplug()
 
 
-def show(config: DictConfig, given: Sequence[str], own_mechanics: bool = False) -> None:
+def show(config: DictConfig, changes: Sequence[str], own_mechanics: bool = False) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
     Args:
         config: of the command.
-        given: settings that replace those of the run, as overrides; ``config`` has their values.
+        changes: settings that replace those of the run, as overrides; ``config`` has their values.
         own_mechanics: the skin at the port is emulated with the simulator of the run.
     """
     from skin.hardware.live.engine_builder import LiveSettings
 
     live = LiveSettings.of(plain(config)["live"])
     try:
-        _watch(config, live, given, own_mechanics)
+        _watch(config, live, changes, own_mechanics)
     except KeyboardInterrupt:
         print("ended", file=sys.stderr)
 
 
-def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_mechanics: bool) -> None:
+def _watch(config: DictConfig, live: "LiveSettings", changes: Sequence[str], own_mechanics: bool) -> None:
     from rich.console import Console
 
     from skin.core.interrupt import ends_on_signal
@@ -114,7 +114,7 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_m
         from skin.hardware.live.engine_builder import watch_exported
         from skin.runs.exported.model import check_overrides
 
-        check_overrides(config.run, config, given)
+        check_overrides(config.run, config, changes)
         device = plain(config)["device"]
         watch = partial(watch_exported, config.run, device, live, messages.print)
     else:
@@ -122,7 +122,7 @@ def _watch(config: DictConfig, live: "LiveSettings", given: Sequence[str], own_m
         from skin.hardware.live.engine_builder import watch_run
 
         quiet()
-        watch = partial(watch_run, config, live, messages.print, given, own_mechanics=own_mechanics)
+        watch = partial(watch_run, config, live, messages.print, changes, own_mechanics=own_mechanics)
     with ExitStack() as open_:
         open_.enter_context(ends_on_signal())
         watched = watch(opened=open_)

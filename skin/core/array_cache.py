@@ -17,9 +17,9 @@ from skin.core.safe_loading import load_npz
 from skin.errors import InputError
 
 
-def folder(given: str | Path | None) -> Path:
+def folder(path: str | Path | None) -> Path:
     """Return the folder of the cache: the given one, else the variable SKIN_CACHE, else the user's cache."""
-    return Path(given or os.environ.get("SKIN_CACHE") or platformdirs.user_cache_dir("skin")).expanduser()
+    return Path(path or os.environ.get("SKIN_CACHE") or platformdirs.user_cache_dir("skin")).expanduser()
 
 
 def hashed(content: Mapping[str, Any], sources: Iterable[Path]) -> str:

@@ -134,7 +134,7 @@ MANIFEST = "manifest.json"
 """The file that makes a folder a data set."""
 
 
-def candidates(given: str | Path) -> list[Path]:
+def candidates(name: str | Path) -> list[Path]:
     """Return where a file may be: relative to the current folder, or beside the package."""
-    path = Path(given).expanduser()
+    path = Path(name).expanduser()
     return [path] if path.is_absolute() else [Path.cwd() / path, BUNDLED / path]

@@ -174,8 +174,8 @@ def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
 
 
 @contextmanager
-def limited_memory(more: int) -> Iterator[None]:
-    """Let this process take no more than ``more`` bytes on top of what it has, while the block runs.
+def limited_memory(extra: int) -> Iterator[None]:
+    """Let this process take no more than ``extra`` bytes on top of what it has, while the block runs.
 
     Who asks for more gets a MemoryError or the error of its library. There is no limit where the system does
     not know one for address space, as on macOS and Windows.
@@ -187,7 +187,7 @@ def limited_memory(more: int) -> Iterator[None]:
     import resource  # not on Windows
 
     before = resource.getrlimit(resource.RLIMIT_AS)
-    limit = int(statm.read_text().split()[0]) * resource.getpagesize() + more
+    limit = int(statm.read_text().split()[0]) * resource.getpagesize() + extra
     if before[0] != resource.RLIM_INFINITY:
         limit = min(limit, before[0])
     resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))

@@ -30,16 +30,16 @@ _FEW = "has too few entries"
 _LENGTHS = {"missing": _FEW, "too_short": _FEW, "too_long": "has too many entries"}
 
 
-def _rising(given: tuple[Any, Any]) -> tuple[Any, Any]:
-    if given[0] > given[1]:
+def _rising(limits: tuple[Any, Any]) -> tuple[Any, Any]:
+    if limits[0] > limits[1]:
         raise ValueError("must be a range [least, most]")
-    return given
+    return limits
 
 
-def _once(given: Sequence[str]) -> Sequence[str]:
-    if len(set(given)) < len(given):
+def _once(names: Sequence[str]) -> Sequence[str]:
+    if len(set(names)) < len(names):
         raise ValueError("must hold each name once")
-    return given
+    return names
 
 
 RISING = AfterValidator(_rising)
@@ -71,20 +71,20 @@ def check_settings(
         if key.startswith("_"):
             continue
         if key not in parameters:
-            if any(one.kind == Parameter.VAR_KEYWORD for one in parameters.values()):
+            if any(parameter.kind == Parameter.VAR_KEYWORD for parameter in parameters.values()):
                 continue
-            known = [one for one in parameters if whole or one not in required or one in settings]
-            near = get_close_matches(key, known, 1)
+            choices = [name for name in parameters if whole or name not in required or name in settings]
+            near = get_close_matches(key, choices, 1)
             meant = f": did you mean {near[0]}?" if near else ":"
-            raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(known)}")
+            raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(choices)}")
         if key in hints and _takes_made(hints[key]) and _is_nothing_made(hints[key], value):
             raise InputError(f"{name}.{key}={str(value)[:_LONG]} must be an option with its settings")
         if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
             default = _written(parameters[key].default)
             example = f": as in {name}.{key}={default}" if default else ""
-            shown = str(list(value) if isinstance(value, tuple) else value)
-            shown = shown if len(shown) <= _LONG else f"{shown[:_LONG]}..."
-            raise InputError(f"{name}.{key}={shown} {wrong}{example}")
+            text = str(list(value) if isinstance(value, tuple) else value)
+            text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
+            raise InputError(f"{name}.{key}={text} {wrong}{example}")
     if whole and (missing := [key for key in required if key not in settings]):
         raise InputError(f"{name} needs {' and '.join(missing)}, got {', '.join(settings) or 'nothing'}")
 
@@ -139,8 +139,8 @@ def check_groups(config: Mapping[str, Any]) -> None:
             raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
         # The model is inside the learner, but is set by the name of its group.
         inner = name.split(".")[-1]
-        shown = inner if inner in _INNER else name
-        check_settings(import_target(part["_target_"], shown), part, shown)
+        label = inner if inner in _INNER else name
+        check_settings(import_target(part["_target_"], label), part, label)
 
 
 def import_target(target: str, name: str) -> Callable[..., Any]:
@@ -165,8 +165,8 @@ def import_target(target: str, name: str) -> Callable[..., Any]:
 def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield every mapping with a ``_target_`` outside of libraries, the innermost first, with its name."""
     if isinstance(value, Mapping):
-        for key, one in value.items():
-            yield from _parts(one, f"{name}.{key}" if name else str(key))
+        for key, entry in value.items():
+            yield from _parts(entry, f"{name}.{key}" if name else str(key))
         target = value.get("_target_")
         if target is None and (option := name.rpartition(".")[2]) in _INNER:
             raise InputError(f"{option} chooses no option: leave it out, or give one that --help lists")
@@ -215,13 +215,13 @@ def _refusal(hint: Any, value: Any) -> str:
         taken = _adapter(hint).validate_python(value)
     except ValidationError as error:
         # Of a union, the message for the closest member.
-        nearest = max(error.errors(), key=lambda one: len(one["loc"]))
-        said = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-        said = said.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
-        said = _LENGTHS.get(nearest["type"], said.replace("a valid tuple", "a list"))
-        return said[0].lower() + said[1:]
-    for given, number in _changed(value, taken):
-        if isinstance(given, str):
+        nearest = max(error.errors(), key=lambda detail: len(detail["loc"]))
+        sentence = nearest["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+        sentence = sentence.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
+        sentence = _LENGTHS.get(nearest["type"], sentence.replace("a valid tuple", "a list"))
+        return sentence[0].lower() + sentence[1:]
+    for original, number in _changed(value, taken):
+        if isinstance(original, str):
             return "is text, and must be a number"
         return f"must be a {'whole ' * isinstance(number, int)}number"
     return ""
@@ -330,17 +330,17 @@ def _allowed(name: Any) -> bool:
     """
     if not isinstance(name, str):
         return False
-    package = next((one for one in _BASES if name.startswith(f"{one}.")), None)
+    package = next((prefix for prefix in _BASES if name.startswith(f"{prefix}.")), None)
     if package is None:
         return False
     try:
-        found = import_name(name)
+        kind = import_name(name)
     except Exception:  # any error means that there is no such class
         return False
-    if not inspect.isclass(found) or inspect.isabstract(found):
+    if not inspect.isclass(kind) or inspect.isabstract(kind):
         return False
     bases = tuple(getattr(import_module(module), base) for module, base in _BASES[package])
-    return issubclass(found, bases) and f"{found.__module__}.".startswith(f"{package}.")
+    return issubclass(kind, bases) and f"{kind.__module__}.".startswith(f"{package}.")
 
 
 def import_name(name: str) -> Any:
@@ -350,11 +350,11 @@ def import_name(name: str) -> Any:
         ImportError: there is no such module, class or function.
     """
     first, *others = name.split(".")
-    found, path = import_module(first), first
+    member, path = import_module(first), first
     for part in others:
         path = f"{path}.{part}"
-        found = getattr(found, part) if hasattr(found, part) else import_module(path)
-    return found
+        member = getattr(member, part) if hasattr(member, part) else import_module(path)
+    return member
 
 
 # The name of an option: of a simulator, device, model, ...

@@ -26,9 +26,9 @@ _NOTE = (
 _WIDE = ("radius, mm", "reach, mm")  # columns without room in the table of a sweep
 
 
-def print_precision(found: Sequence[Findings]) -> None:
+def print_precision(findings: Sequence[Findings]) -> None:
     """Print one line per force; the reach is the receptive radius."""
-    _print([_cells(one) for one in found])
+    _print([_cells(finding) for finding in findings])
 
 
 def draw_precision(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Tensor], path: Path) -> Path:
@@ -46,11 +46,12 @@ def draw_precision(body: AbstractBody, sensors: Sensors, maps: Mapping[float, Te
     size = counts * (panel + np.array([0.2, 0.4])) + np.array([1.4, 0.5])
     figure = Figure(figsize=tuple(size), layout="constrained")
     axes = figure.subplots(counts[1], counts[0], squeeze=False, sharex=True, sharey=True)
-    shown = {force: 1e3 * np.asarray(deviation) for force, deviation in maps.items()}
-    lowest, highest = min(one.min() for one in shown.values()), max(one.max() for one in shown.values())
+    scaled = {force: 1e3 * np.asarray(deviation) for force, deviation in maps.items()}
+    values = np.array(list(scaled.values()))
+    lowest, highest = values.min(), values.max()
     scale = LogNorm(lowest, highest)
     extent = (0, 1e3 * body.size[0], 1e3 * body.size[1], 0)
-    for axis, (force, deviation) in zip(axes.flat, shown.items(), strict=True):
+    for axis, (force, deviation) in zip(axes.flat, scaled.items(), strict=True):
         picture = axis.imshow(deviation, cmap="viridis_r", norm=scale, extent=extent)
         x, y = 1e3 * sensors.positions[:, :2].T
         axis.plot(x, y, "o", color="white", markeredgecolor="black", markersize=4)
@@ -75,8 +76,8 @@ def print_sweep(steps: Sequence[Step]) -> None:
             "sensors": f"{step.grid[0]} x {step.grid[1]}",
             "pitch, mm": f"{1e3 * step.pitch:.0f}",
         }
-        cells = (_cells(one) for one in step.findings)
-        rows += [about | {name: text for name, text in each.items() if name not in _WIDE} for each in cells]
+        cells = (_cells(finding) for finding in step.findings)
+        rows += [about | {name: text for name, text in texts.items() if name not in _WIDE} for texts in cells]
     _print(rows)
 
 
@@ -89,7 +90,7 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
         steps: with the same forces.
         path: x.png.
     """
-    forces = [one.force_N for one in steps[0].findings]
+    forces = [finding.force_N for finding in steps[0].findings]
     figure = Figure(figsize=(2.3 + 4.2 * len(forces), 3.6), layout="constrained")
     axes = figure.subplots(1, len(forces), squeeze=False, sharey=True)[0]
     for number, (axis, force) in enumerate(zip(axes, forces, strict=True)):
@@ -110,16 +111,16 @@ def draw_sweep(steps: Sequence[Step], path: Path) -> Path:
     return save_figure(figure, path)
 
 
-def _cells(one: Findings) -> dict[str, str]:
+def _cells(finding: Findings) -> dict[str, str]:
     """Return name and text of each column of a table."""
     return {
-        "force, N": f"{one.force_N:g}",
-        "blind, %": f"{100 * one.blind_share:.1f}",
-        "place, mm": f"{1e3 * one.place_m:.2f}",
-        "90 %, mm": f"{1e3 * one.place_90_m:.2f}",
-        "radius, mm": f"{1e3 * one.radius_m:.2f}",
-        "force, %": f"{100 * one.force_relative:.1f}",
-        "reach, mm": f"{1e3 * one.receptive_radius_m:.1f}",
+        "force, N": f"{finding.force_N:g}",
+        "blind, %": f"{100 * finding.blind_share:.1f}",
+        "place, mm": f"{1e3 * finding.place_m:.2f}",
+        "90 %, mm": f"{1e3 * finding.place_90_m:.2f}",
+        "radius, mm": f"{1e3 * finding.radius_m:.2f}",
+        "force, %": f"{100 * finding.force_relative:.1f}",
+        "reach, mm": f"{1e3 * finding.receptive_radius_m:.1f}",
     }
 
 

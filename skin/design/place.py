@@ -72,11 +72,13 @@ def sampled_readings(
         clip: largest reading, N.
     """
     read = _reader(device, sensors)
-    wanted = balanced(touches, generator(Stream.PLACEMENT, seed, 0))
+    wanted_labels = balanced(touches, generator(Stream.PLACEMENT, seed, 0))
     parts = range(0, touches, _BATCH)
-    console, shown = Console(stderr=True), sys.stderr.isatty()
-    for number, first in enumerate(track(parts, "sampling touches", console=console, disable=not shown)):
-        labels = wanted[first : first + _BATCH]
+    console, interactive = Console(stderr=True), sys.stderr.isatty()
+    for number, first in enumerate(
+        track(parts, "sampling touches", console=console, disable=not interactive)
+    ):
+        labels = wanted_labels[first : first + _BATCH]
         movie = device.sampler.sample(len(labels), generator(Stream.PLACEMENT, seed, 1 + number), labels)
         yield read(movie).clamp(-clip, clip).double().numpy()
 
@@ -150,10 +152,10 @@ class Place:
         clip = _median(device.constants.clip)
         covariance, frames = reading_covariance(device, problem.sensors, self.touches, self.seed, clip)
         with Console(stderr=True).status("placing sensors"):
-            chosen, found = problem.solve(covariance / noise**2, self.seed)
+            chosen, outcome = problem.solve(covariance / noise**2, self.seed)
         settings: dict[str, Any] = {"sites": problem.sites, "touches": self.touches, "frames": frames}
         settings |= {"noise_N": noise, "clip_N": clip, "distance_m": self.distance}
-        content = settings | found | {"seconds": round(time.perf_counter() - started, 1)}
+        content = settings | outcome | {"seconds": round(time.perf_counter() - started, 1)}
         Console().print(_table(content))
         paths = self._write(problem, chosen, content, forbidden, folder)
         print("\n".join(map(str, paths)))
@@ -213,7 +215,7 @@ def _table(content: Mapping[str, Any]) -> Table:
     share = f"{100 * content['share_of_bound']:.1f} %"
     made.add_row("placed", str(content["sensors"]), f"{content['information_nats']:.1f}", share)
     for name, layout in content["layouts"].items():
-        shown = name.replace("_", " ")
-        made.add_row(shown, str(layout["sensors"]), f"{layout['information_nats']:.1f}", "")
+        words = name.replace("_", " ")
+        made.add_row(words, str(layout["sensors"]), f"{layout['information_nats']:.1f}", "")
     made.add_row("upper bound", str(content["sensors"]), f"{content['bound_nats']:.1f}", "100.0 %")
     return made

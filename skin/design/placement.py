@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.linalg import cho_factor, cho_solve, eigh, eigvalsh, solve
 
 from skin.body.base import AbstractBody, overlaps
-from skin.body.layout.base import place
+from skin.body.layout.base import place_sensors
 from skin.body.layout.grid import Grid
 from skin.body.sensors import Sensors
 from skin.core.files import candidates
@@ -105,16 +105,16 @@ def exchange(signal: np.ndarray, sites: Sites, near: np.ndarray, fixed: int = 0)
     Returns:
         the sites, in the same order.
     """
-    found, moved = list(sites), True
+    places, moved = list(sites), True
     while moved:
         moved = False
-        for number in range(fixed, len(found)):
-            others = found[:number] + found[number + 1 :]
+        for number in range(fixed, len(places)):
+            others = places[:number] + places[number + 1 :]
             variance = _variance(signal, others)
             best = _best(variance, np.logical_not(near[others].any(axis=0)))
-            if variance[best] > variance[found[number]] * (1 + _TIE):
-                found[number], moved = best, True
-    return found
+            if variance[best] > variance[places[number]] * (1 + _TIE):
+                places[number], moved = best, True
+    return places
 
 
 def given(signal: np.ndarray, sites: Sites) -> np.ndarray:
@@ -127,9 +127,9 @@ def given(signal: np.ndarray, sites: Sites) -> np.ndarray:
     Returns:
         (C - k, C - k).
     """
-    rest = np.setdiff1d(np.arange(len(signal)), sites)
+    others = np.setdiff1d(np.arange(len(signal)), sites)
     rows = signal[np.asarray(sites, dtype=int)]
-    return signal[np.ix_(rest, rest)] - (rows.T @ _solved(rows, sites))[np.ix_(rest, rest)]
+    return signal[np.ix_(others, others)] - (rows.T @ _solved(rows, sites))[np.ix_(others, others)]
 
 
 def _best(variance: np.ndarray, allowed: np.ndarray) -> int:
@@ -138,10 +138,10 @@ def _best(variance: np.ndarray, allowed: np.ndarray) -> int:
     return int(np.flatnonzero(allowed & (variance >= most * (1 - _TIE)))[0])
 
 
-def _variance(signal: np.ndarray, given: Sites) -> np.ndarray:
+def _variance(signal: np.ndarray, sites: Sites) -> np.ndarray:
     """Return the variance (C,) of each noisy reading given those of some other sites."""
-    rows = signal[np.asarray(given, dtype=int)]
-    return 1 + np.diag(signal) - (rows * _solved(rows, given)).sum(axis=0)
+    rows = signal[np.asarray(sites, dtype=int)]
+    return 1 + np.diag(signal) - (rows * _solved(rows, sites)).sum(axis=0)
 
 
 def _solved(rows: np.ndarray, sites: Sites) -> np.ndarray:
@@ -172,22 +172,22 @@ def upper_bound(signal: np.ndarray, count: int, fixed: Sites = (), gap: float = 
         fixed: sites that every choice has.
         gap: between the bound and the value of the relaxation, relative, at which the search stops.
     """
-    known, rest = mutual_information(signal, fixed), given(signal, fixed)
+    base, remaining = mutual_information(signal, fixed), given(signal, fixed)
     number = count - len(fixed)
-    if number in (0, len(rest)):
-        return known + mutual_information(rest, range(len(rest))[:number])
-    relaxation = _Relaxation(rest, number)
-    weights = np.full(len(rest), number / len(rest))
+    if number in (0, len(remaining)):
+        return base + mutual_information(remaining, range(len(remaining))[:number])
+    relaxation = _Relaxation(remaining, number)
+    weights = np.full(len(remaining), number / len(remaining))
     state = relaxation.at(weights)
-    barrier, bound = 0.1 * state.value / len(rest), state.bound
+    barrier, bound = 0.1 * state.value / len(remaining), state.bound
     for _ in range(_ITERATIONS):
-        if bound - state.value <= gap * (known + state.value):
+        if bound - state.value <= gap * (base + state.value):
             break
         weights, centred = _step(relaxation, weights, state, barrier)
         state = relaxation.at(weights)
         bound = min(bound, state.bound)
         barrier *= 0.2 if centred else 1.0
-    return known + bound
+    return base + bound
 
 
 class _State(NamedTuple):
@@ -324,7 +324,7 @@ def candidate_sites(
         InputError: no site is left.
     """
     pitches = body.cell if raster is None else raster if isinstance(raster, Sequence) else (raster, raster)
-    x, y = (_along(*one) for one in zip(body.size, pitches, footprint, strict=True))
+    x, y = (_along(*axis) for axis in zip(body.size, pitches, footprint, strict=True))
     free = np.ones((len(y), len(x)), dtype=bool)
     if forbidden is not None:
         free = _covered(forbidden, body.size, (x, y), footprint) <= _COVERED
@@ -335,7 +335,7 @@ def candidate_sites(
             f"{body.size[1]:g} m: shrink the zones of design.keep_out, or lower design.raster or "
             "layout.footprint"
         )
-    return place(body, x[columns], y[rows], depth, footprint)
+    return place_sensors(body, x[columns], y[rows], depth, footprint)
 
 
 def keep_out(zones: Zones | str | None, size: tuple[float, float]) -> np.ndarray | None:
@@ -371,24 +371,24 @@ def keep_out(zones: Zones | str | None, size: tuple[float, float]) -> np.ndarray
     return inside.reshape(height, width)
 
 
-def _picture(given: str, size: tuple[float, float]) -> np.ndarray:
+def _picture(name: str, size: tuple[float, float]) -> np.ndarray:
     """Return the dark pixels of a picture; transparent ones are not dark."""
-    path = next((one for one in candidates(given) if one.is_file()), None)
+    path = next((place for place in candidates(name) if place.is_file()), None)
     if path is None:
-        raise InputError(f"no picture {given}: give design.keep_out=FILE.png, or polygons")
+        raise InputError(f"no picture {name}: give design.keep_out=FILE.png, or polygons")
     try:
         with Image.open(path) as file:
             cover = file.convert("RGBA")
         pixels = np.asarray(Image.alpha_composite(Image.new("RGBA", cover.size, "white"), cover).convert("L"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(
-            f"cannot read design.keep_out={given}: {error}; give a PNG of the whole surface, dark where no "
+            f"cannot read design.keep_out={name}: {error}; give a PNG of the whole surface, dark where no "
             "sensor may be"
         ) from error
     height, width = pixels.shape
     if abs(math.log(width / height * size[1] / size[0])) > _ASPECT:
         raise InputError(
-            f"design.keep_out={given} has {width} x {height} pixels, but the surface has {size[0]:g} x "
+            f"design.keep_out={name} has {width} x {height} pixels, but the surface has {size[0]:g} x "
             f"{size[1]:g} m: give a picture of the whole surface with its aspect ratio"
         )
     return pixels < _DARK
@@ -466,22 +466,22 @@ class PlacementProblem:
         """
         body, old = device.body, device.sensors
         count = len(old) if count is None else count
-        kept = _kept(keep, len(old), count)
+        staying = _kept(keep, len(old), count)
         depths, numbers = np.unique(old.positions[:, 2], return_counts=True)
         depth = float(depths[numbers.argmax()])
         sites = candidate_sites(body, old.footprint, depth, raster, forbidden)
-        if count - len(kept) > len(sites):
+        if count - len(staying) > len(sites):
             raise InputError(
-                f"design.count={count} needs {count - len(kept)} sites, and there are {len(sites)}: lower "
+                f"design.count={count} needs {count - len(staying)} sites, and there are {len(sites)}: lower "
                 "design.count, set a finer design.raster, or shrink the zones of design.keep_out"
             )
         every = [sites, old, *_grid(body, count, old.footprint, depth)]
         positions, normals = (
-            np.concatenate([getattr(one, name) for one in every]) for name in ("positions", "normals")
+            np.concatenate([getattr(group, name) for group in every]) for name in ("positions", "normals")
         )
         sensors = Sensors(positions, old.footprint, normals)
         layout = len(sites) + np.arange(len(old))
-        return cls(body, sensors, len(sites), layout[kept], layout, count, distance)
+        return cls(body, sensors, len(sites), layout[staying], layout, count, distance)
 
     def solve(self, signal: np.ndarray, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the chosen sensors, in the order of the layout, and what is known of them.
@@ -494,9 +494,9 @@ class PlacementProblem:
         fixed = self.sites + np.arange(len(self.kept))
         near = too_near(self.sensors.positions[eligible, :2], self.distance)
         inner = signal[np.ix_(eligible, eligible)]
-        found = exchange(inner, greedy(inner, self.count, near, fixed), near, len(fixed))
-        value, bound = mutual_information(inner, found), upper_bound(inner, self.count, fixed)
-        fresh = eligible[found[len(fixed) :]]
+        sites = exchange(inner, greedy(inner, self.count, near, fixed), near, len(fixed))
+        value, bound = mutual_information(inner, sites), upper_bound(inner, self.count, fixed)
+        fresh = eligible[sites[len(fixed) :]]
         x, y = self.sensors.positions[fresh, :2].T.round(6)
         chosen = np.concatenate([self.kept, fresh[np.lexsort((x, y))]])
         others = {"configured": self.layout, "grid": np.arange(self.layout[-1] + 1, len(signal))}
@@ -508,8 +508,8 @@ class PlacementProblem:
         if drawn := best_of_random(inner, self.count, near, fixed, seed):
             information = mutual_information(inner, drawn)
             layouts["best_of_random"] = {"sensors": self.count, "information_nats": information}
-        known = {"sensors": self.count, "information_nats": value, "bound_nats": bound}
-        return chosen, known | {"share_of_bound": value / bound, "layouts": layouts}
+        summary = {"sensors": self.count, "information_nats": value, "bound_nats": bound}
+        return chosen, summary | {"share_of_bound": value / bound, "layouts": layouts}
 
 
 def best_of_random(

@@ -61,8 +61,8 @@ class Noise:
 
         It is infinite where a sensor clips: its reading does not depend on the touch.
         """
-        known = self.frame**2 / self.frames + (self.gain * readings).square()
-        return known.masked_fill(readings >= self.clip, torch.inf)
+        variance = self.frame**2 / self.frames + (self.gain * readings).square()
+        return variance.masked_fill(readings >= self.clip, torch.inf)
 
     def felt(self, readings: Tensor, sigmas: float = 3.0) -> Tensor:
         """Return which readings (B, S), N, exceed the noise of one frame, bool."""
@@ -100,7 +100,7 @@ def sensitivity(simulator: AbstractSimulator, fingertip: Fingertip, touches: Ten
     """
     simulator.double()
     parts = list(_parts(simulator, fingertip, touches.double()))
-    return Sensitivity(*(torch.cat(one) for one in zip(*parts, strict=True)))
+    return Sensitivity(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
 def _parts(
@@ -112,9 +112,9 @@ def _parts(
             along = torch.zeros_like(part)
             along[:, axis] = 1
             # Touches do not influence each other, so one direction serves all of them.
-            found = torch.func.jvp(lambda one: simulator(fingertip(one)).readings, (part,), (along,))
-            slopes.append(found[1])
-        yield found[0], torch.stack(slopes, dim=-1)
+            pair = torch.func.jvp(lambda touch: simulator(fingertip(touch)).readings, (part,), (along,))
+            slopes.append(pair[1])
+        yield pair[0], torch.stack(slopes, dim=-1)
 
 
 def local_covariance(sensitivity: Sensitivity, noise: Noise, priors: Tensor) -> Tensor:
@@ -209,11 +209,11 @@ class LocalPrecision:
 
         skin = build_skin(config)
         simulator = skin.simulator(skin.body, skin.sensors)
-        found = self.find(simulator, skin.body)
+        findings = self.find(simulator, skin.body)
         maps = dict(zip(self.forces, self.maps(simulator, skin.body), strict=True))
-        print_precision(found)
+        print_precision(findings)
         settings = {name + _UNITS.get(name, ""): value for name, value in asdict(self).items()}
-        lines = [asdict(one) for one in found]
+        lines = [asdict(finding) for finding in findings]
         about = {"sensors": len(skin.sensors), "settings": settings, "precision": lines}
         print(
             write(json_text(about), folder / "design.json"),
@@ -287,8 +287,8 @@ class LocalPrecision:
         """Return the local precision of the place on each cell, for the mean radius, (forces, H, W), m."""
         x, y = ((torch.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True))
         down, across = torch.meshgrid(y, x, indexing="ij")
-        rest = torch.tensor([sum(self.radii) / 2, 1.0]).expand(across.numel(), 2)
-        touches = torch.cat([torch.stack([across, down], -1).flatten(0, 1), rest], dim=1)
+        constants = torch.tensor([sum(self.radii) / 2, 1.0]).expand(across.numel(), 2)
+        touches = torch.cat([torch.stack([across, down], -1).flatten(0, 1), constants], dim=1)
         felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
         places = [self._deviations(felt.of_force(force), force, body)[0] for force in self.forces]
         return torch.stack(places).unflatten(1, body.shape)

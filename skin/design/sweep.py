@@ -21,7 +21,7 @@ from skin.core.files import whole
 from skin.core.settings import checked
 from skin.design.precision import Findings, LocalPrecision
 from skin.errors import InputError
-from skin.runs.build import Skin, build_skin
+from skin.runs.build import SkinModel, build_skin
 
 Pair = tuple[PositiveInt, PositiveInt]
 
@@ -45,9 +45,9 @@ class Step:
     def lines(self) -> Iterator[dict[str, float]]:
         """Yield one line of a table per force."""
         rows, columns = self.grid
-        for one in self.findings:
+        for finding in self.findings:
             about = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
-            yield about | asdict(one)
+            yield about | asdict(finding)
 
 
 @checked("design")
@@ -82,9 +82,10 @@ class Sweep(LocalPrecision):
         cases = [
             (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
         ]
-        console, shown = Console(stderr=True), sys.stderr.isatty()
+        console, interactive = Console(stderr=True), sys.stderr.isatty()
         steps = [
-            self.step(skin, *case) for case in track(cases, "solving", console=console, disable=not shown)
+            self.step(skin, *case)
+            for case in track(cases, "solving", console=console, disable=not interactive)
         ]
         print_sweep(steps)
         path = folder / "design_sweep.csv"
@@ -95,7 +96,7 @@ class Sweep(LocalPrecision):
             writer.writerows(lines)
         print(path, draw_sweep(steps, folder / "design_sweep.png"), sep="\n")
 
-    def step(self, skin: Skin, thickness: float, grid: tuple[int, int]) -> Step:
+    def step(self, skin: SkinModel, thickness: float, grid: tuple[int, int]) -> Step:
         """Return the findings of one layer with a grid of sensors.
 
         Args:

@@ -33,10 +33,10 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
     if device.simulation is None:
         return
     sampler = device.simulation.sampler
-    found = class_balance(recording or device.recording(None, complete=False), sampler.shapes.names)
+    balance = class_balance(recording or device.recording(None, complete=False), sampler.shapes.names)
     if shown:
-        _log.info("\n".join(balance_table(found)))
-    check_label_leakage(found, sampler.settings)
+        _log.info("\n".join(balance_table(balance)))
+    check_label_leakage(balance, sampler.settings)
 
 
 def class_balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, Any]:
@@ -53,38 +53,41 @@ def class_balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, An
         paths with other labels) and misfits (share of drawn bodies that do not fit on the sheet).
     """
     recording = only_touches(recording)
-    known = {name: values.double().numpy() for name, values in recording.parameters.items()}
+    parameters = {name: values.double().numpy() for name, values in recording.parameters.items()}
     labels = recording.touches.labels
     assert labels is not None
     report: dict[str, Any] = {
         "shapes": list(shapes),
-        "stretched": float((known["stretch"] != 1).mean()),
+        "stretched": float((parameters["stretch"] != 1).mean()),
         "labels": {},
     }
-    shape = known["shape"].astype(int)
+    shape = parameters["shape"].astype(int)
     for column, name in enumerate(recording.task.names):
         if name in OPPOSITE:
             holds = labels[:, column].numpy() > 0.5
             accuracy, error = accuracy_from_shape(shape, holds)
-            classes = {"yes": _class(known, holds, len(shapes)), "no": _class(known, ~holds, len(shapes))}
+            classes = {
+                "yes": _class(parameters, holds, len(shapes)),
+                "no": _class(parameters, ~holds, len(shapes)),
+            }
             report["labels"][name] = {"accuracy": accuracy, "error": error, **classes}
     return report
 
 
-def _class(known: dict[str, np.ndarray], rows: np.ndarray, shapes: int) -> dict[str, Any]:
+def _class(parameters: dict[str, np.ndarray], rows: np.ndarray, shapes: int) -> dict[str, Any]:
     count = int(rows.sum())
     if not count:
         return {"touches": 0}
-    own = {name: values[rows] for name, values in known.items()}
+    values = {name: column[rows] for name, column in parameters.items()}
     return {
         "touches": count,
-        "shapes": (np.bincount(own["shape"].astype(int), minlength=shapes) / count).tolist(),
-        "area": float(own["area"].mean()),
-        "force": float(np.median(own["force"])),
-        "x": [float(own["x"].mean()), float(own["x"].std())],
-        "y": [float(own["y"].mean()), float(own["y"].std())],
-        "rejected": 1 - count / float(own["draws"].sum()),
-        "misfits": 1 - count / (count + float(own["misfits"].sum())),
+        "shapes": (np.bincount(values["shape"].astype(int), minlength=shapes) / count).tolist(),
+        "area": float(values["area"].mean()),
+        "force": float(np.median(values["force"])),
+        "x": [float(values["x"].mean()), float(values["x"].std())],
+        "y": [float(values["y"].mean()), float(values["y"].std())],
+        "rejected": 1 - count / float(values["draws"].sum()),
+        "misfits": 1 - count / (count + float(values["misfits"].sum())),
     }
 
 
@@ -120,10 +123,10 @@ def balance_table(report: dict[str, Any]) -> list[str]:
     """Return a class balance as lines of a table, two per label."""
     names = [Path(shape).stem for shape in report["shapes"]]
     table = [["", "accuracy", *names, "area %", "force N", "x mm", "y mm", "paths", "bodies"]]
-    for name, of in report["labels"].items():
-        for title, told, side in ((name, f"{of['accuracy']:.2f}", "yes"), (OPPOSITE[name], "", "no")):
-            if of[side]["touches"]:
-                table.append([title, told, *_cells(of[side])])
+    for name, entry in report["labels"].items():
+        for title, told, side in ((name, f"{entry['accuracy']:.2f}", "yes"), (OPPOSITE[name], "", "no")):
+            if entry[side]["touches"]:
+                table.append([title, told, *_cells(entry[side])])
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     rows = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
     return [
@@ -150,9 +153,9 @@ def check_label_leakage(report: dict[str, Any], settings: GestureSettings) -> No
         InputError: a label leaks and ``settings.strict`` is set.
     """
     leaking = {
-        name: of["accuracy"]
-        for name, of in report["labels"].items()
-        if of["accuracy"] - 2 * of["error"] > settings.leak
+        name: entry["accuracy"]
+        for name, entry in report["labels"].items()
+        if entry["accuracy"] - 2 * entry["error"] > settings.leak
     }
     if not leaking:
         return
@@ -184,23 +187,23 @@ def summarise(recording: Recording, body: AbstractBody) -> dict[str, Any]:
         ones); unconverged (frames whose pressure was not found, so that their gestures were drawn again),
         where it had to be.
     """
-    known, labels = recording.parameters, recording.touches.labels
+    parameters, labels = recording.parameters, recording.touches.labels
     assert labels is not None
-    strain = known.get("strain", known["peak"] / body.layers[-1].material.young)
-    force = torch.quantile(known["force"], torch.tensor([0.05, 0.5, 0.95, 1.0]))
+    strain = parameters.get("strain", parameters["peak"] / body.layers[-1].material.young)
+    force = torch.quantile(parameters["force"], torch.tensor([0.05, 0.5, 0.95, 1.0]))
     dangerous = labels[:, recording.task.names.index("dangerous")] > 0.5
     summary = {
         "gestures": len(recording),
-        "acceptance": len(recording) / float(known["draws"].sum()),
+        "acceptance": len(recording) / float(parameters["draws"].sum()),
         "force": dict(zip(("q05", "q50", "q95", "largest"), force.tolist(), strict=True)),
         "strain_over_30_percent": float((strain > 0.3).float().mean()),
         "strain_over_100_percent": float((strain > 1).float().mean()),
-        "strain_solved": "strain" in known,
-        "clipped": float(known["clipped"].mean()),
-        "clipped_dangerous": float(known["clipped"][dangerous].mean()) if dangerous.any() else 0.0,
+        "strain_solved": "strain" in parameters,
+        "clipped": float(parameters["clipped"].mean()),
+        "clipped_dangerous": float(parameters["clipped"][dangerous].mean()) if dangerous.any() else 0.0,
     }
-    if "unconverged" in known:
-        summary["unconverged"] = int(known["unconverged"].sum())
+    if "unconverged" in parameters:
+        summary["unconverged"] = int(parameters["unconverged"].sum())
     return summary
 
 

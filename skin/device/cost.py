@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import wrap_file
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, grid
+from skin.body.layout.base import AbstractLayout, tile_centres
 from skin.body.sensors import Sensors
 from skin.core.array_cache import folder
 from skin.core.files import whole
@@ -83,19 +83,19 @@ def read_captures(path: Path, window: int) -> Captures:
         InputError: the file is not in the corpus's format; the message has the number of the line.
     """
     parts: list[Captures] = []
-    rest = np.empty((0, len(COLUMNS)), np.int32)
+    begun = np.empty((0, len(COLUMNS)), np.int32)
     line = 2
     for block in _blocks(path):
-        rows = np.concatenate([rest, block])
-        _check(path, rows, len(rest), line)
+        rows = np.concatenate([begun, block])
+        _check(path, rows, len(begun), line)
         line += len(block)
         # The last capture may continue in the next block.
         last = np.flatnonzero(rows[:, _FRAME] == 1)[-1]
         parts.append(_resampled(path, rows[:last], window, line - len(rows)))
-        rest = rows[last:]
-    if not len(rest):
+        begun = rows[last:]
+    if not len(begun):
         raise format_error(path, "it has no rows")
-    parts.append(_resampled(path, rest, window, line - len(rest)))
+    parts.append(_resampled(path, begun, window, line - len(begun)))
     names = [field.name for field in fields(Captures)]
     return Captures(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -137,11 +137,11 @@ def _blocks(path: Path) -> Iterator[np.ndarray]:
 def _words(error: Exception) -> str:
     """Return what is wrong with a line that pyarrow cannot parse."""
     text = " ".join(str(error).split())
-    if found := re.search(r"column #(\d+): Row #(\d+): .*invalid value ('.*')", text):
-        column, line, value = found.groups()
+    if match := re.search(r"column #(\d+): Row #(\d+): .*invalid value ('.*')", text):
+        column, line, value = match.groups()
         return f"line {line} has {value} for {COLUMNS[int(column)]}, not a whole number"
-    if found := re.search(r"Row #(\d+): Expected \d+ columns, got (\d+)", text):
-        return f"line {found[1]} has {found[2]} columns, not {len(COLUMNS)}, as if cut off"
+    if match := re.search(r"Row #(\d+): Expected \d+ columns, got (\d+)", text):
+        return f"line {match[1]} has {match[2]} columns, not {len(COLUMNS)}, as if cut off"
     return text
 
 
@@ -160,23 +160,23 @@ def _check_header(path: Path) -> None:
         raise format_error(path, "it has no rows")
 
 
-def _check(path: Path, rows: np.ndarray, known: int, line: int) -> None:
+def _check(path: Path, rows: np.ndarray, checked: int, line: int) -> None:
     """Refuse values out of range, and frames that do not run 1, 2, 3, ... within one capture.
 
     Args:
         path: for the message.
         rows: (R, 68).
-        known: number of rows that have been checked before.
+        checked: number of rows that have been checked before.
         line: number of the first unchecked row's line.
     """
-    new = rows[known:]
+    new = rows[checked:]
     for name, largest in _LARGEST.items():
         values = new[:, COLUMNS.index(name)]
         _refuse_first(path, (values < 1) | (values > largest), line, f"{name} is not 1 to {largest}")
     counts = new[:, _HEAD:]
     wild = (counts.min(axis=1) < 0) | (counts.max(axis=1) > FULL)
     _refuse_first(path, wild, line, f"a channel is not within 0 to {FULL}")
-    before = rows[known - 1 : -1] if known else np.concatenate([np.zeros_like(rows[:1]), rows[:-1]])
+    before = rows[checked - 1 : -1] if checked else np.concatenate([np.zeros_like(rows[:1]), rows[:-1]])
     same = (new[:, :_FRAME] == before[:, :_FRAME]).all(axis=1)
     follows = same & (before[:, _FRAME] > 0) & (new[:, _FRAME] == before[:, _FRAME] + 1)
     broken = ~follows & (new[:, _FRAME] != 1)
@@ -234,34 +234,34 @@ def cached_captures(path: Path, window: int) -> Captures:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
     key = hashlib.sha256(f"{_FORMAT} {window} {content}".encode()).hexdigest()
     stored = folder(None) / f"cost-{key}.npz"
-    known = _load(stored, window)
-    if known is not None:
-        return known
-    found = read_captures(path, window)
+    cached = _load(stored, window)
+    if cached is not None:
+        return cached
+    captures = read_captures(path, window)
     try:
-        _save(stored, found)
+        _save(stored, captures)
     except InputError as error:
         warnings.warn(f"captures cannot be kept in {stored.parent}: {error}", RuntimeWarning, stacklevel=2)
-    return found
+    return captures
 
 
 def _load(path: Path, window: int) -> Captures | None:
     """Return the captures in a cache file, or None if it is missing or invalid."""
     try:
         stored = load_npz(path)
-        found = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
+        captures = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
     except Exception:  # A broken archive may raise anything; the file is then read again.
         return None
-    sound = found.counts.shape[1:] == (window, CHANNELS) and found.counts.dtype == np.float32
-    others = [values for name, values in vars(found).items() if name != "counts"]
-    sound = sound and all(one.shape == (len(found),) and one.dtype.kind == "i" for one in others)
-    return found if sound else None
+    sound = captures.counts.shape[1:] == (window, CHANNELS) and captures.counts.dtype == np.float32
+    others = [values for name, values in vars(captures).items() if name != "counts"]
+    sound = sound and all(array.shape == (len(captures),) and array.dtype.kind == "i" for array in others)
+    return captures if sound else None
 
 
-def _save(path: Path, found: Captures) -> None:
+def _save(path: Path, captures: Captures) -> None:
     """Write a cache file atomically: other processes may read or write it at the same time."""
     with whole(path) as partial:
-        np.savez(partial, **vars(found))
+        np.savez(partial, **vars(captures))
 
 
 GESTURES = (
@@ -352,7 +352,7 @@ class Cost(AbstractDevice):
             raise InputError(f"device.gestures={self.gestures} is a single class: add device.variants=true")
         self._channels = _channels(self.taxels, self.taxel_seed)
         self.size = (_EDGE * self.pitch, _EDGE * self.pitch)
-        places = grid(_EDGE, _EDGE)[self._channels] * self.size
+        places = tile_centres(_EDGE, _EDGE)[self._channels] * self.size
         flat = np.column_stack([places, np.zeros(len(places))])
         self.sensors = Sensors(flat, (self.pitch, self.pitch))
         self._read(names)
@@ -376,34 +376,34 @@ class Cost(AbstractDevice):
 
     def _read(self, names: tuple[str, ...]) -> None:
         path = Path(str(self.path)).expanduser()
-        found = cached_captures(path, self.window)
-        rows = int(found.frames.sum(dtype=np.int64))
-        if self.strict and (rows, len(found)) != (ROWS, CAPTURES):
+        captures = cached_captures(path, self.window)
+        rows = int(captures.frames.sum(dtype=np.int64))
+        if self.strict and (rows, len(captures)) != (ROWS, CAPTURES):
             raise format_error(
                 path,
-                f"it has {rows} rows in {len(found)} captures, the whole corpus has {ROWS} in {CAPTURES}",
+                f"it has {rows} rows in {len(captures)} captures, the whole corpus has {ROWS} in {CAPTURES}",
                 "add device.strict=false to use a part of it, or download it again",
             )
-        wanted = np.isin(found.gesture, [1 + GESTURES.index(name) for name in names])
-        if not wanted.any():
+        chosen = np.isin(captures.gesture, [1 + GESTURES.index(name) for name in names])
+        if not chosen.any():
             raise InputError(
                 f"{path} has no capture of {', '.join(names)}: choose others, device.gestures=all"
             )
-        self._captures = found[wanted]
+        self._captures = captures[chosen]
 
     def _divide(self, subjects: np.ndarray) -> dict[Split, list[int]]:
         """Return the subjects of each split; the order depends on ``split_seed`` alone."""
         order = generator(Stream.SPLIT, self.split_seed).permutation(subjects).tolist()
         taken = {name: max(1, round(share * len(order))) for name, share in _SHARES.items()}
         if self.test_subjects is not None:
-            given = _numbers(self.test_subjects, "test_subjects")
-            if unknown := [number for number in given if number not in order]:
+            numbers = _numbers(self.test_subjects, "test_subjects")
+            if unknown := [number for number in numbers if number not in order]:
                 raise InputError(
                     f"device.test_subjects names {unknown}, {self.path} has the subjects {subjects.tolist()} "
                     "with these gestures"
                 )
-            order = given + [number for number in order if number not in given]
-            taken["test"] = len(given)
+            order = numbers + [number for number in order if number not in numbers]
+            taken["test"] = len(numbers)
         if sum(taken.values()) >= len(order):
             raise InputError(
                 f"{self.path} has {len(order)} subjects with these gestures: {sum(taken.values())} for test, "
@@ -427,8 +427,8 @@ class Cost(AbstractDevice):
 
 def _names(gestures: str | Sequence[str]) -> tuple[str, ...]:
     """Return the names of gestures, in the order given."""
-    known = {"report": _REPORT, "all": GESTURES}
-    names = known.get(gestures, (gestures,)) if isinstance(gestures, str) else tuple(gestures)
+    choices = {"report": _REPORT, "all": GESTURES}
+    names = choices.get(gestures, (gestures,)) if isinstance(gestures, str) else tuple(gestures)
     if len(names) != len(set(names)) or not names or not set(names) <= set(GESTURES):
         raise InputError(
             f"device.gestures must be report, all or some of {', '.join(GESTURES)}, got {gestures}: as in "
@@ -437,11 +437,11 @@ def _names(gestures: str | Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _numbers(given: int | Sequence[int], name: str) -> list[int]:
+def _numbers(value: int | Sequence[int], name: str) -> list[int]:
     """Return one number or several as a list without repetition."""
-    numbers = [given] if isinstance(given, int) else list(given)
-    if not numbers or len(set(numbers)) != len(numbers) or any(type(one) is not int for one in numbers):
-        raise InputError(f"device.{name} must be different whole numbers, got {given}: as in [1,8]")
+    numbers = [value] if isinstance(value, int) else list(value)
+    if not numbers or len(set(numbers)) != len(numbers) or any(type(number) is not int for number in numbers):
+        raise InputError(f"device.{name} must be different whole numbers, got {value}: as in [1,8]")
     return numbers
 
 
@@ -456,7 +456,7 @@ def _channels(taxels: int | Sequence[int], seed: int) -> np.ndarray:
         if not 1 <= taxels <= count or isinstance(taxels, bool):
             raise InputError(f"device.taxels must be 1 to {count} or a list of channels, got {taxels}")
         order = generator(Stream.POSITION, seed).permutation(count)
-        places = grid(_EDGE, _EDGE)[order]
+        places = tile_centres(_EDGE, _EDGE)[order]
         chosen = [0]
         while len(chosen) < taxels:
             apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)

@@ -149,25 +149,25 @@ def resample(
     return Resampled(strongest if polarity is None else strongest * polarity, has_value, limited)
 
 
-def check_rate(found: float, rate: float, setting: str | None = None) -> None:
+def check_rate(measured: float, rate: float, setting: str | None = None) -> None:
     """Check that a device is fast enough for a model.
 
     Args:
-        found: rate of the device, Hz.
+        measured: rate of the device, Hz.
         rate: of the model, Hz.
         setting: name of the setting with the rate of a simulated device; None: the device is real.
 
     Raises:
         InputError: the device is slower by more than 5 %.
     """
-    if _SLOWER * found >= rate:
+    if _SLOWER * measured >= rate:
         return
-    slow = f"the device sends {found:.3g} frames a second, the model needs {rate:g}: "
+    slow = f"the device sends {measured:.3g} frames a second, the model needs {rate:g}: "
     if setting is not None:
         raise InputError(f"{slow}raise {setting}, or lower touch.rate, as in {setting}={rate:g}")
     raise InputError(
         f"{slow}let the firmware send faster, or train a model at the device's rate, as in "
-        f"touch.rate={found:.2g}"
+        f"touch.rate={measured:.2g}"
     )
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from skin.body.arm import Arm
 from skin.body.base import AbstractBody, Layer
-from skin.body.layout.base import AbstractLayout, Footprint, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors
 from skin.body.layout.grid import Grid
 from skin.body.layout.hexagonal import Hexagonal
 from skin.body.layout.random import Random
@@ -160,7 +160,7 @@ class SkinDistribution:
         shorter = longer / generator.uniform(*self.aspect)
         sides = (longer, shorter) if generator.random() < 0.5 else (shorter, longer)
         base, top = generator.uniform(*self.base), generator.uniform(*self.top)
-        stiff, soft = (_logarithmic(one, generator) for one in (self.base_young, self.top_young))
+        stiff, soft = (_logarithmic(limits, generator) for limits in (self.base_young, self.top_young))
         layers = (
             Layer(Material("base", stiff, _POISSON), base),
             Layer(Material("top", soft, _POISSON), top),
@@ -184,7 +184,7 @@ class _Places(AbstractLayout):
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return them in their order."""
         x, y = self.places.T
-        return place(body, x, y, self.depth, self.footprint)
+        return place_sensors(body, x, y, self.depth, self.footprint)
 
 
 def _logarithmic(limits: tuple[float, float], generator: np.random.Generator) -> float:
@@ -240,10 +240,10 @@ def _clustered(
     spread, places = 0.15 * extent, np.empty((0, 2))
     for attempt in range(_TRIES):
         wide = spread * (1 + 4 * attempt / _TRIES)
-        found = centres[generator.integers(len(centres))] + wide * generator.normal(size=2)
-        found = np.clip(found, side / 2, extent - side / 2)
-        if (np.abs(places - found) >= side).any(axis=1).all():
-            places = np.vstack([places, found])
+        candidate = centres[generator.integers(len(centres))] + wide * generator.normal(size=2)
+        candidate = np.clip(candidate, side / 2, extent - side / 2)
+        if (np.abs(places - candidate) >= side).any(axis=1).all():
+            places = np.vstack([places, candidate])
         if len(places) == count:
             break
     return places[np.argsort(places[:, 1], kind="stable")]

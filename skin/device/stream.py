@@ -68,9 +68,9 @@ class Timeline:
         step = torch.arange(len(gesture)) - (self.duration.cumsum(0) - self.duration)[gesture]
         frame = self.begin[gesture] + step
         inside = frame < self.length
-        shown = (self.movie.parameters["onset"].long()[gesture] + step)[inside]
+        column = (self.movie.parameters["onset"].long()[gesture] + step)[inside]
         result = values.new_zeros(self.length, *values.shape[2:])
-        result[frame[inside]] = values[gesture[inside], shown]
+        result[frame[inside]] = values[gesture[inside], column]
         return result
 
     def window_content(self, starts: Tensor, window: int) -> WindowContent:
@@ -117,9 +117,9 @@ def draw_timeline(
         begins.append(ends - duration)
         filled = int(ends[-1])
     begin = torch.from_numpy(np.concatenate(begins))
-    kept = begin < length
-    kept[0] = True  # at least one, even if a short stream ends before it
-    return Timeline(join_movies(movies)[kept], begin[kept], length)
+    inside = begin < length
+    inside[0] = True  # at least one, even if a short stream ends before it
+    return Timeline(join_movies(movies)[inside], begin[inside], length)
 
 
 @dataclass(frozen=True)
@@ -177,12 +177,12 @@ class TouchStream:
             return None if values is None else values[0][frames]
 
         whole, felt = self.whole, self.whole.touches
-        known = {name: values[gesture] for name, values in self.timeline.movie.parameters.items()}
-        known["onset"] = (self.timeline.begin[gesture] - starts).float()
-        shown = {name: values.where(gesture >= 0, 0) for name, values in known.items()}
+        drawn = {name: values[gesture] for name, values in self.timeline.movie.parameters.items()}
+        drawn["onset"] = (self.timeline.begin[gesture] - starts).float()
+        parameters = {name: values.where(gesture >= 0, 0) for name, values in drawn.items()}
         saturated = windows(felt.saturated)
-        own = {} if saturated is None else {"clipped": saturated.flatten(1).any(1).float()}
-        own |= {"share": share.float()}
+        content = {} if saturated is None else {"clipped": saturated.flatten(1).any(1).float()}
+        content |= {"share": share.float()}
         return replace(
             whole,
             touches=replace(
@@ -195,7 +195,7 @@ class TouchStream:
             ),
             force=windows(whole.force),
             displacement=windows(whole.displacement),
-            parameters=shown | own,
+            parameters=parameters | content,
         )
 
 

@@ -112,28 +112,28 @@ def measure_margins(
     assert labels is not None
     places = [device.task.names.index(name) for name in TOUCH.names]
     chances = learner.probabilities(touches)[:, places]
-    said, known = chances > 0.5, recording.parameters
-    measures = Measures(*(known[name] for name in Measures._fields))
+    predicted, parameters = chances > 0.5, recording.parameters
+    measures = Measures(*(parameters[name] for name in Measures._fields))
     settings = simulation.sampler.settings
     shares = _shares(measures, settings.thresholds, settings.frames.duration)
-    found = {name: find_spans(said[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
+    spans = {name: find_spans(predicted[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
-    found[ALARM_NAME] = find_spans(point.alarm(chances[:, danger]), shares[:, danger])
-    faint = _faint(said != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
+    spans[ALARM_NAME] = find_spans(point.alarm(chances[:, danger]), shares[:, danger])
+    faint = _faint(predicted != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
     overall = compute_metrics(chances, labels, TOUCH, point)
-    return MarginReport(found, faint, point, point.reached(chances, labels, TOUCH), overall)
+    return MarginReport(spans, faint, point, point.reached(chances, labels, TOUCH), overall)
 
 
-def find_spans(said: Tensor, shares: Tensor) -> list[Span]:
+def find_spans(predicted: Tensor, shares: Tensor) -> list[Span]:
     """Return the spans that are not empty.
 
     Args:
-        said: (B,), bool, whether the learner predicts the label.
+        predicted: (B,), bool, whether the learner predicts the label.
         shares: (B,), measure divided by its threshold.
     """
     return [
-        Span(low, high, float(shares[here].mean()), int(here.sum()), int(said[here].sum()))
-        for low, high, here in _between(_SHARES, shares)
+        Span(low, high, float(shares[inside].mean()), int(inside.sum()), int(predicted[inside].sum()))
+        for low, high, inside in _between(_SHARES, shares)
     ]
 
 
@@ -152,15 +152,18 @@ def _faint(wrong: Tensor, strength: Tensor) -> list[Faint]:
     """Return the errors (B, 4) by the strength (B,), N, of the touch."""
     return [
         Faint(
-            low, high, int(here.sum()), dict(zip(TOUCH.names, wrong[here].sum(dim=0).tolist(), strict=True))
+            low,
+            high,
+            int(inside.sum()),
+            dict(zip(TOUCH.names, wrong[inside].sum(dim=0).tolist(), strict=True)),
         )
-        for low, high, here in _between(_STRENGTHS, strength)
+        for low, high, inside in _between(_STRENGTHS, strength)
     ]
 
 
 def _between(edges: Sequence[float], values: Tensor) -> Iterator[tuple[float, float, Tensor]]:
     """Yield each range (low, high] that holds some of the values (B,), and which, bool; 0 is in the first."""
     for low, high in pairwise(edges):
-        here = (values <= high) & ((values > low) | (low == 0))
-        if here.any():
-            yield low, high, here
+        inside = (values <= high) & ((values > low) | (low == 0))
+        if inside.any():
+            yield low, high, inside

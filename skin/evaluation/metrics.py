@@ -62,8 +62,8 @@ def compute_metrics(
             values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = calibration_error(chance, label)
     for metric in ("accuracy", "balanced_accuracy", "ece"):
-        each = [values[f"{name}/{metric}"] for name in task.gated]
-        values[f"overall/{metric}"] = sum(each) / len(each)
+        scores = [values[f"{name}/{metric}"] for name in task.gated]
+        values[f"overall/{metric}"] = sum(scores) / len(scores)
     if task.direction:
         degrees = measure_angles(probabilities, labels, task)
         values["direction/degrees"] = float(degrees.mean())
@@ -156,8 +156,8 @@ def encode(
 def decodable(metric: str, task: Task) -> bool:
     """Return whether :func:`decode` knows a metric."""
     label, _, kind = metric.partition("/")
-    known = label in (*task.names, "overall") and kind == "accuracy"
-    return known or metric in (f"{LABEL}/alarm_recall", f"{LABEL}/false_alarm_rate")
+    scored = label in (*task.names, "overall") and kind == "accuracy"
+    return scored or metric in (f"{LABEL}/alarm_recall", f"{LABEL}/false_alarm_rate")
 
 
 def decode(outcomes: np.ndarray, metric: str, task: Task) -> np.ndarray:

@@ -141,12 +141,12 @@ class OperatingPoint:
 
     def sentence(self) -> str:
         """Return a sentence with the threshold and how it was chosen."""
-        wanted = f"alarm above {self.threshold:.4f}"
+        rule = f"alarm above {self.threshold:.4f}"
         if not self.safe:
-            return f"{wanted}: not chosen on any gestures, its false-alarm rate is unknown"
+            return f"{rule}: not chosen on any gestures, its false-alarm rate is unknown"
         kind = "safe validation" if self.seed is None else "fresh safe"
         what = "gestures" if self.rate is None else f"touches at {self.rate:.3g} Hz"
-        text = f"{wanted}, chosen on {self.safe} {kind} {what} for {100 * self.target:g} % false alarms"
+        text = f"{rule}, chosen on {self.safe} {kind} {what} for {100 * self.target:g} % false alarms"
         if self.dangerous:
             text += f", finds {100 * self.found / self.dangerous:.1f} % of {self.dangerous} dangerous ones"
         return text
@@ -186,9 +186,9 @@ def parse_operating_point(text: str) -> OperatingPoint | None:
             int(stored["dangerous"]),
             int(stored["found"]),
         )
-        known = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
+        usable = stored["label"] == LABEL and point.threshold > 0 and 0 < point.target < 1
         counted = 0 <= point.raised <= point.safe and 0 <= point.found <= point.dangerous
-        if not known or not counted or not math.isfinite(point.threshold):
+        if not usable or not counted or not math.isfinite(point.threshold):
             raise ValueError(text)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise InputError(
@@ -384,8 +384,8 @@ def _decision_windows(
     begun = torch.where(contact, end, torch.iinfo(end.dtype).max).amin(dim=1, keepdim=True)
     lasted = (end - begun) / ratio + 1
     for touch, decision in (contact & (lasted > longest_shown(held, recent, window))).nonzero().tolist():
-        shown = as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
-        windows[touch, decision] = torch.from_numpy(shown)
+        press = as_press(windows[touch, 0].numpy(), windows[touch, decision].numpy(), held)
+        windows[touch, decision] = torch.from_numpy(press)
     return windows * valid[:, None, None], valid, contact
 
 

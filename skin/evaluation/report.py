@@ -84,26 +84,26 @@ def evaluate(
         settings: number of other devices and layouts.
         point: operating point of the alarm; None where the task has no label ``dangerous``.
     """
-    task, found, cannot = device.task, dict[str, float](), dict[str, str]()
+    task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
-    found |= _named("same", compute_metrics(chances, _labels(same), task, point))
+    metrics |= _named("same", compute_metrics(chances, _labels(same), task, point))
     others = touch_sets(device, settings)
     del others["same"]
     for column, sets in others.items():
         try:
-            each = [(learner.probabilities(touches), _labels(touches)) for touches in sets]
+            pairs = [(learner.probabilities(touches), _labels(touches)) for touches in sets]
         except InputError as reason:
             cannot[column] = str(reason)
             continue
-        if each:
-            said, true = (torch.cat(parts) for parts in zip(*each, strict=True))
-            found |= _named(column, compute_metrics(said, true, task, point))
-    cannot |= {name: _UNDEFINED for name, value in found.items() if isnan(value) and name.endswith(_SHOWN)}
+        if pairs:
+            predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+            metrics |= _named(column, compute_metrics(predicted, true, task, point))
+    cannot |= {name: _UNDEFINED for name, value in metrics.items() if isnan(value) and name.endswith(_SHOWN)}
     table = count_confusions(chances, _labels(same), task) if task.kind == "binary" else None
     reached = None if point is None else point.reached(chances, _labels(same), task)
     outcomes = encode(chances, _labels(same), task, point)
-    return Report(found, cannot, table, _predictions(chances, same, task, drawn), point, reached, outcomes)
+    return Report(metrics, cannot, table, _predictions(chances, same, task, drawn), point, reached, outcomes)
 
 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
@@ -122,8 +122,8 @@ def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterato
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
     """Yield the share of the test touches that each of some other devices of the same kind measures."""
     for number in range(settings.devices):
-        other = device.replace(seed=_FIRST_DEVICE + number)
-        yield _share(other.touches("test"), number, settings.devices)
+        sibling = device.replace(seed=_FIRST_DEVICE + number)
+        yield _share(sibling.touches("test"), number, settings.devices)
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
@@ -165,26 +165,26 @@ def _named(column: str, values: dict[str, float]) -> dict[str, float]:
 def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
     columns: dict[str, np.ndarray] = {}
     for name, label, chance in zip(task.names, _labels(touches).T, chances.T, strict=True):
-        known = label.to(torch.int8) if name in task.binary else label
-        columns |= {name: known.numpy(), f"p_{name}": chance.numpy()}
+        truth = label.to(torch.int8) if name in task.binary else label
+        columns |= {name: truth.numpy(), f"p_{name}": chance.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)
 
 
-def print_report(found: Report, title: str, console: Console | None = None) -> None:
+def print_report(report: Report, title: str, console: Console | None = None) -> None:
     """Print one line per label and one column per set of touches, accuracies in per cent, errors in degrees.
 
     Args:
-        found: result of the evaluation.
+        report: result of the evaluation.
         title: of the table.
         console: where to print; None: standard output.
     """
     console = console or Console()
-    console.print(metrics_table(found.metrics, title))
-    if found.point is not None and found.reached is not None:
-        said = f"{found.point.sentence()}; {found.reached.sentence()}"
-        console.print(said, markup=False, highlight=False, soft_wrap=True)
-    for column, reason in found.cannot.items():
+    console.print(metrics_table(report.metrics, title))
+    if report.point is not None and report.reached is not None:
+        sentence = f"{report.point.sentence()}; {report.reached.sentence()}"
+        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+    for column, reason in report.cannot.items():
         console.print(f"{column}: {reason}", markup=False)
 
 
@@ -205,47 +205,47 @@ def format_number(value: float | None, unit: float = 100) -> str:
     return "" if value is None else "-" if isnan(value) else f"{unit * value:.1f}"
 
 
-def evaluation_markdown(found: Report, task: Task, title: str, about: str) -> str:
+def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> str:
     """Return a page in Markdown: accuracies in per cent, and how often each label was taken for what.
 
     Args:
-        found: what an evaluation found.
+        report: what an evaluation found.
         task: the labels.
         title: of the page.
         about: a sentence on where the touches came from.
     """
-    columns = list(dict.fromkeys(name.split("/")[0] for name in found.metrics))
+    columns = list(dict.fromkeys(name.split("/")[0] for name in report.metrics))
     lines = [f"# {title}", "", about, "", "Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
-    rows = dict.fromkeys(name.split("/", 1)[1] for name in found.metrics)
+    rows = dict.fromkeys(name.split("/", 1)[1] for name in report.metrics)
     for row in rows:
         if row.endswith(PERCENTAGES):
-            shares = (found.metrics.get(f"{column}/{row}") for column in columns)
+            shares = (report.metrics.get(f"{column}/{row}") for column in columns)
             lines.append(f"| {row} | {' | '.join(map(format_number, shares))} |")
         if row.endswith("/degrees"):
-            sizes = (found.metrics.get(f"{column}/{row}") for column in columns)
+            sizes = (report.metrics.get(f"{column}/{row}") for column in columns)
             lines.append(
                 f"| {row} | {' | '.join(format_number(x, 1) + '°' * (x is not None) for x in sizes)} |"
             )
-    if found.point is not None and found.reached is not None:
-        lines += ["", f"{found.point.sentence()}; {found.reached.sentence()}."]
-    lines += [f"\n{column}: {reason}" for column, reason in found.cannot.items()]
-    if found.confusion is not None:
+    if report.point is not None and report.reached is not None:
+        lines += ["", f"{report.point.sentence()}; {report.reached.sentence()}."]
+    lines += [f"\n{column}: {reason}" for column, reason in report.cannot.items()]
+    if report.confusion is not None:
         lines += [
             "",
             "| label | no, said no | no, said yes | yes, said no | yes, said yes |",
             "|---" * 5 + "|",
         ]
-        for name, counts in zip(task.binary, found.confusion.numpy().astype(int), strict=True):
+        for name, counts in zip(task.binary, report.confusion.numpy().astype(int), strict=True):
             lines.append(f"| {name} | {' | '.join(map(str, counts.ravel().tolist()))} |")
     return "\n".join(lines) + "\n"
 
 
-def publish_evaluation(path: Path, found: Report, task: Task, title: str, about: str) -> list[Path]:
+def publish_evaluation(path: Path, report: Report, task: Task, title: str, about: str) -> list[Path]:
     """Write ``path`` (.md), and the confusion matrices beside it (.png), each whole."""
-    written = [write(evaluation_markdown(found, task, title, about), path)]
-    if found.confusion is not None:
-        named = dict(zip(task.binary, found.confusion.numpy(), strict=True))
+    written = [write(evaluation_markdown(report, task, title, about), path)]
+    if report.confusion is not None:
+        named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
         written.append(save_figure(confusions(named, ("no", "yes")), path.with_suffix(".png")))
     return written
 
@@ -267,7 +267,7 @@ def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, pat
     with whole(path) as partial:
         pa.csv.write_csv(table, partial)
     levels = dict.fromkeys(task.binary, 0.5) | ({} if point is None else {LABEL: point.threshold})
-    said = [
+    lines = [
         f"gesture {number}: "
         + ", ".join(
             f"{'' if chance > levels[name] else 'not '}{name} ({chance:.2f})"
@@ -276,7 +276,7 @@ def write_chances(chances: Tensor, task: Task, point: OperatingPoint | None, pat
         + (_slide(row, task) if task.direction else "")
         for number, row in enumerate(chances.tolist())
     ]
-    return "\n".join(said), path
+    return "\n".join(lines), path
 
 
 def _slide(row: Sequence[float], task: Task) -> str:

@@ -76,15 +76,15 @@ def count_alarms(alarm: Tensor, gesture: Tensor, dangerous: Tensor, hours: float
     idle = gesture < 0
     wrong = alarm & idle
     began = wrong & ~torch.cat([torch.zeros(1, dtype=torch.bool), wrong[:-1]])
-    shown, raised = torch.zeros(2, len(dangerous), dtype=torch.bool)
-    shown[gesture[~idle]] = True
+    seen, raised = torch.zeros(2, len(dangerous), dtype=torch.bool)
+    seen[gesture[~idle]] = True
     raised[gesture[alarm & ~idle]] = True
     return Alarms(
         idle_hours=float(idle.sum()) * hours,
         false=int(began.sum()),
-        dangerous=int((shown & dangerous).sum()),
+        dangerous=int((seen & dangerous).sum()),
         found=int((raised & dangerous).sum()),
-        safe=int((shown & ~dangerous).sum()),
+        safe=int((seen & ~dangerous).sum()),
         raised=int((raised & ~dangerous).sum()),
     )
 
@@ -142,9 +142,9 @@ class WindowReport:
             "gate/threshold/least": self.threshold,
             "alarms/threshold": self.point.threshold,
         }
-        for one in self.bins:
-            values |= {f"share/{one.name}/{name}/accuracy": value for name, value in one.accuracy.items()}
-            values[f"share/{one.name}/overall/accuracy"] = one.overall
+        for entry in self.bins:
+            values |= {f"share/{entry.name}/{name}/accuracy": value for name, value in entry.accuracy.items()}
+            values[f"share/{entry.name}/overall/accuracy"] = entry.overall
         for gate, counts in self.gates.items():
             values[f"gate/{gate}/accuracy"] = float(counts.diag().sum() / counts.sum())
         for gate, alarms in self.alarms.items():
@@ -184,10 +184,10 @@ def evaluate_windows(
     touches, labels = recording.touches, recording.touches.labels
     assert labels is not None
     chances = learner.probabilities(touches)
-    said = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
+    answers = {name: gate(touches, chances) for name, gate in all_gates.items() if name != "none"}
     return WindowReport(
         bin_by_share(chances, labels, recording.parameters["share"], device.task),
-        {name: binary_confusion_matrix(answer.long(), labels[:, -1].long()) for name, answer in said.items()},
+        {name: binary_confusion_matrix(gate.long(), labels[:, -1].long()) for name, gate in answers.items()},
         threshold.least,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
         settings.hours,
@@ -199,9 +199,9 @@ def evaluate_windows(
 
 def _tuned(device: AbstractSimulated) -> ContactThreshold:
     """Return the threshold that separates touched from idle windows, tuned on the validation split."""
-    known, idle = device.touches("validation"), device.idle
-    assert known.labels is not None
-    return ContactThreshold.tuned(rise(known, idle), known.labels[:, -1] > 0.5, idle)
+    touches, idle = device.touches("validation"), device.idle
+    assert touches.labels is not None
+    return ContactThreshold.tuned(rise(touches, idle), touches.labels[:, -1] > 0.5, idle)
 
 
 def bin_by_share(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> list[Bin]:
@@ -219,15 +219,15 @@ def bin_by_share(chances: Tensor, labels: Tensor, share: Tensor, task: Task) -> 
     group = torch.bucketize(share, torch.tensor(_EDGES)).where(share < 1, len(_EDGES) + 1)
     ends = [0.0, *_EDGES, 1.0]
     titles = [*(f"{low:g}-{high:g}" for low, high in pairwise(ends)), "whole"]
-    found = []
+    bins = []
     for number, title in enumerate(titles):
-        here = (group == number) & (share > 0)
-        if here.any():
-            yes = truth[here].float().mean(0)
-            shares = right[here].float().mean(0).tolist(), torch.maximum(yes, 1 - yes).tolist()
-            each = (dict(zip(names, values, strict=True)) for values in shares)
-            found.append(Bin(title, int(here.sum()), *each))
-    return found
+        inside = (group == number) & (share > 0)
+        if inside.any():
+            yes = truth[inside].float().mean(0)
+            shares = right[inside].float().mean(0).tolist(), torch.maximum(yes, 1 - yes).tolist()
+            tables = (dict(zip(names, values, strict=True)) for values in shares)
+            bins.append(Bin(title, int(inside.sum()), *tables))
+    return bins
 
 
 def _listen(
@@ -256,7 +256,7 @@ def _listen(
     gesture = stream.timeline.window_content(starts, device.window).gesture
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
     hours = stride / rate / 3600
-    return {name: count_alarms(torch.cat(said), gesture, truth, hours) for name, said in heard.items()}
+    return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in heard.items()}
 
 
 def _frames(seconds: float, rate: float, name: str) -> int:
@@ -279,9 +279,9 @@ def _length(learner: Predictor, device: AbstractSimulated, window: float) -> flo
     settings = device.sampler.settings
     try:
         press = settings.press[0], min(settings.press[1], window)
-        other = device.replace(touch=replace(settings, window=window, press=press)).touches("test")
-        assert other.labels is not None
-        found = compute_metrics(learner.probabilities(other), other.labels, device.task)
+        longer = device.replace(touch=replace(settings, window=window, press=press)).touches("test")
+        assert longer.labels is not None
+        metrics = compute_metrics(learner.probabilities(longer), longer.labels, device.task)
     except InputError as reason:
         return str(reason)
-    return found["overall/accuracy"]
+    return metrics["overall/accuracy"]

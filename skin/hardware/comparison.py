@@ -210,8 +210,8 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
         if valid.any() and simulated.any():
             time = np.arange(len(simulated)) / device.model_rate
             measured = np.where(valid, values.astype(float), np.nan)
-            known = dict(take.labels or {})
-            pairs.append(Pair(take.number, known, time, gesture.applied, simulated, measured, valid))
+            prompt = dict(take.labels or {})
+            pairs.append(Pair(take.number, prompt, time, gesture.applied, simulated, measured, valid))
     if not pairs:
         raise InputError(f"{path} has no gesture that any sensor feels: record more, or check the wiring")
     valid = np.stack([pair.valid for pair in pairs])
@@ -287,8 +287,8 @@ def compare_presses(device: AbstractSimulated, bench: BenchData, scale: float | 
 
 def _subtract_idle(values: np.ndarray, idle: np.ndarray) -> np.ndarray:
     """Return readings (T, S) without their idle medians; NaN for a channel without values."""
-    rest = np.ma.median(np.ma.masked_invalid(values[idle]), axis=0)
-    return values - np.ma.filled(rest, np.nan)
+    medians = np.ma.median(np.ma.masked_invalid(values[idle]), axis=0)
+    return values - np.ma.filled(medians, np.nan)
 
 
 def _cut_press(

@@ -49,8 +49,8 @@ class Fingertip:
 
 def _samples(count: int, cell: float, rim: float) -> Tensor:
     """Return sample points along an axis, m: equally many in each cell."""
-    each = max(1, math.ceil(cell / (2 * rim)))
-    return (torch.arange(count * each, dtype=torch.float64) + 0.5) * (cell / each)
+    samples = max(1, math.ceil(cell / (2 * rim)))
+    return (torch.arange(count * samples, dtype=torch.float64) + 0.5) * (cell / samples)
 
 
 _RADIUS, _RIM = 0.008, 0.0015  # m, of the fingertip that probes a skin
@@ -82,10 +82,10 @@ def sensor_geometry(body: AbstractBody, sensors: Sensors, model: AbstractSimulat
     uniform = model(torch.full((1, *body.shape), _UNIFORM)).readings[0]
     share = uniform / (_UNIFORM * math.prod(sensors.footprint))
     reaches = torch.stack([_response(body, sensors, model, reach) for reach in REACHES], dim=1)
-    known = torch.from_numpy(np.concatenate(parts, axis=1)).float()
-    found = torch.cat([known, share[:, None].float(), reaches.float()], dim=1)
-    assert found.shape == (count, len(GEOMETRY))
-    return found
+    design = torch.from_numpy(np.concatenate(parts, axis=1)).float()
+    columns = torch.cat([design, share[:, None].float(), reaches.float()], dim=1)
+    assert columns.shape == (count, len(GEOMETRY))
+    return columns
 
 
 def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, reach: float) -> Tensor:
@@ -98,8 +98,8 @@ def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, re
         inside, axis=1, keepdims=True
     )  # of a small body: beyond the edge is better than nowhere
     owner, number = np.nonzero(inside)
-    rest = np.broadcast_to([_RADIUS, 1.0], (len(owner), 2))
-    touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), rest], axis=1))
+    constants = np.broadcast_to([_RADIUS, 1.0], (len(owner), 2))
+    touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), constants], axis=1))
     rows = torch.arange(len(owner))
     index = torch.from_numpy(owner)
     fingertip = Fingertip(body, _RIM)

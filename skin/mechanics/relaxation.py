@@ -40,12 +40,12 @@ def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Te
 
 def running_peak(readings: Tensor) -> Tensor:
     """Return the largest |reading| since a sensor was last at rest, (B, T, S), N."""
-    size, found = readings.abs(), torch.empty_like(readings)
+    size, peaks = readings.abs(), torch.empty_like(readings)
     peak = torch.zeros_like(size[:, 0])
     for number, frame in enumerate(size.unbind(1)):
         peak = torch.where(frame > 0, torch.maximum(peak, frame), 0)
-        found[:, number] = peak
-    return found
+        peaks[:, number] = peak
+    return peaks
 
 
 def apply_hysteresis(readings: Tensor, hysteresis: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ def relaxes(body: AbstractBody) -> bool:
     return any(layer.material.relaxation for layer in body.layers)
 
 
-def elastic(body: AbstractBody, speed: float) -> AbstractBody:
+def make_elastic(body: AbstractBody, speed: float) -> AbstractBody:
     """Return the elastic body with the response of the viscoelastic one to a load exp(``speed`` t), 1/s."""
     return replace(
         body, layers=tuple(replace(layer, material=layer.material.elastic(speed)) for layer in body.layers)
@@ -136,7 +136,8 @@ class Relaxing(AbstractSimulator):
         super().__init__()
         self.lags, self.rate = times(body), float(rate)
         at = speeds(self.lags)
-        self.models = nn.ModuleList(simulator(elastic(body, speed), sensors) for speed in [*at, math.inf])
+        bodies = (make_elastic(body, speed) for speed in [*at, math.inf])
+        self.models = nn.ModuleList(simulator(elastic, sensors) for elastic in bodies)
         self._relaxed.linear(torch.zeros(body.shape))  # raises here instead of in the first batch
         terms = 1 / (1 + np.outer(at, self.lags))
         self.register_buffer("shares", torch.from_numpy(np.linalg.inv(terms)))

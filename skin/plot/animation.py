@@ -62,9 +62,9 @@ def write_animation(scene: Scene, view: str, path: Path) -> Path:
     """
     step = thinning(len(scene.readings), scene.rate)
     pictures = _pictures(scene, view, range(0, len(scene.readings), step))
-    more, pause = pictures[1:], round(1e3 * step / scene.rate)
+    others, pause = pictures[1:], round(1e3 * step / scene.rate)
     with whole(path) as partial:
-        pictures[0].save(partial, save_all=True, append_images=more, duration=pause, loop=0)
+        pictures[0].save(partial, save_all=True, append_images=others, duration=pause, loop=0)
     return path
 
 
@@ -208,7 +208,7 @@ def _between(scene: Scene) -> np.ndarray:
 
 
 @torch.no_grad()
-def simulated(
+def simulate_scene(
     device: AbstractSimulated, labels: Sequence[str], shape: str | None, seed: int, field: bool
 ) -> Scene:
     """Draw a touch as a simulated device feels it.
@@ -228,24 +228,24 @@ def simulated(
     if shape is not None:
         device = device.replace(touch=replace(device.sampler.settings, shapes=(shape,)))
     generator = np.random.default_rng(seed)
-    wanted = np.array([[name in labels for name in TOUCH.names]])
-    movie = device.sampler.sample(1, generator, wanted)
+    holds = np.array([[name in labels for name in TOUCH.names]])
+    movie = device.sampler.sample(1, generator, holds)
     true = device.model.respond(movie, displacement=False).readings
     readings, *_ = device.imperfection.apply(true, device.constants, generator)
     pressure = movie.pressure()[0]
     moved = None
-    found = surface_motion(device.model, device.body, movie.frames) if field else None
-    if found is not None:
-        moved = found[movie.index[0]] * movie.scale[0, :, None, None].numpy()
+    motion = surface_motion(device.model, device.body, movie.frames) if field else None
+    if motion is not None:
+        moved = motion[movie.index[0]] * movie.scale[0, :, None, None].numpy()
     name = device.sampler.shapes.names[int(movie.parameters["shape"][0])]
     positions = np.broadcast_to(device.sensors.positions, (len(pressure), *device.sensors.positions.shape))
     return Scene(
-        readings[0].numpy(), positions, device.size, device.model_rate, _title(name, wanted[0], TOUCH.names),
+        readings[0].numpy(), positions, device.size, device.model_rate, _title(name, holds[0], TOUCH.names),
         pressure.numpy(), moved, _round(device.body),
     )  # fmt: skip
 
 
-def recorded(device: AbstractDevice, index: int) -> Scene:
+def read_scene(device: AbstractDevice, index: int) -> Scene:
     """Return one touch of a device: of a whole recording, or of another device's test touches.
 
     Raises:
@@ -256,12 +256,12 @@ def recorded(device: AbstractDevice, index: int) -> Scene:
         raise InputError(
             f"there are {len(touches)} touches, got index={index}: give index=0 to {len(touches) - 1}"
         )
-    one: Touches = touches[index : index + 1]
-    readings = one.readings.where(one.valid, 0)[0].numpy()
-    positions = np.broadcast_to(one.positions.numpy(), (1, *readings.shape, 3))[0]
-    said = "" if one.labels is None else _title("", one.labels[0].bool().numpy(), device.task.names)
+    touch: Touches = touches[index : index + 1]
+    readings = touch.readings.where(touch.valid, 0)[0].numpy()
+    positions = np.broadcast_to(touch.positions.numpy(), (1, *readings.shape, 3))[0]
+    heading = "" if touch.labels is None else _title("", touch.labels[0].bool().numpy(), device.task.names)
     return Scene(
-        readings, positions, device.size, one.rate, f"touch {index}{said}", body=_round(device.surface)
+        readings, positions, device.size, touch.rate, f"touch {index}{heading}", body=_round(device.surface)
     )
 
 
@@ -272,5 +272,5 @@ def _round(body: AbstractBody | None) -> AbstractBody | None:
 
 def _title(name: str, holds: np.ndarray, names: Sequence[str]) -> str:
     """Return what presses and which labels hold."""
-    said = ", ".join(label for label, on in zip(names, holds, strict=True) if on) or "no label holds"
-    return f"{name}: {said}"
+    text = ", ".join(label for label, on in zip(names, holds, strict=True) if on) or "no label holds"
+    return f"{name}: {text}"

@@ -64,8 +64,8 @@ def overview(
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
     extent = (0, size[0] * 1e3, size[1] * 1e3, 0)
-    shown = left.imshow(np.asarray(pressure) / 1e3, cmap="magma", extent=extent)
-    figure.colorbar(shown, ax=left, label="pressure, kPa", shrink=0.85)
+    image = left.imshow(np.asarray(pressure) / 1e3, cmap="magma", extent=extent)
+    figure.colorbar(image, ax=left, label="pressure, kPa", shrink=0.85)
     left.set_title("what touches")
     middle.imshow(np.asarray(picture), cmap="magma", extent=extent)
     middle.set_title(f"what {len(points)} sensors feel")
@@ -95,10 +95,15 @@ def confusions(matrices: Mapping[str, np.ndarray], names: tuple[str, str]) -> Fi
     for axis, (title, counts) in zip(axes, matrices.items(), strict=False):
         shares = counts / counts.sum(axis=1, keepdims=True).clip(min=1)
         axis.imshow(shares, cmap="Blues", vmin=0, vmax=1)
-        for (true, said), count in np.ndenumerate(counts):
-            ink = "white" if shares[true, said] > 0.5 else "black"
+        for (true, predicted), count in np.ndenumerate(counts):
+            ink = "white" if shares[true, predicted] > 0.5 else "black"
             axis.text(
-                said, true, f"{shares[true, said]:.1%}\n{count:.0f}", ha="center", va="center", color=ink
+                predicted,
+                true,
+                f"{shares[true, predicted]:.1%}\n{count:.0f}",
+                ha="center",
+                va="center",
+                color=ink,
             )
         axis.set_xticks([0, 1], names)
         axis.set_yticks([0, 1], names, rotation=90, va="center")

@@ -86,8 +86,8 @@ def space_and_traces(figure: Figure) -> tuple[Axes3D, Axes]:
 
 
 def clear(axis: Axes3D) -> None:
-    for shown in list(axis.collections):
-        shown.remove()
+    for artist in list(axis.collections):
+        artist.remove()
 
 
 def draw_traces(axis: Axes, scene: Scene) -> Draw:
@@ -191,8 +191,8 @@ def surface(moved: np.ndarray, depth: float, size: tuple[float, float], title: s
     draw_surface(space, moved, depth, size, float(moved.max()))
     flat = figure.add_subplot(1, 2, 2)
     extent = (0, 1e3 * size[0], 1e3 * size[1], 0)
-    shown = flat.imshow(1e3 * moved, cmap="viridis", extent=extent, interpolation="bilinear")
-    figure.colorbar(shown, ax=flat, label="into the skin, mm")
+    image = flat.imshow(1e3 * moved, cmap="viridis", extent=extent, interpolation="bilinear")
+    figure.colorbar(image, ax=flat, label="into the skin, mm")
     flat.set(xlabel="x, mm", ylabel="y, mm")
     return figure
 
@@ -245,9 +245,9 @@ class _Shell:
 
 def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     """Show the surface as it moves and the sensors; where nobody knows the movement, the pressure."""
-    known = scene.known(scene.pressure if scene.moved is None else scene.moved)
+    frames = scene.known(scene.pressure if scene.moved is None else scene.moved)
     axis, right = space_and_traces(figure)
-    now, shell, most = draw_traces(right, scene), _Shell(body), max(float(known.max()), 1e-9)
+    now, shell, most = draw_traces(right, scene), _Shell(body), max(float(frames.max()), 1e-9)
     stretch = 1.0
     if scene.moved is None:
         scale, what = Normalize(0, most / 1e3), "pressure, kPa"
@@ -260,7 +260,7 @@ def skin_in_space(figure: Figure, scene: Scene, body: AbstractBody) -> Draw:
     def draw(frame: int) -> None:
         clear(axis)
         if scene.moved is None:
-            _skin(axis, shell.surface(np.zeros_like(shell.lines[0])), colormaps[FORCE](known[frame] / most))
+            _skin(axis, shell.surface(np.zeros_like(shell.lines[0])), colormaps[FORCE](frames[frame] / most))
         else:
             moved = scene.moved[frame]
             _skin(axis, shell.surface(stretch * moved), colormaps[FORCE](_mean(moved) / most))

@@ -42,7 +42,7 @@ from skin.runs.configuration import plain, validate_config
 from skin.runs.finished_run import TAG, FinishedRun
 from skin.runs.progress import Steps
 from skin.runs.store import Store, note_reuse
-from skin.runs.train import describe, log_learner, log_report, tags
+from skin.runs.train import log_configuration, log_learner, log_report, tags
 from skin.touch.labels import Task
 
 ADAPTED = "adapted"
@@ -409,7 +409,7 @@ def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
     name = f"{target.config.row} {identity['simulator']} {len(touches)} gestures seed {settings.seed}"
     store = Store.open(config.tracking)
     with store.run(name, identity, parent.identity) as run:
-        describe(store, run.info.run_id, target.config, touches_hash(touches))
+        log_configuration(store, run.info.run_id, target.config, touches_hash(touches))
         steps.begin("fine-tuning")
         adaptation = fine_tune(network, data, touches, settings)
         log_learner(store, run, learner)

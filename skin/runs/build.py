@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Skin:
+class SkinModel:
     """A body with sensors and a simulator, without touches.
 
     Attributes:
@@ -41,12 +41,12 @@ class Skin:
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
 
 
-def build_skin(config: DictConfig) -> Skin:
+def build_skin(config: DictConfig) -> SkinModel:
     """Return the body, the sensors and the simulator."""
     groups = plain(config)
     body, layout = _body_and_layout(groups, "simulator")
     sensors, simulator = layout.sensors(body), instantiate(groups["simulator"])
-    return Skin(body, layout, sensors, simulator)
+    return SkinModel(body, layout, sensors, simulator)
 
 
 def _body_and_layout(groups: dict[str, Any], source: str) -> tuple[AbstractBody, AbstractLayout]:

@@ -70,7 +70,7 @@ def _file(name: str) -> Path | None:
     plain = "/" not in name and "." not in name
     try:
         paths = [path / MANIFEST if plain or path.is_dir() else path for path in candidates(name)]
-        return next((found for found in paths if found.is_file()), None)
+        return next((candidate for candidate in paths if candidate.is_file()), None)
     except OSError:
         return None
 
@@ -118,14 +118,14 @@ def _processor() -> str:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
         text = ""
-    known = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
-    if not known:
+    facts = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+    if not facts:
         return platform.processor() or platform.machine() or "unknown"
     return ", ".join(
         part for part in (
-            known.get("model name"),
-            f"family {known['cpu family']}" if "cpu family" in known else None,
-            f"model {known['model']}" if "model" in known else None,
+            facts.get("model name"),
+            f"family {facts['cpu family']}" if "cpu family" in facts else None,
+            f"model {facts['model']}" if "model" in facts else None,
         ) if part
     )  # fmt: skip
 
@@ -292,8 +292,8 @@ def _not_numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     elif isinstance(value, int) and abs(value) >= _TOO_LARGE:
         yield name, "too large"
     elif isinstance(value, dict | list):
-        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _not_numbers(one, f"{name}.{key}" if name else str(key))
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _not_numbers(entry, f"{name}.{key}" if name else str(key))
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

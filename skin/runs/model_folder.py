@@ -208,17 +208,17 @@ def _drawn(device: Mapping[str, Any]) -> bool:
 
 def _settings(group: Mapping[str, Any], *without: str) -> str:
     """Return the class of a group, if it has one, and its settings; nested ones as ``outer.inner``."""
-    kept = {key: value for key, value in group.items() if key not in without}
-    name = [f"`{kept['_target_']}`"] if "_target_" in kept else []
-    return " ".join([*name, ", ".join(_flat(kept))]).strip()
+    settings = {key: value for key, value in group.items() if key not in without}
+    name = [f"`{settings['_target_']}`"] if "_target_" in settings else []
+    return " ".join([*name, ", ".join(_flat(settings))]).strip()
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, one in value.items():
-        if isinstance(one, Mapping):
-            yield from _flat(one, f"{prefix}{key}.")
-        elif not key.startswith("_") and one is not None:
-            yield f"{prefix}{key}={str(one).replace('|', '/')}"
+    for key, entry in value.items():
+        if isinstance(entry, Mapping):
+            yield from _flat(entry, f"{prefix}{key}.")
+        elif not key.startswith("_") and entry is not None:
+            yield f"{prefix}{key}={str(entry).replace('|', '/')}"
 
 
 def _table(title: str, rows: Iterator[tuple[str, str]], about: str = "") -> str:

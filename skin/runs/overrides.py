@@ -123,7 +123,7 @@ def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> No
     Raises:
         InputError: it changes a setting that the weights depend on.
     """
-    given = _raw(composed)
+    settings = _raw(composed)
     taken = option.group in composed and option.group not in _FIXED
     if taken:
         _take(whole, composed, option.group)
@@ -132,7 +132,7 @@ def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> No
         if taken and group == option.group:
             continue
         # What a later file or the command line replaced is not taken.
-        if _is_steering(group) or _value(given, path) != value:
+        if _is_steering(group) or _value(settings, path) != value:
             continue
         if group in _FIXED:
             if _value(plain(whole), path) != _value(plain(composed), path):
@@ -140,7 +140,7 @@ def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> No
                     f"{'.'.join(path)} in the option {option.name} was fixed when the run was trained: leave "
                     "it out of the file, or train another run"
                 )
-        elif _value(given, (group, "_target_")) != _value(_raw(whole), (group, "_target_")):
+        elif _value(settings, (group, "_target_")) != _value(_raw(whole), (group, "_target_")):
             _take(whole, composed, group)
         else:
             _take_leaf(whole, path, value)
@@ -177,9 +177,9 @@ def profile_settings(name: str) -> dict[str, Any]:
         InputError: there is no such profile.
     """
     loader = GlobalHydra.instance().config_loader()
-    known = loader.get_group_options("profile")
-    if name not in known:
-        raise InputError(f"there is no profile {name}: choose one of {', '.join(known)}")
+    names = loader.get_group_options("profile")
+    if name not in names:
+        raise InputError(f"there is no profile {name}: choose one of {', '.join(names)}")
     return plain(compose(f"profile/{name}").device)
 
 
@@ -253,11 +253,11 @@ def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, An
     }
 
 
-def _layout_settings(given: str) -> dict[str, Any]:
+def _layout_settings(name: str) -> dict[str, Any]:
     """Return the settings of a layout that is given by its name or by its file."""
-    if given.lower().endswith(".csv"):
-        return _default_option("layout", "file") | {"path": given}
-    return _default_option("layout", given)
+    if name.lower().endswith(".csv"):
+        return _default_option("layout", "file") | {"path": name}
+    return _default_option("layout", name)
 
 
 def _default_option(group: str, name: str) -> dict[str, Any]:

@@ -32,13 +32,13 @@ class SweepProgress:
         finished: Collection[int] = (),
         partial: Collection[int] = (),
     ) -> None:
-        known = [value for value in seconds if value is not None]
-        typical = sum(known) / len(known) if known else 1.0
+        measured = [value for value in seconds if value is not None]
+        typical = sum(measured) / len(measured) if measured else 1.0
         self._expected = [typical if value is None else value for value in seconds]
         for number in finished:
             self._expected[number] = 0.0
         self._partial = frozenset(partial)
-        self._sure = bool(known)
+        self._sure = bool(measured)
         self._spent = self._done = 0.0
 
     def finish(self, number: int, seconds: float, skipped: bool) -> None:

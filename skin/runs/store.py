@@ -235,15 +235,15 @@ def _patience() -> Iterator[None]:
 
 def _experiment(client: MlflowClient, name: str, location: str | None) -> str:
     """Return the id of an experiment, made if it is missing, perhaps by another process at the same time."""
-    if (found := client.get_experiment_by_name(name)) is None:
+    if (experiment := client.get_experiment_by_name(name)) is None:
         try:
             return client.create_experiment(name, artifact_location=location, tags=TAGS)
         except MlflowException as error:
             if error.error_code != ErrorCode.Name(RESOURCE_ALREADY_EXISTS):
                 raise
             return _experiment(client, name, location)
-    _tag(client, found)
-    return str(found.experiment_id)
+    _tag(client, experiment)
+    return str(experiment.experiment_id)
 
 
 def _tag(client: MlflowClient, experiment: Experiment) -> None:

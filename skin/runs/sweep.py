@@ -56,8 +56,8 @@ class Shard:
         Raises:
             InputError: the text names no shard.
         """
-        found = re.fullmatch(r"([0-9]+)/([0-9]+)", text)
-        number, count = map(int, found.groups()) if found else (0, 0)
+        match = re.fullmatch(r"([0-9]+)/([0-9]+)", text)
+        number, count = map(int, match.groups()) if match else (0, 0)
         if not 1 <= number <= count:
             raise InputError(
                 f"shard={text} names no part: give i/n with i from 1 to n, as in shard=3/8; an array that "
@@ -99,8 +99,8 @@ def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict
             raise InputError(
                 f"{override.input_line} names no values to try: give {key}=1,2 or {key}=range(1,9,2)"
             )
-    (found,) = BasicSweeper.split_arguments(parsed, None)
-    return [_chosen(job) for job in found]
+    (jobs,) = BasicSweeper.split_arguments(parsed, None)
+    return [_chosen(job) for job in jobs]
 
 
 def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
@@ -121,7 +121,7 @@ def _words(config: DictConfig) -> list[str]:
     return words
 
 
-class Sweep(Callback):
+class SweepCallback(Callback):
     """Hydra's callback of every command: opens and closes the parent run, prints progress.
 
     The parent exists before the first job, and with it database and experiment: jobs that start at once must
@@ -181,7 +181,7 @@ class Sweep(Callback):
         from skin.runs.train import SWEPT, tags
 
         identities = [tags(job) if job else {} for job in composed]
-        self._fingerprints = [one.get("fingerprint", "") for one in identities]
+        self._fingerprints = [identity.get("fingerprint", "") for identity in identities]
         self._choose(config, self._fingerprints)
         self._store = store = Store.open(settings)
         name = config.hydra.runtime.choices.get("sweep") or sweep_title(self._jobs, self._swept) or "sweep"
@@ -189,9 +189,9 @@ class Sweep(Callback):
         atexit.register(self._close)
         os.environ |= {PARENT: self._parent.info.run_id, SWEPT: " ".join(self._swept)}
         _share_cores(config.hydra.launcher)
-        own = [(composed[number], identities[number]) for number in self._own]
+        mine = [(composed[number], identities[number]) for number in self._own]
         self._progress = SweepProgress(
-            [expected_seconds(store, job, one) if job else None for job, one in own],
+            [expected_seconds(store, job, identity) if job else None for job, identity in mine],
             self._with_status("FINISHED"),
             self._with_status("KILLED"),
         )
@@ -201,14 +201,14 @@ class Sweep(Callback):
         if not self._resume or self._store is None:
             return set()
         prints = [self._fingerprints[number] for number in self._own]
-        known = {run.data.tags.get("fingerprint") for run in self._store.find(status)}
-        return {place for place, identity in enumerate(prints) if identity and identity in known}
+        done = {run.data.tags.get("fingerprint") for run in self._store.find(status)}
+        return {place for place, identity in enumerate(prints) if identity and identity in done}
 
     def _choose(self, config: DictConfig, fingerprints: Sequence[str]) -> None:
         """Choose the jobs of this shard, and tell the others that they have nothing to do."""
         shard = Shard.parse(config.shard) if config.get("shard") is not None else Shard(1, 1)
         # A job without a fingerprint is refused, or is no training; its overrides identify it.
-        names = [one or str(job) for one, job in zip(fingerprints, self._jobs, strict=True)]
+        names = [fingerprint or str(job) for fingerprint, job in zip(fingerprints, self._jobs, strict=True)]
         chosen = shard.part(names) if self._runs is None else self._runs
         self._own = [number for number, name in enumerate(names) if name in chosen]
         os.environ[LEFT_OUT] = " ".join(str(number) for number in set(range(len(names))) - {*self._own})
@@ -222,8 +222,8 @@ class Sweep(Callback):
         self._began = time.monotonic()
         if self._parent and config.hydra.job.num in self._own:
             left = self._progress.left()
-            rest = "" if left is None else f" about {format_duration(left)} left"
-            print(f"{self._label(config)} …{rest}", flush=True)
+            remainder = "" if left is None else f" about {format_duration(left)} left"
+            print(f"{self._label(config)} …{remainder}", flush=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Print how a job ended."""

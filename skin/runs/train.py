@@ -85,7 +85,7 @@ def train(config: DictConfig) -> bool:
         again = find_unfinished(store, config.tracking, identity["fingerprint"])
         with store.run(name, identity, os.environ.get(PARENT), again) as run:
             learner.unfinished = _unfinished_folder(config.tracking, run)
-            describe(store, run.info.run_id, config, data.hash)
+            log_configuration(store, run.info.run_id, config, data.hash)
             learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
             point = choose_operating_point(learner, judged, config.evaluation)
             report = evaluate(learner, device, config.evaluation, point)
@@ -263,7 +263,7 @@ def _option(part: DictConfig, name: str) -> str:
     return option_name(import_target(part["_target_"], name))
 
 
-def describe(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
+def log_configuration(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
     """Log the configuration of a run before it starts.
 
     Args:
@@ -295,10 +295,10 @@ def describe(store: Store, run: str, config: DictConfig, data_hash: str) -> None
 
 def _differences(config: DictConfig) -> list[str]:
     """Return the overrides that distinguish this run: in a sweep, those that are swept."""
-    found = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
+    changes = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
     if SWEPT in os.environ:
-        found = {key: value for key, value in found.items() if key in os.environ[SWEPT].split()}
-    return [f"{key.split('.')[-1]}={value}" for key, value in found.items()]
+        changes = {key: value for key, value in changes.items() if key in os.environ[SWEPT].split()}
+    return [f"{key.split('.')[-1]}={value}" for key, value in changes.items()]
 
 
 def relevant_overrides(config: DictConfig) -> dict[str, str]:
@@ -306,11 +306,15 @@ def relevant_overrides(config: DictConfig) -> dict[str, str]:
     if not HydraConfig.initialized():
         return {}
     parsed = OverridesParser.create().parse_overrides(overrides())
-    found = {one.key_or_group: one.get_value_element_as_str() for one in parsed if not one.is_delete()}
+    changes = {
+        override.key_or_group: override.get_value_element_as_str()
+        for override in parsed
+        if not override.is_delete()
+    }
     unused = _unused(config)
     return {
         key: value
-        for key, value in found.items()
+        for key, value in changes.items()
         if not key.startswith(_STEERING) and key.split(".")[0] not in unused
     }
 
@@ -322,7 +326,7 @@ def _unused(config: DictConfig) -> tuple[str, ...]:
 
 def _holds(value: Any, name: str) -> bool:
     """Return whether a setting has this name, however deep."""
-    return isinstance(value, dict) and (name in value or any(_holds(one, name) for one in value.values()))
+    return isinstance(value, dict) and (name in value or any(_holds(entry, name) for entry in value.values()))
 
 
 def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[str, float]) -> None:

@@ -50,8 +50,8 @@ class GestureFrames(NamedTuple):
         """Return ``round(seconds * rate)`` for every duration of the settings."""
         rate = settings.rate
 
-        def frames(given: tuple[float, float]) -> tuple[int, int]:
-            return round(given[0] * rate), round(given[1] * rate)
+        def frames(seconds: tuple[float, float]) -> tuple[int, int]:
+            return round(seconds[0] * rate), round(seconds[1] * rate)
 
         return cls(
             round(settings.window * rate),
@@ -101,8 +101,8 @@ class GestureFrames(NamedTuple):
 
 
 def _shown(settings: "GestureSettings", name: str) -> str:
-    given = getattr(settings, name)
-    return f"touch.{name}={list(given) if isinstance(given, tuple) else given} s"
+    value = getattr(settings, name)
+    return f"touch.{name}={list(value) if isinstance(value, tuple) else value} s"
 
 
 @checked("touch")
@@ -154,13 +154,13 @@ class GestureSettings:
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     @classmethod
-    def of(cls, given: "Mapping[str, Any] | GestureSettings | None") -> "GestureSettings":
+    def of(cls, settings: "Mapping[str, Any] | GestureSettings | None") -> "GestureSettings":
         """Return the settings of a configuration; missing ones keep their default."""
-        if isinstance(given, GestureSettings):
-            return given
-        if given is not None and not isinstance(given, Mapping):
-            raise InputError(f"touch must be settings by name, got {given!r}")
-        values = dict(given or {})
+        if isinstance(settings, GestureSettings):
+            return settings
+        if settings is not None and not isinstance(settings, Mapping):
+            raise InputError(f"touch must be settings by name, got {settings!r}")
+        values = dict(settings or {})
         limits = values.pop("thresholds", {})
         if not isinstance(limits, Thresholds):
             limits = configured(Thresholds, limits, "touch.thresholds")
@@ -181,10 +181,10 @@ class GestureSettings:
             ("safe_peak", 0, lines.pressure),
             ("dangerous_peak", lines.pressure, np.inf),
         ):
-            given = getattr(self, name)
-            if given[0] < low or given[1] > high:
+            limits = getattr(self, name)
+            if limits[0] < low or limits[1] > high:
                 raise InputError(
-                    f"touch.{name}={list(given)} must lie between {low:g} and {high:g}: "
+                    f"touch.{name}={list(limits)} must lie between {low:g} and {high:g}: "
                     "touch.thresholds decides"
                 )
         self.frames.check(self)
@@ -203,9 +203,9 @@ def model_window(touch: Mapping[str, Any] | GestureSettings | None) -> tuple[int
     """
     if isinstance(touch, GestureSettings):
         return touch.frames.window, float(touch.rate)
-    given = {name: value for name, value in (touch or {}).items() if name in ("window", "rate")}
-    check_settings(GestureSettings, given, "touch")
-    window, rate = (float(given.get(name, getattr(GestureSettings, name))) for name in ("window", "rate"))
+    settings = {name: value for name, value in (touch or {}).items() if name in ("window", "rate")}
+    check_settings(GestureSettings, settings, "touch")
+    window, rate = (float(settings.get(name, getattr(GestureSettings, name))) for name in ("window", "rate"))
     if not round(window * rate):
         raise InputError(
             f"touch.window={window:g} s is no frame at touch.rate={rate:g} Hz: raise it to "
@@ -305,8 +305,8 @@ def heading(place: np.ndarray, first: np.ndarray) -> np.ndarray:
     """
     steps = np.diff(place, axis=0, prepend=place[:1])
     steps[first] = 0
-    more = first[np.diff(first, append=len(place)) > 1]
-    steps[more] = steps[more + 1]
+    longer = first[np.diff(first, append=len(place)) > 1]
+    steps[longer] = steps[longer + 1]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     return np.divide(steps, length, out=np.zeros_like(steps), where=length > 0)
 
@@ -386,8 +386,8 @@ def sample_paths(
     peak_level = level.max(axis=1)
     counts = np.where(sliding, duration, 1 if proportional else peak_level)
     first = np.cumsum(counts) - counts
-    shown = np.where(sliding[:, None], time, level - 1)
-    index = first[:, None] + np.clip(shown, 0, counts[:, None] - 1)
+    column = np.where(sliding[:, None], time, level - 1)
+    index = first[:, None] + np.clip(column, 0, counts[:, None] - 1)
     owner = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(owner)) - first[owner]
     velocity = gestures["speed"] * np.stack([np.cos(gestures["direction"]), np.sin(gestures["direction"])])

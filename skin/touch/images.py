@@ -50,9 +50,9 @@ def _find(name: str) -> Path:
     for candidate in candidates(path) if path.suffix else [_FOLDER / f"{name}.png", path]:
         if candidate.is_file():
             return candidate.resolve()
-    known = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.png")))
+    names = ", ".join(sorted(file.stem for file in _FOLDER.glob("*.png")))
     raise InputError(
-        f"no shape {name}: touch.shapes takes {known}, or the path of a picture, as in "
+        f"no shape {name}: touch.shapes takes {names}, or the path of a picture, as in "
         "touch.shapes=[disc,my.png]"
     )
 
@@ -98,10 +98,10 @@ def pyramid(images: Sequence[np.ndarray], pixels: int) -> list[Tensor]:
 def hulls(images: np.ndarray, contact: float) -> np.ndarray:
     """Return the corners (N, K, 2) of the convex outlines of images (N, p, p), in scales."""
     pixels = images.shape[-1]
-    found = []
+    outlines = []
     for image in images:
         rows, columns = np.nonzero(image > contact)
         corners = np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
-        found.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
-    most = max(map(len, found))
-    return np.stack([np.pad(hull, ((0, most - len(hull)), (0, 0)), mode="edge") for hull in found])
+        outlines.append(corners[ConvexHull(corners).vertices] / pixels * 2 - 1)
+    most = max(map(len, outlines))
+    return np.stack([np.pad(hull, ((0, most - len(hull)), (0, 0)), mode="edge") for hull in outlines])

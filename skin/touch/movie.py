@@ -181,15 +181,15 @@ class Movie:
     def __getitem__(self, rows: Tensor) -> "Movie":
         """Return the movies of some gestures, without unused frames."""
         index = self.index[rows]
-        shown = torch.zeros(len(self.frames), dtype=torch.bool)
-        shown[index.flatten()] = True
+        used = torch.zeros(len(self.frames), dtype=torch.bool)
+        used[index.flatten()] = True
         return Movie(
-            self.frames if shown.all() else self.frames[shown],
-            (shown.cumsum(0) - 1)[index],
+            self.frames if used.all() else self.frames[used],
+            (used.cumsum(0) - 1)[index],
             self.scale[rows],
             self.labels[rows],
             {name: values[rows] for name, values in self.parameters.items()},
-            None if self.shear is None else self.shear[shown],
+            None if self.shear is None else self.shear[used],
         )
 
     @property
@@ -200,9 +200,9 @@ class Movie:
     @property
     def slides(self) -> Tensor:
         """Cosines of the sliding directions, (B, 2); see ``skin.touch.movie.sliding``."""
-        known = self.parameters
-        net = torch.stack([known["net_x"], known["net_y"]], dim=1)
-        return sliding(net, known["speed"] * (known["duration"] - 1))
+        parameters = self.parameters
+        net = torch.stack([parameters["net_x"], parameters["net_y"]], dim=1)
+        return sliding(net, parameters["speed"] * (parameters["duration"] - 1))
 
     def pressure(self) -> Tensor:
         """Return the dense movie, (B, T, H, W), Pa."""

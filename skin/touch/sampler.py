@@ -169,21 +169,21 @@ class TouchSampler:
         Raises:
             InputError: a combination of labels that does not occur on this sheet with these settings.
         """
-        wanted = balanced(count, generator) if labels is None else labels
+        targets = balanced(count, generator) if labels is None else labels
         redraws = self.settings.redraws
         pending = np.arange(count)
         tally = _Tally.of(count)
-        kept = self.fit and self.fit.draw(wanted[:, 0], generator)
-        found: list[np.ndarray] = []
+        fitted = self.fit and self.fit.draw(targets[:, 0], generator)
+        finished: list[np.ndarray] = []
         movies: list[Movie] = []
         while len(pending):
             if tally.draws[pending].min() >= _ATTEMPTS * redraws:
                 tally.warn()
-                raise self._never(wanted[pending[0]])
+                raise self._never(targets[pending[0]])
             if self.fit and tally.draws[pending].min() >= _LOYAL * redraws:
-                kept = self.fit.draw(wanted[:, 0], generator)
+                fitted = self.fit.draw(targets[:, 0], generator)
             gestures = draw_gestures(
-                wanted, self.settings, self.shapes, self.padded, generator, self.fit, kept
+                targets, self.settings, self.shapes, self.padded, generator, self.fit, fitted
             )
             tally.misfits[pending] += gestures["misfits"][pending]
             gestures["misfits"] = tally.misfits
@@ -196,14 +196,14 @@ class TouchSampler:
                 # Sorted by scale, because frames of one texture level are rendered together.
                 pending = pending[np.argsort(gestures["scale"][pending], kind="stable")]
                 tried += ahead
-                chosen, given_up, movie = self._round(pending, wanted, gestures, chance, tally)
+                chosen, given_up, movie = self._round(pending, targets, gestures, chance, tally)
                 movies.append(movie)
-                found.append(pending[chosen])
+                finished.append(pending[chosen])
                 hopeless.append(pending[given_up])
                 pending = pending[~chosen & ~given_up]
             pending = np.concatenate([pending, *hopeless])
         tally.warn()
-        return join_movies(movies)[torch.from_numpy(np.concatenate(found).argsort())]
+        return join_movies(movies)[torch.from_numpy(np.concatenate(finished).argsort())]
 
     def _round(
         self, pending: np.ndarray, wanted: np.ndarray, gestures: Draws, chance: np.ndarray, tally: _Tally
@@ -248,9 +248,9 @@ class TouchSampler:
         pressed = self.contact.press(
             paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
-        shown, shares = paths.trajectories.index, paths.trajectories.profile
+        index, shares = paths.trajectories.index, paths.trajectories.profile
         measures = measure_gestures(
-            pressed.frames, shown, shares, self.footprints, self.body.cell, settings.thresholds.contact
+            pressed.frames, index, shares, self.footprints, self.body.cell, settings.thresholds.contact
         )
         if not self.contact.proportional:
             # The contact area grows with force, which moves the centre of pressure of a static touch.
@@ -258,12 +258,12 @@ class TouchSampler:
         begin = paths.trajectories.place[paths.first]
         values = pressed.peak, pressed.force, gestures["draws"], *paths.net.T, *begin.T
         parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
-        known = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
-        known |= {name: value.float() for name, value in measures._asdict().items()}
+        drawn = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
+        drawn |= {name: value.float() for name, value in measures._asdict().items()}
         pull = settings.shear * heading(paths.place, paths.first) if settings.shear else None
         shear = None if pull is None else torch.from_numpy(pull).float()
         labels = measures.labels(settings.thresholds, settings.rate)
-        return Movie(pressed.frames, shown, shares, labels, known, shear), pressed
+        return Movie(pressed.frames, index, shares, labels, drawn, shear), pressed
 
     def _never(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))

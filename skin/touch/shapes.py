@@ -114,8 +114,8 @@ class Shapes:
         size = (count * self.body.cell[0], count * self.body.cell[1])
         # The same images, because scales refer to them, but without values computed for this sheet.
         large = copy(self)
-        for known in ("_calibration", "_points"):
-            vars(large).pop(known, None)
+        for name in ("_calibration", "_points"):
+            vars(large).pop(name, None)
         large.body = Sheet(size, (count, count), self.body.layers)
         return large
 
@@ -247,7 +247,7 @@ class Shapes:
     def _sample(self, texture: Tensor, turns: np.ndarray, shift: np.ndarray) -> Tensor:
         """Return sums (f, C, H, W) of textures (f, C, p, p) seen at turns * (x, i y) - shift, in scales."""
         x, y = self._points
-        turn_x, turn_y, shifts = (torch.from_numpy(one)[:, None, None] for one in (*turns, shift))
+        turn_x, turn_y, shifts = (torch.from_numpy(values)[:, None, None] for values in (*turns, shift))
         # A rotation is a product of complex numbers; grid_sample takes real and imaginary parts.
         across, down = (turn_x * x - shifts).to(torch.complex64), (turn_y * y).to(torch.complex64)
         grid = torch.view_as_real(across + down)
@@ -257,12 +257,12 @@ class Shapes:
         return left + right
 
 
-def _interpolated(shape: np.ndarray, at: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolated(shape: np.ndarray, at: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the values (B,) at places (B,), between the known ones (N, K) of each shape."""
     result = np.empty(len(shape))
     for number in np.unique(shape):
         mine = shape == number
-        result[mine] = np.interp(at[mine], known[number], values[number])
+        result[mine] = np.interp(at[mine], nodes[number], values[number])
     return result
 
 
@@ -291,13 +291,13 @@ class Fit(NamedTuple):
 
         def fits(fitted: bool) -> np.ndarray:
             """Return the share of small and big bodies of each shape that fit, (2, N)."""
-            found = np.empty((2, len(shapes.names)))
-            for row, shape in np.ndindex(found.shape):
+            portions = np.empty((2, len(shapes.names)))
+            for row, shape in np.ndindex(portions.shape):
                 same, number = np.full(_PROBES, bool(row)), np.full(_PROBES, shape)
-                given = settings, shapes, chance[row], number
-                drawn = _fitted(same, *given, same) if fitted else _as_they_are(same, *given)
-                found[row, shape] = drawn["fits"].mean()
-            return found
+                arguments = settings, shapes, chance[row], number
+                drawn = _fitted(same, *arguments, same) if fitted else _as_they_are(same, *arguments)
+                portions[row, shape] = drawn["fits"].mean()
+            return portions
 
         redrawn = fits(fitted=False)
         totals = redrawn.sum(axis=1, keepdims=True)
@@ -312,7 +312,7 @@ class Fit(NamedTuple):
         """Draw a shape (B,) per body, uniformly among those that fit with its area, big (B,) or small."""
         chance = generator.random(len(big))
         options = [np.flatnonzero(which) for which in (self.small, self.big)]
-        small, large = (one[(chance * len(one)).astype(int)] for one in options)
+        small, large = (numbers[(chance * len(numbers)).astype(int)] for numbers in options)
         return np.where(big, large, small)
 
 
@@ -351,12 +351,12 @@ def draw_bodies(
         chance = generator.random((len(big), 3 if fit is None else 4))[todo]
         if fit is None or kept is None:
             shape = (chance[:, 0] * len(shapes.names)).astype(int)
-            found = _as_they_are(big[todo], settings, shapes, chance, shape)
+            bodies = _as_they_are(big[todo], settings, shapes, chance, shape)
         else:
             shape = kept[todo]
-            found = _fitted(big[todo], settings, shapes, chance, shape, fit.big[shape])
-        fits = found.pop("fits")
-        for name, value in found.items():
+            bodies = _fitted(big[todo], settings, shapes, chance, shape, fit.big[shape])
+        fits = bodies.pop("fits")
+        for name, value in bodies.items():
             drawn.setdefault(name, np.empty((len(big), *value.shape[1:]), value.dtype))[todo] = value
         todo = todo[~fits]
         drawn["misfits"][todo] += 1
@@ -372,8 +372,8 @@ def _as_they_are(
     scale = shapes.scale(shape, _area(big, settings, chance[:, 2]))
     low, high = shapes.extent(shape, angle, scale)
     fits = (high - low + settings.spare <= shapes.body.size).all(axis=1)
-    found = {"shape": shape, "angle": angle, "stretch": np.ones(len(big)), "scale": scale}
-    return found | {"low": low, "high": high, "fits": fits}
+    body = {"shape": shape, "angle": angle, "stretch": np.ones(len(big)), "scale": scale}
+    return body | {"low": low, "high": high, "fits": fits}
 
 
 def _fitted(
@@ -385,18 +385,18 @@ def _fitted(
     asked_big: np.ndarray,
 ) -> Draws:
     angle = 2 * np.pi * chance[:, 1]
-    asked = shapes.whole_scale(shape, _area(asked_big, settings, chance[:, 2]))
-    low, high = shapes.extent(shape, angle, asked)
+    scale_asked = shapes.whole_scale(shape, _area(asked_big, settings, chance[:, 2]))
+    low, high = shapes.extent(shape, angle, scale_asked)
     room = np.array(shapes.body.size) - settings.spare
     x, y = ((high - low) / np.maximum(room, _SLACK)).T
     # The stretch nearest to 1 at which both sides have room.
     stretch = np.clip(1, y**2, np.maximum(x**-2, y**2))
     fits = (x * y <= 1 + _SLACK) & (np.maximum(stretch, 1 / stretch) <= settings.stretch)
-    own = shapes.whole_scale(shape, _area(big, settings, chance[:, 3]))
-    scale = np.where(big == asked_big, asked, own)
+    scale_own = shapes.whole_scale(shape, _area(big, settings, chance[:, 3]))
+    scale = np.where(big == asked_big, scale_asked, scale_own)
     low, high = shapes.extent(shape, angle, scale, stretch)
-    found = {"shape": shape, "angle": angle, "stretch": stretch, "scale": scale}
-    return found | {"low": low, "high": high, "fits": fits}
+    body = {"shape": shape, "angle": angle, "stretch": stretch, "scale": scale}
+    return body | {"low": low, "high": high, "fits": fits}
 
 
 def _area(big: np.ndarray, settings: GestureSettings, chance: np.ndarray) -> np.ndarray:

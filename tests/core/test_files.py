@@ -21,7 +21,7 @@ from skin.hardware.calibration.bench import BenchSession
 from skin.hardware.calibration.bench import write_bench_session as write_session
 from skin.mechanics.simulator import solid as _elastic
 from skin.plot import animation, figures
-from skin.plot.animation import simulated
+from skin.plot.animation import simulate_scene
 from skin.runs.configuration import Tracking
 from skin.runs.store import Store
 from skin.touch.labels import TOUCH
@@ -102,7 +102,7 @@ def test_an_animation_is_whole(tmp_path, configured):
     from skin.runs.build import build_device
 
     small = ["data.gestures=10", "simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
-    scene = simulated(build_device(configured(*small)), [], None, 0, False)
+    scene = simulate_scene(build_device(configured(*small)), [], None, 0, False)
     with full(500), pytest.raises(InputError, match=r"^cannot write .*x\.gif"):
         animation.write_animation(scene, "flat", tmp_path / "x.gif")
     assert not list(tmp_path.iterdir())

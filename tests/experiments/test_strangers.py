@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from skin.body.sheet import Sheet
 from skin.errors import InputError
-from skin.mechanics.simulator.solid import Elastic, hexahedra
+from skin.mechanics.simulator.solid import Elastic, build_mesh
 from skin.runs.build import build_device, build_learner
 from skin.runs.configuration import Tracking, plain, validate_config
 from skin.runs.finished_run import FinishedRun, find_run
@@ -235,7 +235,7 @@ def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, mon
 
 def test_a_stored_influence_is_built_anew_where_it_holds_objects(tmp_path, marker):
     sheet = Sheet((0.02, 0.02), (4, 4), [{"material": "EcoFlex 00-30", "thickness": 0.01}])
-    elastic, path = Elastic(hexahedra(sheet, 1, {})), tmp_path / "influence.npy"
+    elastic, path = Elastic(build_mesh(sheet, 1, {})), tmp_path / "influence.npy"
     wanted = np.array(elastic.influence(2, path))
     np.save(path, np.array([Payload(marker)], dtype=object))
     np.testing.assert_array_equal(elastic.influence(2, path), wanted)

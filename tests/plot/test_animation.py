@@ -7,7 +7,7 @@ from PIL import Image
 
 from skin.device.files import write_recording as store
 from skin.errors import InputError
-from skin.plot.animation import VIEWS, recorded, simulated, thinning, write_animation
+from skin.plot.animation import VIEWS, read_scene, simulate_scene, thinning, write_animation
 from skin.plot.plot3d import Scene
 from skin.runs.build import build_device
 
@@ -83,7 +83,7 @@ def test_long_and_fast_touches_are_thinned_out(tmp_path):
 
 def test_a_simulated_touch_is_what_was_asked_for(configured):
     device = build_device(configured("layout=grid", "layout.rows=3", "layout.columns=4", "device.noise=0"))
-    scene = simulated(device, ["press", "dynamic"], "bar", 5, field=True)
+    scene = simulate_scene(device, ["press", "dynamic"], "bar", 5, field=True)
     assert scene.readings.shape == (30, 12)
     assert scene.title == "bar: dynamic, press"
     assert scene.pressure.max() < 90.5e3
@@ -97,27 +97,27 @@ def test_a_simulated_touch_is_what_was_asked_for(configured):
         frame, max(0, deepest[0] - 2) : deepest[0] + 2, max(0, deepest[1] - 2) : deepest[1] + 2
     ]
     assert near.max() > 0.3 * scene.pressure[frame].max()
-    again = simulated(device, ["press", "dynamic"], "bar", 5, field=False)
+    again = simulate_scene(device, ["press", "dynamic"], "bar", 5, field=False)
     assert (again.readings == scene.readings).all()
     assert again.moved is None
-    assert (simulated(device, [], None, 6, field=False).readings != scene.readings).any()
+    assert (simulate_scene(device, [], None, 6, field=False).readings != scene.readings).any()
 
 
 def test_a_touch_of_another_device_is_taken_by_its_number(made_up_device, tmp_path):
-    touches, scene = made_up_device.touches("test"), recorded(made_up_device, 3)
+    touches, scene = made_up_device.touches("test"), read_scene(made_up_device, 3)
     assert torch.equal(torch.from_numpy(scene.readings), touches.readings[3])
     assert scene.title.startswith("touch 3: ")
     with pytest.raises(InputError, match="view=flat or view=sensors3d"):
         write_animation(scene, "skin3d", tmp_path / "x.gif")
     with pytest.raises(InputError, match="give index=0 to 39"):
-        recorded(made_up_device, 40)
+        read_scene(made_up_device, 40)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("view", ["sensors3d", "skin3d"])
 def test_a_slide_on_the_arm_is_drawn_in_space(view, configured, tmp_path):
     device = build_device(configured("body=arm", "body.cells=[12,12]", "simulator=naive"))
-    scene = simulated(device, ["press", "dynamic"], "bar", 5, field=True)
+    scene = simulate_scene(device, ["press", "dynamic"], "bar", 5, field=True)
     assert scene.body == device.body
     assert scene.moved is None
     shown, _ = frames_of(write_animation(scene, view, tmp_path / "x.gif"))
@@ -128,11 +128,11 @@ def test_a_recording_of_an_arm_is_drawn_on_the_arm(configured, tmp_path):
     made = build_device(configured("body=arm", "simulator=naive", "data.gestures=10"))
     path = store(made.recording(), tmp_path / "x.parquet")
     device = build_device(configured("body=arm", "device=recording", f"device.path={path}"))
-    assert recorded(device, 2).body == made.body
+    assert read_scene(device, 2).body == made.body
     sheet = build_device(configured("device=recording", f"device.path={path}"))
-    assert recorded(sheet, 2).body is None
+    assert read_scene(sheet, 2).body is None
 
 
 def test_an_unknown_label_is_refused(configured):
     with pytest.raises(InputError, match="no label pres: labels may list big, dynamic, press, dangerous"):
-        simulated(build_device(configured("simulator=naive")), ["pres"], None, 0, field=False)
+        simulate_scene(build_device(configured("simulator=naive")), ["pres"], None, 0, field=False)

@@ -23,7 +23,7 @@ Tilt = Annotated[float, Ge(0), Lt(math.pi / 2)]
 _WAYS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
-def grid(rows: int, columns: int) -> np.ndarray:
+def tile_centres(rows: int, columns: int) -> np.ndarray:
     """Return the centres (S, 2) of rows x columns equal tiles of the unit square, row by row."""
     y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     return np.column_stack([x.ravel(), y.ravel()])
@@ -66,7 +66,7 @@ class AbstractLayout(ABC):
         """
 
 
-def place(
+def place_sensors(
     body: AbstractBody,
     x: np.ndarray,
     y: np.ndarray,
@@ -119,7 +119,7 @@ def _apart(positions: np.ndarray) -> None:
     close = np.flatnonzero(distance[:, 1] < _APART)
     if len(close):
         first = int(close[0])
-        second = next(int(other) for other in nearest[first] if other != first)
+        second = next(int(index) for index in nearest[first] if index != first)
         x, y, _ = positions[first]
         raise InputError(
             f"sensors {first + 1} and {second + 1} are at one place, x = {x:g} m, y = {y:g} m: "
@@ -155,4 +155,4 @@ class Listed(AbstractLayout):
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in their order."""
         x, y, depth = self.positions.T
-        return place(body, x, y, depth, self.footprint, self.normals)
+        return place_sensors(body, x, y, depth, self.footprint, self.normals)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors
 from skin.body.sensors import MOST, Sensors
 from skin.core.files import candidates
 from skin.core.safe_loading import read_file
@@ -56,7 +56,7 @@ class File(AbstractLayout):
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors in the order of the file."""
         x, y, depth = self.places["x_m"], self.places["y_m"], self.places.get("depth_m", self.depth)
-        return place(body, x, y, depth, self.footprint, self._normals())
+        return place_sensors(body, x, y, depth, self.footprint, self._normals())
 
     def _normals(self) -> np.ndarray | None:
         """Return the unit vectors of the file, (S, 3), if it has any."""
@@ -66,13 +66,13 @@ class File(AbstractLayout):
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _find(given: str | Path) -> Path:
-    places = candidates(given)
+def _find(name: str | Path) -> Path:
+    places = candidates(name)
     for path in places:
         if path.is_file():
             return path
     looked = " and ".join(dict.fromkeys(map(str, places)))
-    raise InputError(f"no layout file {given}: looked for {looked}; give layout.path=FILE.csv")
+    raise InputError(f"no layout file {name}: looked for {looked}; give layout.path=FILE.csv")
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -84,8 +84,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
         needed = {"x_m", "y_m"} | (set(_FACING) if set(_FACING) & set(names) else set())
         if missing := needed - set(names):
-            found = ", ".join(names) or "nothing"
-            raise ValueError(f"no column {' and '.join(sorted(missing))}, found {found[:_SHOWN]}")
+            present = ", ".join(names) or "nothing"
+            raise ValueError(f"no column {' and '.join(sorted(missing))}, found {present[:_SHOWN]}")
         columns = [name for name in names if name in _PLACE + _FACING]
         if twice := [name for name in columns if columns.count(name) > 1]:
             raise ValueError(f"the column {twice[0]} is there twice")

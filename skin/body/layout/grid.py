@@ -4,7 +4,7 @@ import numpy as np
 from pydantic import PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, Tilt, grid, place, rosette
+from skin.body.layout.base import AbstractLayout, Footprint, Tilt, place_sensors, rosette, tile_centres
 from skin.body.sensors import Sensors
 from skin.core.settings import checked
 
@@ -34,11 +34,11 @@ class Grid(AbstractLayout):
         tilt: Tilt = 0.0,
         depth: float | None = None,
     ) -> None:
-        self.centres = grid(rows, columns)
+        self.centres = tile_centres(rows, columns)
         self.normals = rosette(rows, columns, tilt)
         self.footprint, self.depth = footprint, depth
 
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
         x, y = (self.centres * np.array(body.size)).T
-        return place(body, x, y, self.depth, self.footprint, self.normals)
+        return place_sensors(body, x, y, self.depth, self.footprint, self.normals)

@@ -4,7 +4,7 @@ import numpy as np
 from pydantic import PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, grid, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors, tile_centres
 from skin.body.sensors import Sensors
 from skin.core.settings import checked
 
@@ -33,7 +33,7 @@ class Hexagonal(AbstractLayout):
         footprint: Footprint = (0.01, 0.01),
         depth: float | None = None,
     ) -> None:
-        self.centres = grid(rows, columns)
+        self.centres = tile_centres(rows, columns)
         odd = np.repeat(np.arange(rows) % 2, columns)
         # A quarter of a pitch to either side keeps the rows within the surface.
         self.centres[:, 0] += (0.5 * odd - 0.25) / columns
@@ -42,4 +42,4 @@ class Hexagonal(AbstractLayout):
     def sensors(self, body: AbstractBody) -> Sensors:
         """Return the sensors row by row, from the upper left rightwards and down."""
         x, y = (self.centres * np.array(body.size)).T
-        return place(body, x, y, self.depth, self.footprint)
+        return place_sensors(body, x, y, self.depth, self.footprint)

@@ -4,7 +4,7 @@ import numpy as np
 from pydantic import NonNegativeInt, PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, place
+from skin.body.layout.base import AbstractLayout, Footprint, place_sensors
 from skin.body.sensors import Sensors
 from skin.core.settings import checked
 from skin.errors import InputError
@@ -46,12 +46,12 @@ class Random(AbstractLayout):
             raise self._full(body)
         places = np.empty((0, 2))
         for _ in range(_TRIES):
-            found = np.round(extent / 2 + draw.random(2) * (np.array(body.size) - extent), 6)
-            if (np.abs(places - found) >= extent).any(axis=1).all():
-                places = np.vstack([places, found])
+            candidate = np.round(extent / 2 + draw.random(2) * (np.array(body.size) - extent), 6)
+            if (np.abs(places - candidate) >= extent).any(axis=1).all():
+                places = np.vstack([places, candidate])
             if len(places) == self.count:
                 x, y = places[np.argsort(places[:, 1], kind="stable")].T
-                return place(body, x, y, self.depth, self.footprint)
+                return place_sensors(body, x, y, self.depth, self.footprint)
         raise self._full(body)
 
     def _full(self, body: AbstractBody) -> InputError:

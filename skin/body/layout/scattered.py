@@ -7,7 +7,7 @@ from annotated_types import Ge, Lt
 from pydantic import NonNegativeInt, PositiveInt
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Footprint, Tilt, grid, place, rosette
+from skin.body.layout.base import AbstractLayout, Footprint, Tilt, place_sensors, rosette, tile_centres
 from skin.body.sensors import Sensors
 from skin.core.settings import checked
 
@@ -41,7 +41,7 @@ class Scattered(AbstractLayout):
         depth: float | np.ndarray | None = None,
         normals: np.ndarray | None = None,
     ) -> None:
-        self.centres = grid(rows, columns)
+        self.centres = tile_centres(rows, columns)
         self.normals = rosette(rows, columns, tilt) if normals is None else normals
         self.pitch = np.array([1 / columns, 1 / rows])
         self.jitter, self.seed = jitter, seed
@@ -51,4 +51,4 @@ class Scattered(AbstractLayout):
         """Return the sensors row by row, from the upper left rightwards and down, to the micrometre."""
         moves = np.random.default_rng(self.seed).uniform(-self.jitter, self.jitter, self.centres.shape)
         x, y = np.round((self.centres + moves * self.pitch) * body.size, 6).T
-        return place(body, x, y, self.depth, self.footprint, self.normals)
+        return place_sensors(body, x, y, self.depth, self.footprint, self.normals)

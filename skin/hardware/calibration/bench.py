@@ -108,8 +108,8 @@ def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
         # A copy, because Arrow's memory cannot be written to and torch warns of that.
         return np.array(table[name].cast(pa.float64()).to_numpy())
     except (KeyError, pa.ArrowException) as error:
-        found = ", ".join(table.column_names)
-        raise InputError(f"{where}: the column {name} must hold numbers, found {found}: {error}") from error
+        present = ", ".join(table.column_names)
+        raise InputError(f"{where}: the column {name} must hold numbers, found {present}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -318,8 +318,8 @@ def read_bench_session(
         table = table.append_column("time", [time])
     rows = gauge_from_table(table, str(path), indenter, radius) if inside else None
     try:
-        known: Any = unit or about.get("unit", "N")
-        return BenchSession(time, raw, known, rows, about.get("bits"), about.get("channels"))
+        unit_of_values: Any = unit or about.get("unit", "N")
+        return BenchSession(time, raw, unit_of_values, rows, about.get("bits"), about.get("channels"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -64,12 +64,12 @@ def measure_idle(time: np.ndarray, values: np.ndarray, step: float) -> Idle:
     middles = np.array([[time[block].mean(), np.median(values[block])] for block in blocks])
     slope, _, low, high = theilslopes(middles[:, 1], middles[:, 0])
     drift = 0.0 if low <= 0 <= high else float(slope)
-    rest = values - drift * time
-    offset = float(np.median(rest))
-    spread = _MAD * float(np.median(np.abs(rest - offset)))
+    steady = values - drift * time
+    offset = float(np.median(steady))
+    spread = _MAD * float(np.median(np.abs(steady - offset)))
     if step > 0.8 * spread:
         # The steps are too coarse for a median.
-        spread = float(np.std(rest[np.abs(rest - offset) <= 3 * max(spread, step)]))
+        spread = float(np.std(steady[np.abs(steady - offset) <= 3 * max(spread, step)]))
     # Rounding and spreading each add the variance of a step (Sheppard's correction).
     return Idle(offset, drift, math.sqrt(max(spread**2 - step**2 / 6, 0.0)))
 
@@ -169,9 +169,9 @@ class Responses:
     error: np.ndarray
     responding: np.ndarray
 
-    def predicted(self, each: np.ndarray) -> np.ndarray:
-        """Return true readings (F, S), N, of presses that give ``each`` (P, S) per N."""
-        return self.force[:, None] * each[self.press]
+    def predicted(self, per_newton: np.ndarray) -> np.ndarray:
+        """Return true readings (F, S), N, of presses that give ``per_newton`` (P, S) per N."""
+        return self.force[:, None] * per_newton[self.press]
 
 
 @dataclass(frozen=True)
@@ -201,11 +201,11 @@ def collect_responses(bench: BenchData) -> Responses:
         if not len(frames):
             continue
         before = idle[idle < frames[0]][-_BEFORE:]
-        rest = _middle(raw[before]) if len(before) >= _FEW else resting
-        rest = np.where(np.isfinite(rest), rest, resting)
-        rests.append(rest)
+        level = _middle(raw[before]) if len(before) >= _FEW else resting
+        level = np.where(np.isfinite(level), level, resting)
+        rests.append(level)
         for step in np.array_split(frames, min(_STEPS, len(frames))):
-            rows.append(_middle(raw[step]) - rest)
+            rows.append(_middle(raw[step]) - level)
             forces.append(force[step].mean())
             numbers.append(number)
             counts.append(len(step))
@@ -219,7 +219,7 @@ def collect_responses(bench: BenchData) -> Responses:
     return Responses(measured, np.array(forces), np.array(numbers), error, responding)
 
 
-def match_channels(responses: Responses, each: np.ndarray) -> Match:
+def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
     """Compare every channel with the prediction for every sensor.
 
     A channel reads gain times the prediction up to a limit. Both are free, and the gain may be negative. But
@@ -227,9 +227,9 @@ def match_channels(responses: Responses, each: np.ndarray) -> Match:
 
     Args:
         responses: of the session.
-        each: (P, S), true readings per N of every press.
+        per_newton: (P, S), true readings per N of every press.
     """
-    prediction = responses.predicted(each)
+    prediction = responses.predicted(per_newton)
     largest = np.abs(prediction).max(axis=0)
     reached = largest > _TINY * largest.max(initial=0.0)
     shape = prediction / np.where(reached, largest, 1.0)
@@ -255,22 +255,22 @@ def match_channels(responses: Responses, each: np.ndarray) -> Match:
     return Match(residual, sign, expected)
 
 
-def find_polarity(responses: Responses, each: np.ndarray) -> np.ndarray:
+def find_polarity(responses: Responses, per_newton: np.ndarray) -> np.ndarray:
     """Return 1 or -1 for every channel, (S,): -1 where it falls with force at its own sensor.
 
     A channel that does not respond has the polarity of most others.
     """
-    signs = np.diagonal(match_channels(responses, each).sign)
+    signs = np.diagonal(match_channels(responses, per_newton).sign)
     most = -1.0 if signs[responses.responding].sum() < 0 else 1.0
     return np.where(responses.responding, signs, most)
 
 
 def _middle(values: np.ndarray) -> np.ndarray:
     """Return the median of each column, (S,); NaN where a column has no number."""
-    known = np.isfinite(values).any(axis=0) if len(values) else np.zeros(values.shape[1], dtype=bool)
+    measured = np.isfinite(values).any(axis=0) if len(values) else np.zeros(values.shape[1], dtype=bool)
     middle = np.full(values.shape[1], np.nan)
-    if known.any():
-        middle[known] = np.nanmedian(values[:, known], axis=0)
+    if measured.any():
+        middle[measured] = np.nanmedian(values[:, measured], axis=0)
     return middle
 
 

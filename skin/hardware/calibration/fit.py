@@ -124,8 +124,8 @@ def _mark_silent(bench: BenchData, channels: list[_Channel]) -> None:
 
 def _subtract_rest(bench: BenchData, number: int, channel: _Channel) -> np.ndarray:
     """Return the change of a channel against its rest, (T,), in the session's unit, above 0 under force."""
-    rest = channel.idle.offset + channel.idle.drift * bench.session.time
-    return channel.polarity * (bench.session.raw[:, number] - rest)
+    idle = channel.idle.offset + channel.idle.drift * bench.session.time
+    return channel.polarity * (bench.session.raw[:, number] - idle)
 
 
 def _fit_time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:

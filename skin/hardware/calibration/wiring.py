@@ -148,12 +148,12 @@ class _Explanation:
         """How much the explanation supposes."""
         return (self.turn != "as_given") + len(self.moved)
 
-    def clearly_worse(self, other: "_Explanation") -> bool:
+    def clearly_worse(self, rival: "_Explanation") -> bool:
         """Return whether another explanation leaves clearly less."""
-        differs = (self.sensors != other.sensors) | (self.turn != other.turn)
+        differs = (self.sensors != rival.sensors) | (self.turn != rival.turn)
         factor, least = _CLEARER
-        more = len(self.unexplained) > len(other.unexplained)
-        return more or self.residual[differs].sum() > factor * other.residual[differs].sum() + least
+        leaves_more = len(self.unexplained) > len(rival.unexplained)
+        return leaves_more or self.residual[differs].sum() > factor * rival.residual[differs].sum() + least
 
 
 def wired_bench(
@@ -182,11 +182,12 @@ def wired_bench(
     # Where no turn brings all places onto the sheet, they are refused here.
     bench = build_bench_data(device, session, next(iter(allowed.values()), gauge))
     responses = collect_responses(bench)
-    own, best = _compare_turns(device, bench, responses, allowed)
-    clear = [each for each in best if _is_conclusive(each, own, responses.responding)]
-    if own is not None and not len(own.unexplained) and (not clear or any(each is own for each in best)):
+    straight, best = _compare_turns(device, bench, responses, allowed)
+    clear = [entry for entry in best if _is_conclusive(entry, straight, responses.responding)]
+    explained = straight is not None and not len(straight.unexplained)
+    if explained and (not clear or any(entry is straight for entry in best)):
         return bench
-    raise InputError(_phrase_refusal(own, best[0], clear, confirmed, responses.responding))
+    raise InputError(_phrase_refusal(straight, best[0], clear, confirmed, responses.responding))
 
 
 def _order_channels(raw: np.ndarray, confirmed: Confirmed) -> np.ndarray:
@@ -211,16 +212,16 @@ def _compare_turns(
     """
     explanations = list[_Explanation]()
     for turn, gauge in allowed.items():
-        each = bench.each if gauge is bench.gauge else per_newton(device.model, device.body, gauge)
-        straight, permuted = _explain(match_channels(responses, each), responses.responding, turn)
+        rows = bench.each if gauge is bench.gauge else per_newton(device.model, device.body, gauge)
+        straight, permuted = _explain(match_channels(responses, rows), responses.responding, turn)
         plain = straight.residual.max(initial=0.0) < _PLAIN and not straight.clearly_worse(permuted)
         if turn == "as_given" and plain:
             return straight, [straight]
         explanations += [straight, permuted] if len(permuted.moved) else [straight]
-    best = min(explanations, key=lambda each: (len(each.unexplained), each.residual.sum()))
-    good = [each for each in explanations if not each.clearly_worse(best)]
-    own = explanations[0] if "as_given" in allowed else None
-    return own, sorted(good, key=lambda each: each.parts)
+    best = min(explanations, key=lambda entry: (len(entry.unexplained), entry.residual.sum()))
+    good = [entry for entry in explanations if not entry.clearly_worse(best)]
+    designed = explanations[0] if "as_given" in allowed else None
+    return designed, sorted(good, key=lambda entry: entry.parts)
 
 
 def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explanation, _Explanation]:
@@ -231,17 +232,17 @@ def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explana
     _, sensors = linear_sum_assignment(cost - 1e-6 * np.eye(len(cost)))
     settled = responding & (cost[channels, sensors] <= _FITS)
     sensors = _keep_unsettled(sensors, settled)
-    own, there = (np.where(responding, cost[channels, place], 0.0) for place in (channels, sensors))
+    straight, permuted = (np.where(responding, cost[channels, place], 0.0) for place in (channels, sensors))
     factor, least = _CLEARER
     moved = np.flatnonzero(settled & (sensors != channels))
     seconds = [
-        np.delete(cost[channel], sensors[channel]).min(initial=1.0) > factor * there[channel] + least
+        np.delete(cost[channel], sensors[channel]).min(initial=1.0) > factor * permuted[channel] + least
         for channel in moved
     ]
-    seconds += list((match.expected[sensors[moved]] >= _PRESSED) & (there[moved] <= _WELL))
+    seconds += list((match.expected[sensors[moved]] >= _PRESSED) & (permuted[moved] <= _WELL))
     # Of two silent channels, nothing says which is where.
     seconds.append(int((~settled & (sensors != channels)).sum()) <= 1)
-    return _Explanation(turn, channels, own), _Explanation(turn, sensors, there, all(seconds))
+    return _Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, all(seconds))
 
 
 def _keep_unsettled(sensors: np.ndarray, settled: np.ndarray) -> np.ndarray:
@@ -254,7 +255,7 @@ def _keep_unsettled(sensors: np.ndarray, settled: np.ndarray) -> np.ndarray:
 
 
 def _phrase_refusal(
-    own: _Explanation | None,
+    straight: _Explanation | None,
     best: _Explanation,
     clear: Sequence[_Explanation],
     confirmed: Confirmed,
@@ -262,12 +263,12 @@ def _phrase_refusal(
 ) -> str:
     """Return the sentence that refuses a session, with the settings that confirm its explanations."""
     order = np.array(confirmed.order(len(responding)))
-    if own is None:
+    if straight is None:
         wrong = np.flatnonzero(responding)
         trouble = "the places of some presses are outside the sheet"
     else:
-        wrong = np.flatnonzero(own.residual > _CLEARER[0] * best.residual + _CLEARER[1])
-        wrong = np.union1d(wrong, own.unexplained).astype(int)
+        wrong = np.flatnonzero(straight.residual > _CLEARER[0] * best.residual + _CLEARER[1])
+        wrong = np.union1d(wrong, straight.unexplained).astype(int)
         noun, verb, place = ("channels", "respond", "their sensors") if len(wrong) > 1 else (
             "channel", "responds", "its sensor"
         )  # fmt: skip
@@ -276,24 +277,28 @@ def _phrase_refusal(
         return f"{trouble}: {_phrase_advice(wrong, order, responding)}"
     sentences = [f"{trouble}: the session fits if {_phrase_explanation(clear[0], confirmed, order)}"]
     # A turn that is made up for by another order says nothing new.
-    others = [each for each in clear[1:] if each.turn == "as_given" or not len(each.moved)]
-    sentences += [f"it fits as well if {_phrase_explanation(each, confirmed, order)}" for each in others[:2]]
+    others = [entry for entry in clear[1:] if entry.turn == "as_given" or not len(entry.moved)]
+    sentences += [
+        f"it fits as well if {_phrase_explanation(entry, confirmed, order)}" for entry in others[:2]
+    ]
     if len(left := clear[0].unexplained):
         sentences.append(f"channel {list_numbers(sorted(order[left]))} fits nowhere: check the wiring")
     return ". ".join(text[0].upper() * bool(n) + text[bool(n) :] for n, text in enumerate(sentences))
 
 
-def _is_conclusive(each: _Explanation, own: _Explanation | None, responding: np.ndarray) -> bool:
+def _is_conclusive(explanation: _Explanation, straight: _Explanation | None, responding: np.ndarray) -> bool:
     """Return whether an explanation is sure and explains enough to be named."""
-    if not each.parts or not each.sure or len(each.unexplained) > _MOST * responding.sum():
+    if not explanation.parts or not explanation.sure:
         return False
-    if own is None:
-        return True
-    if len(np.setdiff1d(each.unexplained, own.unexplained)):
+    if len(explanation.unexplained) > _MOST * responding.sum():
         return False
-    if each.turn == "as_given":
+    if straight is None:
         return True
-    return int((own.residual > _CLEARER[0] * each.residual + _CLEARER[1]).sum()) >= _FEWEST
+    if len(np.setdiff1d(explanation.unexplained, straight.unexplained)):
+        return False
+    if explanation.turn == "as_given":
+        return True
+    return int((straight.residual > _CLEARER[0] * explanation.residual + _CLEARER[1]).sum()) >= _FEWEST
 
 
 def _phrase_advice(wrong: np.ndarray, order: np.ndarray, responding: np.ndarray) -> str:
@@ -310,17 +315,17 @@ def _phrase_advice(wrong: np.ndarray, order: np.ndarray, responding: np.ndarray)
     )
 
 
-def _phrase_explanation(each: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:
+def _phrase_explanation(explanation: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:
     """Return an explanation in words, with its settings."""
     words, settings = list[str](), list[str]()
-    if each.turn != "as_given":
-        words.append(f"the places of the presses are {WORDS[each.turn]}")
-        settings.append(f"calibrate.places={compose_turns(confirmed.places, each.turn)}")
-    if len(each.moved):
-        moved = sorted(order[each.moved])
+    if explanation.turn != "as_given":
+        words.append(f"the places of the presses are {WORDS[explanation.turn]}")
+        settings.append(f"calibrate.places={compose_turns(confirmed.places, explanation.turn)}")
+    if len(explanation.moved):
+        moved = sorted(order[explanation.moved])
         verb = "exchanged" if len(moved) == 2 else "in another order"
         words.append(f"channels {list_numbers(moved)} are {verb}")
-        channels = ",".join(str(channel) for channel in order[np.argsort(each.sensors)])
+        channels = ",".join(str(channel) for channel in order[np.argsort(explanation.sensors)])
         settings.append(f"'calibrate.channels=[{channels}]'")
     return f"{' and '.join(words)}; to confirm that, add {' '.join(settings)}"
 

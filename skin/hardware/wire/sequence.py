@@ -11,7 +11,7 @@ _ACROSS = 4096  # frames that may be missing where seq wraps
 _WRAP_GAP = 60_000_000  # microseconds that may be missing where the clock wraps
 
 
-class Place(NamedTuple):
+class FramePosition(NamedTuple):
     """Time, segment and losses of a frame, as in :class:`skin.device.resampling.Frame`."""
 
     t: float
@@ -43,7 +43,7 @@ class SequenceTracker:
         """Start a new segment with the next frame; ``after`` is the reason."""
         self._after = after
 
-    def place(self, seq: int | None, t_us: float, missing: int) -> Place:
+    def place(self, seq: int | None, t_us: float, missing: int) -> FramePosition:
         """Return the time, segment and losses of a frame.
 
         Args:
@@ -70,13 +70,13 @@ class SequenceTracker:
             return self._begin(t_us)
         return self._follow(t_us + self._wrapped, ahead - 1)
 
-    def _follow(self, t_us: float, lost: int) -> Place:
-        return Place(t_us * 1e-6, self.segment, lost, "gap" if lost else "")
+    def _follow(self, t_us: float, lost: int) -> FramePosition:
+        return FramePosition(t_us * 1e-6, self.segment, lost, "gap" if lost else "")
 
-    def _begin(self, t_us: float) -> Place:
+    def _begin(self, t_us: float) -> FramePosition:
         after, self._after, self._wrapped = self._after, "", 0
         self.segment += bool(after)
-        return Place(t_us * 1e-6, self.segment, 0, after)
+        return FramePosition(t_us * 1e-6, self.segment, 0, after)
 
 
 class FrameClock:

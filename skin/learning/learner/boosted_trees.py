@@ -129,12 +129,12 @@ class BoostedTrees(AbstractLearner):
         began = time.perf_counter()
         self._models = []
         # Each label is trained on the touches for which it is defined.
-        known, other = (
+        trained, checked = (
             task.counts(torch.from_numpy(table[f"{split}_labels"])).numpy()
             for split in ("train", "validation")
         )
         for label, name in enumerate(task.names):
-            rows, held = known[:, label], other[:, label]
+            rows, held = trained[:, label], checked[:, label]
             truth = table["train_labels"][rows, label]
             if len(np.unique(truth)) < 2:
                 raise InputError(f"all training touches have the same label {name}: give more touches")
@@ -195,6 +195,6 @@ def _predict(model: Trees, matrix: np.ndarray) -> np.ndarray:
 
 def _matrix(touches: Touches, task: Task) -> np.ndarray:
     """Return the features as (B, D), float32."""
-    here = touches.to("cpu")
-    columns = engineered_features(here) | (direction_features(here) if task.direction else {})
+    moved = touches.to("cpu")
+    columns = engineered_features(moved) | (direction_features(moved) if task.direction else {})
     return torch.stack([column.to(torch.float32) for column in columns.values()], dim=1).numpy()

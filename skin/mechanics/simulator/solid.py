@@ -251,7 +251,7 @@ class Solid(AbstractSimulator):
     ) -> None:
         super().__init__()
         self.shape, self._area = body.shape, float(np.prod(body.cell))
-        self._mesh, self._divisions = hexahedra(body, divisions, poisson or {}), divisions
+        self._mesh, self._divisions = build_mesh(body, divisions, poisson or {}), divisions
         self._folder = array_cache.folder(cache)
         self._key = array_cache.hashed(_content(body, self._mesh), _SOURCES)
         rows = self._operator(sensors)
@@ -353,7 +353,7 @@ class Solid(AbstractSimulator):
         return array_cache.kept(self._folder / f"solid-{key}.npz", key, {"rows": shape}, build)["rows"]
 
 
-def hexahedra(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) -> Hexahedra:
+def build_mesh(body: AbstractBody, divisions: int, poisson: Mapping[str, float]) -> Hexahedra:
     """Return a body's elements: its cells, ``divisions`` rows to each layer.
 
     Args:

@@ -110,16 +110,16 @@ class ModelMetadata:
         if KEY not in entries:
             raise InputError(f"{path} was not written by skin export: it describes no labels and no sensors")
         try:
-            known = json.loads(entries[KEY])
-            schema, sensors = known.pop("schema"), known.pop("sensors")
+            content = json.loads(entries[KEY])
+            schema, sensors = content.pop("schema"), content.pop("sensors")
         except (ValueError, KeyError, AttributeError, TypeError) as error:
             raise InputError(f"{path} has a damaged description: {again}") from error
         if schema != SCHEMA:
             raise InputError(f"{path} has schema {schema}, this version reads {SCHEMA}: {again}")
-        found = configured(cls, known, f"description of {path}")
-        if len(found.positions) != sensors:
-            raise InputError(f"{path} has {len(found.positions)} positions for {sensors} sensors: {again}")
-        return found
+        metadata = configured(cls, content, f"description of {path}")
+        if len(metadata.positions) != sensors:
+            raise InputError(f"{path} has {len(metadata.positions)} positions for {sensors} sensors: {again}")
+        return metadata
 
 
 _NAMES = """
@@ -214,8 +214,8 @@ def _check_interface(model: "ModelProto", metadata: ModelMetadata, path: Path) -
 def _check(model: "ModelProto", entries: dict[str, str]) -> None:
     """Raise a ValueError where a file has what no network needs."""
     graph = model.graph
-    if other := sorted(set(entries) - {KEY, CHECKSUM}):
-        raise ValueError(f"it has the unknown entry {other[0]!r}")
+    if unknown := sorted(set(entries) - {KEY, CHECKSUM}):
+        raise ValueError(f"it has the unknown entry {unknown[0]!r}")
     if len(graph.node) > _NODES:
         raise ValueError(f"it has {len(graph.node)} operators")
     if model.functions or graph.sparse_initializer or model.training_info:
@@ -223,13 +223,13 @@ def _check(model: "ModelProto", entries: dict[str, str]) -> None:
     # Whose content would be another file, perhaps a device.
     if any(tensor.data_location == _EXTERNAL or tensor.external_data for tensor in _tensors(model)):
         raise ValueError("it refers to other files")
-    known = {value.name for value in graph.input}
+    dependent = {value.name for value in graph.input}
     for node in graph.node:
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             raise ValueError(f"it uses the operator {node.domain} {node.op_type}".replace("  ", " "))
         if any(attribute.HasField("g") or attribute.graphs for attribute in node.attribute):
             raise ValueError(f"{node.op_type} has a graph inside")
-        _follow(node, known)
+        _follow(node, dependent)
 
 
 def _tensors(model: "ModelProto") -> Iterator:
@@ -239,17 +239,17 @@ def _tensors(model: "ModelProto") -> Iterator:
             yield from (attribute.t, *attribute.tensors)
 
 
-def _follow(node, known: set[str]) -> None:  # type: ignore[no-untyped-def]
+def _follow(node, dependent: set[str]) -> None:  # type: ignore[no-untyped-def]
     """Add the outputs of an operator to the names of tensors that depend on readings, if they do.
 
     Raises:
         ValueError: the size of its output depends on readings.
     """
     sizes = {node.input[place] for place in _SIZES.get(node.op_type, ()) if place < len(node.input)}
-    if sizes & known:
+    if sizes & dependent:
         raise ValueError(f"the size of what {node.op_type} returns depends on readings")
-    if node.op_type not in ("Shape", "Size") and known & set(node.input):
-        known.update(node.output)
+    if node.op_type not in ("Shape", "Size") and dependent & set(node.input):
+        dependent.update(node.output)
 
 
 _SECONDS = 20.0  # s to load a file and to classify a window, which takes some ms
@@ -312,7 +312,7 @@ class ExportedModel(TrainedModel):
         if threshold is None:
             return None
         if thresholds:
-            nearest = min(thresholds, key=lambda known: abs(log(float(known) / rate)))
+            nearest = min(thresholds, key=lambda text: abs(log(float(text) / rate)))
             say(f"the device sends {rate:.3g} frames a second: threshold for {nearest} Hz, per touch")
             threshold = thresholds[nearest]
         else:
@@ -419,15 +419,15 @@ def check_overrides(path: str, composed: DictConfig, overrides: Sequence[str]) -
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     groups = [override.key_or_group.split(".")[0].split("/")[0] for override in parsed]
     named = dict(zip(overrides, groups, strict=True))
-    asked = {override: group for override, group in named.items() if group not in _FREE}
-    for override, group in asked.items():
+    restricted = {override: group for override, group in named.items() if group not in _FREE}
+    for override, group in restricted.items():
         if group not in GROUPS:
             raise InputError(f"{override} has no effect on {path}, a network for one skin: leave it out")
-    if not asked:
+    if not restricted:
         return
     metadata = ExportedModel(path).metadata
     folders = [override for override, group in named.items() if group == "hydra"]
-    for override in asked:
+    for override in restricted:
         if not _agrees(metadata, composed, [*folders, override], path):
             raise InputError(
                 f"{override} contradicts {path}, which was exported for another skin: leave it out, or "

@@ -23,14 +23,14 @@ def nanmedian(x: Any, dim: int, keepdim: bool = False) -> tuple[Any, Any]:
         The medians (B,), NaN in rows without a number, and no useful indices.
     """
     missing = op.IsNaN(x)
-    known = op.Where(missing, op.Constant(value_float=float("inf")), x)
+    filled = op.Where(missing, op.Constant(value_float=float("inf")), x)
     count = op.ReduceSum(op.Cast(op.Not(missing), to=_INT64), [dim], keepdims=1)
     length = op.Gather(op.Shape(x), [dim])
-    rising, order = op.TopK(known, length, axis=dim, largest=0)
+    rising, order = op.TopK(filled, length, axis=dim, largest=0)
     middle = op.Max(op.Div(op.Sub(count, 1), 2), 0)
-    found = op.GatherElements(rising, middle, axis=dim)
-    found = op.Where(op.Greater(count, 0), found, op.Constant(value_float=float("nan")))
-    return (found, order) if keepdim else (op.Squeeze(found, [dim]), order)
+    median = op.GatherElements(rising, middle, axis=dim)
+    median = op.Where(op.Greater(count, 0), median, op.Constant(value_float=float("nan")))
+    return (median, order) if keepdim else (op.Squeeze(median, [dim]), order)
 
 
 def cummax(x: Any, dim: int) -> tuple[Any, Any]:
@@ -79,15 +79,15 @@ def singular_values(
     rows, columns = x.shape[1], x.shape[2]
     gram = op.MatMul(turned, whole) if columns <= rows else op.MatMul(whole, turned)
     identity = op.CastLike(op.EyeLike(op.ConstantOfShape([min(rows, columns)] * 2)), gram)
-    found = []
+    values = []
     for _ in range(min(SINGULAR_VALUES, rows, columns)):
         value, gram = _largest_eigenvalue(gram, identity)
-        found.append(value)
-    largest = op.Sqrt(op.Max(op.Concat(*found, axis=1), _double(0.0)))
-    others = min(rows, columns) - len(found)
-    found = op.Pad(op.Cast(largest, to=_FLOAT), [0, 0, 0, others])
+        values.append(value)
+    largest = op.Sqrt(op.Max(op.Concat(*values, axis=1), _double(0.0)))
+    others = min(rows, columns) - len(values)
+    values = op.Pad(op.Cast(largest, to=_FLOAT), [0, 0, 0, others])
     # Not x itself, to which the exporter would give the shape of the output.
-    return op.Identity(x), found, op.Identity(x)
+    return op.Identity(x), values, op.Identity(x)
 
 
 def _largest_eigenvalue(matrix: Any, identity: Any) -> tuple[Any, Any]:
@@ -107,8 +107,8 @@ def _largest_eigenvalue(matrix: Any, identity: Any) -> tuple[Any, Any]:
     # (I - v v^T) M (I - v v^T)
     mixed = op.Sub(image, op.Mul(op.Mul(value, _double(0.5)), vector))
     outer = op.MatMul(mixed, across)
-    rest = op.Sub(op.Sub(matrix, outer), op.Transpose(outer, perm=[0, 2, 1]))
-    return op.Squeeze(value, [2]), rest
+    deflated = op.Sub(op.Sub(matrix, outer), op.Transpose(outer, perm=[0, 2, 1]))
+    return op.Squeeze(value, [2]), deflated
 
 
 def _positive(x: Any) -> Any:

@@ -115,8 +115,8 @@ def _quiet() -> Iterator[None]:
 def _difference(module: nn.Module, model: ExportedModel, touches: Touches) -> float:
     with torch.inference_mode():
         expected = module(touches.readings, touches.valid).numpy()
-    found = model.probabilities(touches.readings.numpy(), touches.valid.numpy())
-    return float(np.abs(found - expected).max())
+    computed = model.probabilities(touches.readings.numpy(), touches.valid.numpy())
+    return float(np.abs(computed - expected).max())
 
 
 def _rounding(module: nn.Module, touches: Touches) -> float:

@@ -10,7 +10,7 @@ from skin.body.sensors import Sensors
 from skin.body.sheet import Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra
-from skin.mechanics.simulator.solid import Elastic, Solid, hexahedra, reading_rows
+from skin.mechanics.simulator.solid import Elastic, Solid, build_mesh, reading_rows
 
 LAYERS = [
     {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
@@ -57,7 +57,7 @@ def _interpolated(mesh, points, strain):
 
 
 def test_the_table_pushes_back():
-    mesh = hexahedra(SHEET, 2, {})
+    mesh = build_mesh(SHEET, 2, {})
     for axis in range(3):
         load = mesh.loads(axis) @ np.random.default_rng(axis).random(144)
         moved = Elastic(mesh).solve(load[:, None])[:, 0]
@@ -66,7 +66,7 @@ def test_the_table_pushes_back():
 
 
 def test_the_operator_is_a_direct_solve():
-    mesh = hexahedra(SHEET, 2, {})
+    mesh = build_mesh(SHEET, 2, {})
     free = np.flatnonzero(~mesh.held)
     where = sensors((0.031, 0.052, 0.005), (0.09, 0.03, 0.009), normals=[(0.3, 0.1, 0.9), (0, 0, 1)])
     pressure = 1e4 * np.random.default_rng(0).random(144)
@@ -80,7 +80,7 @@ def test_the_operator_is_a_direct_solve():
 
 def test_forces_are_mutual():
     """Maxwell and Betti: cell a moves under cell b as cell b does under cell a."""
-    mesh = hexahedra(SHEET, 2, {})
+    mesh = build_mesh(SHEET, 2, {})
     loads = mesh.loads(2)
     compliance = loads.T @ Elastic(mesh).solve(loads.toarray())
     assert np.abs(compliance - compliance.T).max() < 1e-10 * np.abs(compliance).max()

@@ -474,7 +474,7 @@ class DataSet:
                 f"{self.path(missing[0]).name} is: repeat the skin generate that made it, which adds them"
             )
         for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
-            with _mended():
+            with _advise_repair():
                 about = read_description(self.path(number))
             expected = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
             if expected != (count, first, self.manifest.config_hash):
@@ -490,12 +490,12 @@ class DataSet:
         Raises:
             InputError: the shard is damaged.
         """
-        with _mended():
+        with _advise_repair():
             return read_recording(self.path(number), complete)
 
 
 @contextmanager
-def _mended() -> Iterator[None]:
+def _advise_repair() -> Iterator[None]:
     """Add to an InputError about a shard what to do."""
     try:
         yield

@@ -272,10 +272,8 @@ def _layer(material: Any, thickness: PositiveFloat) -> Layer:
     return Layer(Material.of(material), float(thickness))
 
 
-# Refuse values with the wrong unit; warn of skins whose mechanics have no effect.
-#
-# Classes take any value that has a meaning, however large a sheet or stiff a layer a proof needs; a
-# configuration describes a skin that somebody could hold, and 12 in place of 0.012 m is a mistake there.
+# Plausible ranges of a configuration, where 12 in place of 0.012 m is a mistake. The classes take any value
+# that has a meaning, however large a sheet or stiff a layer a proof needs.
 
 
 class _Range(NamedTuple):

@@ -199,7 +199,6 @@ def limited_memory(extra: int) -> Iterator[None]:
 
 # Checksums inside the files that they are of, so that damage never passes for content.
 
-
 KEY = "skin_file_sha256"
 """Name of the entry with the checksum in the metadata of a binary file (Parquet, ONNX)."""
 BLANK = 64 * "0"

@@ -342,13 +342,8 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     )
 
 
-# A data set: a folder of recordings, its shards, with a manifest.
-#
-# ``manifest.json`` has the schema of the shards and its version, the units, the seed, the source commit and
-# the
-# configuration. ``shards/00000.parquet`` and so on are recordings (:mod:`skin.device.files`); the column
-# ``simulation`` numbers the touches of all shards.
-
+# A data set: recordings in ``shards/00000.parquet`` and so on, whose column ``simulation`` numbers the
+# touches of all, and ``manifest.json`` with schema, version, units, seed, source commit and configuration.
 
 _Positive = Annotated[int, Ge(1)]
 _AGAIN = "delete it, and repeat the skin generate that made the data set, which draws it again"

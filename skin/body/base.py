@@ -272,10 +272,8 @@ def _layer(material: Any, thickness: PositiveFloat) -> Layer:
     return Layer(Material.of(material), float(thickness))
 
 
-# Refuse values with the wrong unit; warn of skins whose mechanics have no effect.
-#
-# Classes take any value that has a meaning, however large a sheet or stiff a layer a proof needs; a
-# configuration describes a skin that somebody could hold, and 12 in place of 0.012 m is a mistake there.
+# Plausible ranges of a configuration, where 12 in place of 0.012 m is a mistake. The classes take any value
+# that has a meaning, however large a sheet or stiff a layer a proof needs.
 
 
 class _Range(NamedTuple):
@@ -325,19 +323,19 @@ def check_plausibility(groups: Mapping[str, Any]) -> None:
         InputError: a value is out of its range.
     """
     for name, ranges in _RANGES.items():
-        _within(name, groups.get(name), ranges)
+        _check_ranges(name, groups.get(name), ranges)
 
 
-def _within(name: str, group: Any, ranges: Mapping[str, Any]) -> None:
+def _check_ranges(name: str, group: Any, ranges: Mapping[str, Any]) -> None:
     if isinstance(group, list):
         for number, entry in enumerate(group):
-            _within(f"{name}.{number}", entry, ranges)
+            _check_ranges(f"{name}.{number}", entry, ranges)
     if not isinstance(group, Mapping):
         return
     for key, within in ranges.items():
         setting = group.get(key)
         if isinstance(within, Mapping):
-            _within(f"{name}.{key}", setting, within)
+            _check_ranges(f"{name}.{key}", setting, within)
             continue
         low, high, unit = within
         for value in setting if isinstance(setting, list) else [setting]:

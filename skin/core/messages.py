@@ -40,7 +40,7 @@ def to_input_error(error: Exception) -> InputError | None:
     """Return an error as an InputError with a message for the user; None for bugs, which need a traceback."""
     if isinstance(error, InputError):
         return error
-    for link in _chain(error):
+    for link in _iterate_causes(error):
         if isinstance(link, sqlite3.OperationalError) or type(link) is sqlite3.DatabaseError:
             return InputError(
                 f"the database of runs failed: {link}: make room, or give another one, as in "
@@ -67,7 +67,7 @@ def to_input_error(error: Exception) -> InputError | None:
     return InputError(one_line(reason))
 
 
-def _chain(error: BaseException) -> Iterator[BaseException]:
+def _iterate_causes(error: BaseException) -> Iterator[BaseException]:
     """Yield an error and its causes: libraries wrap errors of the system."""
     cause: BaseException | None = error
     while cause is not None:

@@ -123,7 +123,7 @@ def load_npz(path: Path, most: int = _BYTES) -> dict[str, np.ndarray]:
     regular(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            total = sum(_claimed(archive, entry) for entry in archive.infolist())
+            total = sum(_check_size(archive, entry) for entry in archive.infolist())
         if total > most:
             raise ValueError(f"its arrays take {total} bytes, more than {most}")
         with np.load(path, allow_pickle=False) as file:
@@ -152,14 +152,14 @@ def check_archive(path: Path, most: int = _BYTES) -> None:
             total = sum(entry.file_size for entry in entries)
             for entry in entries:
                 if entry.filename.endswith(".npy"):
-                    _claimed(archive, entry)
+                    _check_size(archive, entry)
     except zipfile.BadZipFile as error:
         raise ValueError(f"it is no archive of weights: {error}") from error
     if total > most:
         raise ValueError(f"it expands to {total} bytes, more than {most}")
 
 
-def _claimed(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+def _check_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
     """Return the size of an array, bytes, which must match that of its entry."""
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
@@ -198,7 +198,6 @@ def limited_memory(extra: int) -> Iterator[None]:
 
 
 # Checksums inside the files that they are of, so that damage never passes for content.
-
 
 KEY = "skin_file_sha256"
 """Name of the entry with the checksum in the metadata of a binary file (Parquet, ONNX)."""

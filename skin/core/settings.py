@@ -30,21 +30,21 @@ _FEW = "has too few entries"
 _LENGTHS = {"missing": _FEW, "too_short": _FEW, "too_long": "has too many entries"}
 
 
-def _rising(limits: tuple[Any, Any]) -> tuple[Any, Any]:
+def _check_rising(limits: tuple[Any, Any]) -> tuple[Any, Any]:
     if limits[0] > limits[1]:
         raise ValueError("must be a range [least, most]")
     return limits
 
 
-def _once(names: Sequence[str]) -> Sequence[str]:
+def _check_unique(names: Sequence[str]) -> Sequence[str]:
     if len(set(names)) < len(names):
         raise ValueError("must hold each name once")
     return names
 
 
-RISING = AfterValidator(_rising)
+RISING = AfterValidator(_check_rising)
 """Makes a pair a range: ``Annotated[tuple[float, float], RISING]``."""
-ONCE = AfterValidator(_once)
+ONCE = AfterValidator(_check_unique)
 """Makes a list one of different names."""
 
 
@@ -79,7 +79,7 @@ def check_settings(
             raise InputError(f"{name} has no setting {key}{meant} it has {', '.join(choices)}")
         if key in hints and _takes_made(hints[key]) and _is_nothing_made(hints[key], value):
             raise InputError(f"{name}.{key}={str(value)[:_LONG]} must be an option with its settings")
-        if key in hints and _plain(hints[key]) and (wrong := _refusal(hints[key], value)):
+        if key in hints and _is_plain(hints[key]) and (wrong := _explain_refusal(hints[key], value)):
             default = _written(parameters[key].default)
             example = f": as in {name}.{key}={default}" if default else ""
             text = str(list(value) if isinstance(value, tuple) else value)
@@ -194,14 +194,14 @@ def _is_nothing_made(hint: Any, value: Any) -> bool:
     return isinstance(value, str | int | float | list) or (value is None and NoneType not in get_args(hint))
 
 
-def _plain(hint: Any) -> bool:
+def _is_plain(hint: Any) -> bool:
     """Return whether an annotation is made of numbers, text and collections of these alone."""
     if hint in _SCALARS:
         return True
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return _plain(arguments[0])
-    return origin is Literal or (origin in _COLLECTIONS and all(map(_plain, arguments)))
+        return _is_plain(arguments[0])
+    return origin is Literal or (origin in _COLLECTIONS and all(map(_is_plain, arguments)))
 
 
 @cache
@@ -209,7 +209,7 @@ def _adapter(hint: Any) -> TypeAdapter:
     return TypeAdapter(hint, config=_FINITE)
 
 
-def _refusal(hint: Any, value: Any) -> str:
+def _explain_refusal(hint: Any, value: Any) -> str:
     """Return why a value is invalid, and what is valid; empty if it is valid."""
     try:
         taken = _adapter(hint).validate_python(value)
@@ -220,18 +220,18 @@ def _refusal(hint: Any, value: Any) -> str:
         sentence = sentence.split(", unable to parse")[0].replace("an instance of Sequence", "a list")
         sentence = _LENGTHS.get(nearest["type"], sentence.replace("a valid tuple", "a list"))
         return sentence[0].lower() + sentence[1:]
-    for original, number in _changed(value, taken):
+    for original, number in _find_changed(value, taken):
         if isinstance(original, str):
             return "is text, and must be a number"
         return f"must be a {'whole ' * isinstance(number, int)}number"
     return ""
 
 
-def _changed(value: Any, taken: Any) -> Iterator[tuple[Any, Any]]:
+def _find_changed(value: Any, taken: Any) -> Iterator[tuple[Any, Any]]:
     """Yield values that pydantic converted to another type, because the class gets the original."""
     if isinstance(value, list | tuple):
         for pair in zip(value, taken, strict=True):
-            yield from _changed(*pair)
+            yield from _find_changed(*pair)
     for kind in (bool, str, float):
         if isinstance(value, kind) and not isinstance(taken, kind | Path):
             yield value, taken
@@ -293,10 +293,10 @@ def check_targets(config: Any, where: str) -> None:
     Raises:
         InputError: another class is named, or a value is an interpolation, which could become a name.
     """
-    for path, value in _values(config, ()):
+    for path, value in _iterate_values(config, ()):
         if isinstance(value, str) and "${" in value:
             _refuse(where, path, f"has the interpolation {value!r}, stored values are final")
-        if path and path[-1] == "_target_" and not _allowed(value):
+        if path and path[-1] == "_target_" and not _is_allowed(value):
             _refuse(where, path, f"names {value!r}, which could run any code")
     row = config.get("row") if isinstance(config, dict) else None
     if row is not None and (not isinstance(row, str) or {"/", "\\", "\0"} & set(row)):
@@ -309,21 +309,21 @@ def _refuse(where: str, path: tuple[str, ...], reason: str) -> None:
     )
 
 
-def _values(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _iterate_values(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield every key with its value and every entry of a list, however deep."""
     if isinstance(value, dict):
         for key, entry in value.items():
             if isinstance(key, str) and "${" in key:
                 yield (*path, key), key
             yield (*path, str(key)), entry
-            yield from _values(entry, (*path, str(key)))
+            yield from _iterate_values(entry, (*path, str(key)))
     elif isinstance(value, list):
         for number, entry in enumerate(value):
             yield (*path, str(number)), entry
-            yield from _values(entry, (*path, str(number)))
+            yield from _iterate_values(entry, (*path, str(number)))
 
 
-def _allowed(name: Any) -> bool:
+def _is_allowed(name: Any) -> bool:
     """Return whether a name is that of an allowed class.
 
     The name's package is checked first, because to resolve a name imports modules, and then the class.

@@ -82,7 +82,7 @@ def greedy(signal: np.ndarray, count: int, near: np.ndarray, fixed: Sites = ()) 
                 f"only {len(chosen)} of {count} sensors fit, because each other site is too near to one of "
                 "them: lower design.count or design.distance, or set a finer design.raster"
             )
-        site = int(fixed[len(chosen)]) if staying else _best(variance, allowed)
+        site = int(fixed[len(chosen)]) if staying else _find_best(variance, allowed)
         above = factor[: len(chosen)]
         row = signal[site] - above[:, site] @ above
         row[site] += 1
@@ -111,7 +111,7 @@ def exchange(signal: np.ndarray, sites: Sites, near: np.ndarray, fixed: int = 0)
         for number in range(fixed, len(places)):
             others = places[:number] + places[number + 1 :]
             variance = _variance(signal, others)
-            best = _best(variance, np.logical_not(near[others].any(axis=0)))
+            best = _find_best(variance, np.logical_not(near[others].any(axis=0)))
             if variance[best] > variance[places[number]] * (1 + _TIE):
                 places[number], moved = best, True
     return places
@@ -129,10 +129,10 @@ def given(signal: np.ndarray, sites: Sites) -> np.ndarray:
     """
     others = np.setdiff1d(np.arange(len(signal)), sites)
     rows = signal[np.asarray(sites, dtype=int)]
-    return signal[np.ix_(others, others)] - (rows.T @ _solved(rows, sites))[np.ix_(others, others)]
+    return signal[np.ix_(others, others)] - (rows.T @ _solve_noisy(rows, sites))[np.ix_(others, others)]
 
 
-def _best(variance: np.ndarray, allowed: np.ndarray) -> int:
+def _find_best(variance: np.ndarray, allowed: np.ndarray) -> int:
     """Return the first of the allowed sites with the largest variance (C,), to within rounding."""
     most = variance[allowed].max()
     return int(np.flatnonzero(allowed & (variance >= most * (1 - _TIE)))[0])
@@ -141,10 +141,10 @@ def _best(variance: np.ndarray, allowed: np.ndarray) -> int:
 def _variance(signal: np.ndarray, sites: Sites) -> np.ndarray:
     """Return the variance (C,) of each noisy reading given those of some other sites."""
     rows = signal[np.asarray(sites, dtype=int)]
-    return 1 + np.diag(signal) - (rows * _solved(rows, sites)).sum(axis=0)
+    return 1 + np.diag(signal) - (rows * _solve_noisy(rows, sites)).sum(axis=0)
 
 
-def _solved(rows: np.ndarray, sites: Sites) -> np.ndarray:
+def _solve_noisy(rows: np.ndarray, sites: Sites) -> np.ndarray:
     """Return (I + A_SS)^-1 times the rows of A at S, (k, C)."""
     if not len(sites):
         return rows
@@ -466,7 +466,7 @@ class PlacementProblem:
         """
         body, old = device.body, device.sensors
         count = len(old) if count is None else count
-        staying = _kept(keep, len(old), count)
+        staying = _find_staying(keep, len(old), count)
         depths, numbers = np.unique(old.positions[:, 2], return_counts=True)
         depth = float(depths[numbers.argmax()])
         sites = candidate_sites(body, old.footprint, depth, raster, forbidden)
@@ -521,12 +521,12 @@ def best_of_random(
         signal, count, near, fixed: as of :func:`skin.design.placement.greedy`.
         seed: of the choices.
     """
-    draws = (_drawn(near, count, fixed, generator(Stream.PLACEMENT, seed, 0, n)) for n in range(_RANDOM))
+    draws = (_draw_sites(near, count, fixed, generator(Stream.PLACEMENT, seed, 0, n)) for n in range(_RANDOM))
     whole = (sites for sites in draws if len(sites) == count)
     return max(whole, key=lambda sites: mutual_information(signal, sites), default=[])
 
 
-def _kept(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:
+def _find_staying(keep: str | Sequence[int], sensors: int, count: int) -> np.ndarray:
     """Return the indices of the sensors of a layout that stay, in its order; less than ``count``."""
     numbers = range(1, sensors + 1) if isinstance(keep, str) else sorted(set(keep))
     if beyond := [number for number in numbers if number > sensors]:
@@ -555,7 +555,7 @@ def _grid(body: AbstractBody, count: int, footprint: tuple[float, float], depth:
     return [Grid(rows, count // rows, footprint, depth=depth).sensors(body)]
 
 
-def _drawn(near: np.ndarray, count: int, fixed: Sites, draw: np.random.Generator) -> list[int]:
+def _draw_sites(near: np.ndarray, count: int, fixed: Sites, draw: np.random.Generator) -> list[int]:
     """Return sites that are drawn at random, or fewer if no more fit."""
     sites = [int(site) for site in fixed]
     taken = np.asarray(near[sites].any(axis=0))

@@ -25,17 +25,10 @@ from skin.mechanics.geometry import PARAMETERS, Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.runs.build import build_skin
 
-# The local precision: how precisely readings determine where and how hard a fingertip presses.
-#
-# With independent noise of the readings and Gaussian priors, the inverse of J' R^-1 J + P is the covariance
-# of the parameters given the readings, to first order (Van Trees, Detection, Estimation, and Modulation
-# Theory, 2.4). J are the derivatives of the readings, R the variances of the noise, P the inverse variances
-# of the priors.
-#
-# This is no limit for estimators. It describes touches near the true one, and only through the slopes of the
-# readings: a sensor that stays silent has no slope, yet it tells that the touch is not near it. The exact
-# posterior uses that. Above a single sensor it is several times narrower.
-
+# Covariance of the parameters given the readings, to first order: (J' R^-1 J + P)^-1, with the slopes J, the
+# variances R of the noise and the inverse variances P of the priors (Van Trees, Detection, Estimation, and
+# Modulation Theory, 2.4). It is no limit for estimators: a silent sensor has no slope, yet tells that the
+# touch is not near it. Above a single sensor the exact posterior is several times narrower.
 
 _AT_ONCE = 64  # touches; their samples then take about 50 MB with all derivatives
 

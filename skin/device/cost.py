@@ -91,11 +91,11 @@ def read_captures(path: Path, window: int) -> Captures:
         line += len(block)
         # The last capture may continue in the next block.
         last = np.flatnonzero(rows[:, _FRAME] == 1)[-1]
-        parts.append(_resampled(path, rows[:last], window, line - len(rows)))
+        parts.append(_resample(path, rows[:last], window, line - len(rows)))
         begun = rows[last:]
     if not len(begun):
         raise format_error(path, "it has no rows")
-    parts.append(_resampled(path, begun, window, line - len(begun)))
+    parts.append(_resample(path, begun, window, line - len(begun)))
     names = [field.name for field in fields(Captures)]
     return Captures(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -129,12 +129,12 @@ def _blocks(path: Path) -> Iterator[np.ndarray]:
                 if batch.num_rows:
                     yield np.column_stack([column.to_numpy() for column in batch.columns])
     except pa.ArrowException as error:
-        raise format_error(path, _words(error)) from error
+        raise format_error(path, _explain_error(error)) from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from error
 
 
-def _words(error: Exception) -> str:
+def _explain_error(error: Exception) -> str:
     """Return what is wrong with a line that pyarrow cannot parse."""
     text = " ".join(str(error).split())
     if match := re.search(r"column #(\d+): Row #(\d+): .*invalid value ('.*')", text):
@@ -188,7 +188,7 @@ def _refuse_first(path: Path, bad: np.ndarray, line: int, wrong: str) -> None:
         raise format_error(path, f"in line {line + int(bad.argmax())} {wrong}")
 
 
-def _resampled(path: Path, rows: np.ndarray, window: int, line: int) -> Captures:
+def _resample(path: Path, rows: np.ndarray, window: int, line: int) -> Captures:
     """Return whole captures from their rows (R, 68), the first of which stands in ``line``."""
     starts = np.flatnonzero(rows[:, _FRAME] == 1)
     lengths = np.diff(starts, append=len(rows))

@@ -342,13 +342,8 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     )
 
 
-# A data set: a folder of recordings, its shards, with a manifest.
-#
-# ``manifest.json`` has the schema of the shards and its version, the units, the seed, the source commit and
-# the
-# configuration. ``shards/00000.parquet`` and so on are recordings (:mod:`skin.device.files`); the column
-# ``simulation`` numbers the touches of all shards.
-
+# A data set: recordings in ``shards/00000.parquet`` and so on, whose column ``simulation`` numbers the
+# touches of all, and ``manifest.json`` with schema, version, units, seed, source commit and configuration.
 
 _Positive = Annotated[int, Ge(1)]
 _AGAIN = "delete it, and repeat the skin generate that made the data set, which draws it again"
@@ -474,7 +469,7 @@ class DataSet:
                 f"{self.path(missing[0]).name} is: repeat the skin generate that made it, which adds them"
             )
         for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
-            with _mended():
+            with _advise_repair():
                 about = read_description(self.path(number))
             expected = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
             if expected != (count, first, self.manifest.config_hash):
@@ -490,12 +485,12 @@ class DataSet:
         Raises:
             InputError: the shard is damaged.
         """
-        with _mended():
+        with _advise_repair():
             return read_recording(self.path(number), complete)
 
 
 @contextmanager
-def _mended() -> Iterator[None]:
+def _advise_repair() -> Iterator[None]:
     """Add to an InputError about a shard what to do."""
     try:
         yield

@@ -152,9 +152,9 @@ class Imperfection(ImperfectionSettings):
         """
         shape = (sensors,) if gestures is None else (gestures, 1, sensors)
         if self.calibration is None:
-            values = self._drawn(shape, generator)
+            values = self._draw_constants(shape, generator)
         else:
-            values = self._calibrated(self.calibration, shape, generator)
+            values = self._draw_calibrated(self.calibration, shape, generator)
         if values["dead"].all(axis=-1).any():
             raise InputError(
                 f"device.dead={self.dead} of {sensors} sensors leaves none alive (those that are stuck, "
@@ -165,7 +165,9 @@ class Imperfection(ImperfectionSettings):
         tensors = {name: torch.from_numpy(value).float() for name, value in values.items()}
         return Constants(**tensors | {"dead": tensors["dead"].bool()})
 
-    def _drawn(self, shape: tuple[int, ...], generator: np.random.Generator) -> dict[str, np.ndarray]:
+    def _draw_constants(
+        self, shape: tuple[int, ...], generator: np.random.Generator
+    ) -> dict[str, np.ndarray]:
         """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
         ranges = {name: getattr(self, name) for name in _SPREADS}
         some = any(isinstance(bounds, list | tuple) for bounds in ranges.values())
@@ -189,7 +191,7 @@ class Imperfection(ImperfectionSettings):
             "gain": gain, "offset": offset, "dead": dead, "level": level, "drift": drift, "idle": idle
         }  # fmt: skip
 
-    def _calibrated(
+    def _draw_calibrated(
         self, calibration: Calibration, shape: tuple[int, ...], generator: np.random.Generator
     ) -> dict[str, np.ndarray]:
         """Take the values of a calibration, or, a device per gesture, draw from its ranges."""
@@ -343,10 +345,10 @@ def measure(
         return imperfection.apply(force, constants, noise)
     fine = between_frames(force, model_rate, imperfection.rate, noise.random(len(force)))
     readings, valid, saturated = imperfection.apply(fine, constants, noise)
-    return _reduced(readings, valid, saturated, (imperfection.rate, model_rate), force.shape[1])
+    return _reduce_rate(readings, valid, saturated, (imperfection.rate, model_rate), force.shape[1])
 
 
-def _reduced(
+def _reduce_rate(
     readings: Tensor, valid: Tensor, saturated: Tensor, rates: tuple[float, float], window: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return readings and masks (B, F, S) at the first of two rates as (B, window, S) at the second, Hz."""

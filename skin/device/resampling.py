@@ -243,7 +243,7 @@ class Window:
         interval, now = max(1 / self.rate, period), self._times[self._end - 1]
         if not partial and now - self._times[0] + 1.5 * period < self.frames * interval:
             return None
-        return self._until(now + 0.5 * period, interval)
+        return self._resample_until(now + 0.5 * period, interval)
 
     def since(self, begin: float) -> Resampled:
         """Return the window that began at ``begin``, s; read it before a frame behind its end is added.
@@ -255,9 +255,9 @@ class Window:
         end = begin + self.frames * interval - 0.5 * period
         latest = self._times[self._end - 1] + 0.5 * period if self._end else end
         # Where the last frames were lost, the window ends without them.
-        return self._until(latest if abs(latest - end) <= period else end, interval)
+        return self._resample_until(latest if abs(latest - end) <= period else end, interval)
 
-    def _until(self, end: float, interval: float) -> Resampled:
+    def _resample_until(self, end: float, interval: float) -> Resampled:
         times = self._times[: self._end]
         first = int(np.searchsorted(times, end - (self.frames + 1) * interval))
         part = slice(first, int(np.searchsorted(times, end)))

@@ -262,7 +262,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     @torch.no_grad()
     def _batch(self, labels: np.ndarray, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
         movie = self.sampler.sample(len(labels), generator(stream, *key), labels)
-        return self._felt(self._true(movie, complete), generator(Stream.NOISE, self.seed, stream, *key))
+        return self._apply_imperfections(
+            self._simulate_true(movie, complete), generator(Stream.NOISE, self.seed, stream, *key)
+        )
 
     @torch.no_grad()
     def _windows(self, part: slice, complete: bool, stream: Stream, key: tuple[int, ...]) -> Recording:
@@ -272,10 +274,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         starts = np.cumsum(draw.integers(*frames.stride, count, endpoint=True)) - frames.stride[0]
         length = int(starts[-1]) + self.window
         timeline = draw_timeline(self.sampler, length, frames.gap, draw)
-        true = TouchStream.of(timeline, self._true(timeline.movie, complete))
+        true = TouchStream.of(timeline, self._simulate_true(timeline.movie, complete))
         if self.randomise:
-            return self._felt(true.cut(torch.from_numpy(starts), self.window), noise)
-        return TouchStream(timeline, self._felt(true.whole, noise)).cut(torch.from_numpy(starts), self.window)
+            return self._apply_imperfections(true.cut(torch.from_numpy(starts), self.window), noise)
+        return TouchStream(timeline, self._apply_imperfections(true.whole, noise)).cut(
+            torch.from_numpy(starts), self.window
+        )
 
     @torch.no_grad()
     def simulate_stream(self, frames: int, gap: Sequence[int] | None = None, number: int = 0) -> TouchStream:
@@ -285,10 +289,12 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         key = Stream.TEST, 1, number
         gap = gap or self.sampler.settings.frames.gap
         timeline = draw_timeline(self.sampler, frames, gap, generator(*key))
-        true = TouchStream.of(timeline, self._true(timeline.movie, complete=False))
-        return TouchStream(timeline, self._felt(true.whole, generator(Stream.NOISE, self.seed, *key)))
+        true = TouchStream.of(timeline, self._simulate_true(timeline.movie, complete=False))
+        return TouchStream(
+            timeline, self._apply_imperfections(true.whole, generator(Stream.NOISE, self.seed, *key))
+        )
 
-    def _true(self, movie: Movie, complete: bool) -> Recording:
+    def _simulate_true(self, movie: Movie, complete: bool) -> Recording:
         """Return the true readings of gestures; ``complete`` adds displacements and strains."""
         readings, displacement = self.model.respond(movie, displacement=complete)
         positions = torch.from_numpy(self.sensors.positions).float()
@@ -301,7 +307,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         about = TOUCH if self.stream else self.task, self.size, self.sensors.footprint
         return Recording(touches, *about, movie.force, displacement, movie.parameters | true_values)
 
-    def _felt(self, true: Recording, noise: np.random.Generator) -> Recording:
+    def _apply_imperfections(self, true: Recording, noise: np.random.Generator) -> Recording:
         """Return true readings with the imperfections of the device."""
         force, constants, rate = true.touches.readings, self.constants, self.model_rate
         if self.randomise:

@@ -177,10 +177,10 @@ def join_skins(parts: Sequence[Touches]) -> Touches:
     first = parts[0]
 
     def together(name: str, axis: int) -> Tensor:
-        return torch.cat([_widened(getattr(part, name), most, axis) for part in parts])
+        return torch.cat([_widen(getattr(part, name), most, axis) for part in parts])
 
     def expanded(name: str) -> Tensor:
-        return torch.cat([_widened(getattr(part, name), most, 0).expand(len(part), -1, -1) for part in parts])
+        return torch.cat([_widen(getattr(part, name), most, 0).expand(len(part), -1, -1) for part in parts])
 
     return Touches(
         together("readings", 2),
@@ -193,7 +193,7 @@ def join_skins(parts: Sequence[Touches]) -> Touches:
     )
 
 
-def _widened(values: Tensor, sensors: int, axis: int) -> Tensor:
+def _widen(values: Tensor, sensors: int, axis: int) -> Tensor:
     """Return values with zeros, or False, for further sensors along an axis."""
     shape = list(values.shape)
     shape[axis] = sensors - shape[axis]

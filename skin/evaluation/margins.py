@@ -119,7 +119,7 @@ def measure_margins(
     spans = {name: find_spans(predicted[:, n], shares[:, n]) for n, name in enumerate(TOUCH.names)}
     danger = TOUCH.names.index(LABEL)
     spans[ALARM_NAME] = find_spans(point.alarm(chances[:, danger]), shares[:, danger])
-    faint = _faint(predicted != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
+    faint = _count_faint(predicted != (labels > 0.5), above_idle(touches).amax(dim=(1, 2)))
     overall = compute_metrics(chances, labels, TOUCH, point)
     return MarginReport(spans, faint, point, point.reached(chances, labels, TOUCH), overall)
 
@@ -133,7 +133,7 @@ def find_spans(predicted: Tensor, shares: Tensor) -> list[Span]:
     """
     return [
         Span(low, high, float(shares[inside].mean()), int(inside.sum()), int(predicted[inside].sum()))
-        for low, high, inside in _between(_SHARES, shares)
+        for low, high, inside in _split_ranges(_SHARES, shares)
     ]
 
 
@@ -148,7 +148,7 @@ def _shares(measures: Measures, thresholds: Thresholds, longest_tap: int) -> Ten
     return torch.stack([measure / threshold for measure, threshold in pairs], dim=1)
 
 
-def _faint(wrong: Tensor, strength: Tensor) -> list[Faint]:
+def _count_faint(wrong: Tensor, strength: Tensor) -> list[Faint]:
     """Return the errors (B, 4) by the strength (B,), N, of the touch."""
     return [
         Faint(
@@ -157,11 +157,11 @@ def _faint(wrong: Tensor, strength: Tensor) -> list[Faint]:
             int(inside.sum()),
             dict(zip(TOUCH.names, wrong[inside].sum(dim=0).tolist(), strict=True)),
         )
-        for low, high, inside in _between(_STRENGTHS, strength)
+        for low, high, inside in _split_ranges(_STRENGTHS, strength)
     ]
 
 
-def _between(edges: Sequence[float], values: Tensor) -> Iterator[tuple[float, float, Tensor]]:
+def _split_ranges(edges: Sequence[float], values: Tensor) -> Iterator[tuple[float, float, Tensor]]:
     """Yield each range (low, high] that holds some of the values (B,), and which, bool; 0 is in the first."""
     for low, high in pairwise(edges):
         inside = (values <= high) & ((values > low) | (low == 0))

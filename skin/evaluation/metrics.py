@@ -57,7 +57,7 @@ def compute_metrics(
     for name, (chance, label) in zip(task.binary, pairs, strict=True):
         values[f"{name}/accuracy"] = float(((chance > 0.5) == (label > 0)).float().mean())
         values[f"{name}/balanced_accuracy"] = math.nan
-        if _both(label):
+        if _has_both(label):
             recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
             values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = calibration_error(chance, label)
@@ -102,7 +102,7 @@ def measure_angles(probabilities: Tensor, labels: Tensor, task: Task) -> Tensor:
     return angle.where((x != 0) | (y != 0), 90)
 
 
-def _both(label: Tensor) -> bool:
+def _has_both(label: Tensor) -> bool:
     """Return whether a label (B,) has both classes."""
     return bool(label.any()) and not bool(label.all())
 

@@ -87,7 +87,7 @@ def evaluate(
     task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
-    metrics |= _named("same", compute_metrics(chances, _labels(same), task, point))
+    metrics |= _add_prefix("same", compute_metrics(chances, _labels(same), task, point))
     others = touch_sets(device, settings)
     del others["same"]
     for column, sets in others.items():
@@ -98,7 +98,7 @@ def evaluate(
             continue
         if pairs:
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-            metrics |= _named(column, compute_metrics(predicted, true, task, point))
+            metrics |= _add_prefix(column, compute_metrics(predicted, true, task, point))
     cannot |= {name: _UNDEFINED for name, value in metrics.items() if isnan(value) and name.endswith(_SHOWN)}
     table = count_confusions(chances, _labels(same), task) if task.kind == "binary" else None
     reached = None if point is None else point.reached(chances, _labels(same), task)
@@ -158,7 +158,7 @@ def _labels(touches: Touches) -> Tensor:
     return touches.labels
 
 
-def _named(column: str, values: dict[str, float]) -> dict[str, float]:
+def _add_prefix(column: str, values: dict[str, float]) -> dict[str, float]:
     return {f"{column}/{name}": value for name, value in values.items()}
 
 

@@ -178,7 +178,7 @@ def evaluate_windows(
     device = device.simulated(f"streams are simulated, {type(device).__name__} has none")
     # One device records the whole stream, and its baseline is known as after a tare.
     streamed = device.replace(stream=True, randomise=False)
-    threshold = _tuned(streamed)
+    threshold = _tune_threshold(streamed)
     all_gates = gates(threshold, device.task)
     recording = streamed.recording("test")
     touches, labels = recording.touches, recording.touches.labels
@@ -191,13 +191,13 @@ def evaluate_windows(
         threshold.least,
         _listen(learner, streamed, device.task, all_gates, settings, point, track),
         settings.hours,
-        {window: _length(learner, device, window) for window in settings.windows},
+        {window: _measure_length(learner, device, window) for window in settings.windows},
         device.stream,
         point,
     )
 
 
-def _tuned(device: AbstractSimulated) -> ContactThreshold:
+def _tune_threshold(device: AbstractSimulated) -> ContactThreshold:
     """Return the threshold that separates touched from idle windows, tuned on the validation split."""
     touches, idle = device.touches("validation"), device.idle
     assert touches.labels is not None
@@ -270,7 +270,7 @@ def _frames(seconds: float, rate: float, name: str) -> int:
     return frames
 
 
-def _length(learner: Predictor, device: AbstractSimulated, window: float) -> float | str:
+def _measure_length(learner: Predictor, device: AbstractSimulated, window: float) -> float | str:
     """Return the overall accuracy on test touches in windows of another length, s, or why there is none.
 
     All lengths have the same touches with other onsets; windows that are shorter than the longest press have

@@ -60,7 +60,7 @@ class Pair:
     @property
     def sensor(self) -> int:
         """The sensor that answers most in simulation."""
-        return _strongest(self.simulated, self.valid)
+        return _find_strongest(self.simulated, self.valid)
 
     @property
     def force(self) -> float:
@@ -371,7 +371,7 @@ def plot_comparison(comparison: SessionComparison, count: int) -> Figure:
     figure = Figure(figsize=(3.6 * len(strongest), 5.4), layout="constrained")
     axes = figure.subplots(2, len(strongest), squeeze=False, sharex="col")
     for column, pair in enumerate(strongest):
-        answering = pair.sensor if comparison.same else _strongest(pair.measured, pair.valid)
+        answering = pair.sensor if comparison.same else _find_strongest(pair.measured, pair.valid)
         sides = ("simulated", pair.simulated, pair.sensor), ("recorded", pair.measured, answering)
         for axis, (name, values, sensor) in zip(axes[:, column], sides, strict=True):
             if name == "simulated" or comparison.same:
@@ -389,7 +389,7 @@ def plot_comparison(comparison: SessionComparison, count: int) -> Figure:
     return figure
 
 
-def _strongest(values: np.ndarray, valid: np.ndarray) -> int:
+def _find_strongest(values: np.ndarray, valid: np.ndarray) -> int:
     """Return the sensor with the largest valid reading."""
     return int(np.where(valid, values, -np.inf).max(axis=0).argmax())
 

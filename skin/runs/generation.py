@@ -50,7 +50,7 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
         _begin(device, parts, source, folder)
     manifest = Manifest.read(folder)
     _compare(manifest, source, folder)
-    with _locked(folder):
+    with _lock_folder(folder):
         for left in folder.glob("shards/.*"):  # of a process that was killed
             left.unlink()
         _write_missing(parts, manifest, folder)
@@ -107,7 +107,7 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     """Keep other processes from generating the same folder."""
     try:
         with FileLock(folder / ".lock", timeout=0):

@@ -100,7 +100,7 @@ class Store:
         artifacts = Path(settings.artifacts or "mlartifacts").expanduser()
         check_server(uri)
         try:
-            with _alone(uri, artifacts):
+            with _lock_creation(uri, artifacts):
                 client = MlflowClient(tracking_uri=uri)
                 # A server keeps the artifacts of its runs, unless a folder is given.
                 served = is_server(uri) and settings.artifacts is None
@@ -146,7 +146,9 @@ class Store:
 
     def create(self, name: str, tags: dict[str, str]) -> Run:
         """Return a new run, tagged with this process; the caller must end it."""
-        return self.client.create_run(self.experiment, tags=tags | {PROCESS: _me()}, run_name=name)
+        return self.client.create_run(
+            self.experiment, tags=tags | {PROCESS: _identify_process()}, run_name=name
+        )
 
     def _close_abandoned(self) -> None:
         """Set the status of runs whose process no longer exists to KILLED.
@@ -178,7 +180,7 @@ class Store:
         run = again or self.create(name, tags)
         if again:
             self.client.update_run(run.info.run_id, status="RUNNING")
-            for key, value in (tags | {PROCESS: _me()}).items():
+            for key, value in (tags | {PROCESS: _identify_process()}).items():
                 self.client.set_tag(run.info.run_id, key, value)
         status = "KILLED"
         try:
@@ -261,7 +263,7 @@ def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
     print(f"runs: {table}?workflowType=machine_learning&viewStateShareKey={_VIEW}")
 
 
-def _where() -> str:
+def _identify_machine() -> str:
     """Return an identifier of the machine, or of the container with its own process numbers."""
     try:
         space = os.readlink("/proc/self/ns/pid")
@@ -270,16 +272,16 @@ def _where() -> str:
     return f"{platform.node()} {space}"
 
 
-def _me() -> str:
+def _identify_process() -> str:
     """Return the tag of this process; its start time makes it unique."""
-    return json.dumps([_where(), os.getpid(), psutil.Process().create_time()])
+    return json.dumps([_identify_machine(), os.getpid(), psutil.Process().create_time()])
 
 
 def _is_gone(process: str) -> bool | None:
     """Return whether a tagged process no longer exists; None for those of other machines."""
     try:
         where, number, started = json.loads(process)
-        if where != _where():
+        if where != _identify_machine():
             return None
         return abs(psutil.Process(number).create_time() - started) > _SET_CLOCK
     except psutil.NoSuchProcess:
@@ -307,7 +309,7 @@ def _make(path: Path, artifacts: Path) -> None:
 
 
 @contextmanager
-def _alone(uri: str, artifacts: Path) -> Iterator[Any]:
+def _lock_creation(uri: str, artifacts: Path) -> Iterator[Any]:
     """Lock the creation of a SQLite database, which fails in two processes at the same time."""
     if not uri.startswith("sqlite:///"):
         yield

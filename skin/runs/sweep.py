@@ -100,7 +100,7 @@ def sweep_jobs(overrides: list[str], parameters: Mapping[str, str]) -> list[dict
                 f"{override.input_line} names no values to try: give {key}=1,2 or {key}=range(1,9,2)"
             )
     (jobs,) = BasicSweeper.split_arguments(parsed, None)
-    return [_chosen(job) for job in jobs]
+    return [_parse_choices(job) for job in jobs]
 
 
 def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
@@ -110,7 +110,7 @@ def sweep_title(jobs: Sequence[Mapping[str, str]], swept: Sequence[str]) -> str:
     return text if len(text) <= 250 else f"{text[:249]}…"
 
 
-def _chosen(overrides: Iterable[str]) -> dict[str, str]:
+def _parse_choices(overrides: Iterable[str]) -> dict[str, str]:
     """Return the keys and values of overrides."""
     return dict(override.split("=", 1) for override in overrides)  # type: ignore[misc]
 
@@ -173,7 +173,7 @@ class SweepCallback(Callback):
             return
         settings = validate_config(_without_hydra(config)).tracking
         check_server(settings.uri)
-        composed = [_composed(config, job) for job in self._jobs]
+        composed = [_compose_job(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
         from skin.core.messages import PARENT
@@ -270,7 +270,7 @@ class SweepCallback(Callback):
             store.client.delete_run(parent.info.run_id)
 
     def _label(self, config: DictConfig) -> str:
-        job = _chosen(_words(config))
+        job = _parse_choices(_words(config))
         chosen = " ".join(f"{key}={job[key]}" for key in self._swept or job)
         return f"[{self._own.index(config.hydra.job.num) + 1}/{len(self._own)}] {chosen}"
 
@@ -285,7 +285,7 @@ def _without_hydra(config: DictConfig) -> DictConfig:
     return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
 
 
-def _composed(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
+def _compose_job(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
     """Return the configuration of a job; None where it will be refused."""
     words = [f"{key}={value}" for key, value in job.items()]
     whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)

@@ -179,7 +179,7 @@ class TouchSampler:
         while len(pending):
             if tally.draws[pending].min() >= _ATTEMPTS * redraws:
                 tally.warn()
-                raise self._never(targets[pending[0]])
+                raise self._explain_impossible(targets[pending[0]])
             if self.fit and tally.draws[pending].min() >= _LOYAL * redraws:
                 fitted = self.fit.draw(targets[:, 0], generator)
             gestures = draw_gestures(
@@ -265,7 +265,7 @@ class TouchSampler:
         labels = measures.labels(settings.thresholds, settings.rate)
         return Movie(pressed.frames, index, shares, labels, drawn, shear), pressed
 
-    def _never(self, labels: np.ndarray) -> InputError:
+    def _explain_impossible(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))
         return InputError(
             f"no gesture in {_ATTEMPTS * self.settings.redraws} draws was {', '.join(names)}: on this sheet, "

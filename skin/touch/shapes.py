@@ -95,12 +95,12 @@ class Shapes:
         Parts beyond the sheet do not count.
         """
         scales, roots = self._calibration
-        return _interpolated(shape, np.sqrt(area), roots, scales)
+        return _interpolate(shape, np.sqrt(area), roots, scales)
 
     def area(self, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """Return the share of the sheet (B,) that shapes cover at a scale, m (inverse of :meth:`scale`)."""
         scales, roots = self._calibration
-        return _interpolated(shape, scale, scales, roots) ** 2
+        return _interpolate(shape, scale, scales, roots) ** 2
 
     def whole_scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which whole shapes cover as much as a share of the sheet."""
@@ -164,7 +164,7 @@ class Shapes:
             stretch: (F,), along x after the rotation.
         """
         frames = torch.empty(len(shape), *self.body.shape)
-        for part, cells in self._rendered(self.levels, shape, angle, scale, place, stretch):
+        for part, cells in self._render_parts(self.levels, shape, angle, scale, place, stretch):
             frames[part] = cells[:, 0].div_(cells.sum((2, 3)).unsqueeze(2))
         return frames
 
@@ -181,7 +181,7 @@ class Shapes:
         The object is where the image is brighter than ``contact``. Stretching does not change ``rim``.
         """
         cells = torch.empty(len(shape), 3, *self.body.shape)
-        for part, values in self._rendered(self._objects, shape, angle, scale, place, stretch):
+        for part, values in self._render_parts(self._objects, shape, angle, scale, place, stretch):
             cells[part] = values
         cover, grey, rim = cells.unbind(1)
         most = cover.amax((1, 2), keepdim=True)
@@ -207,7 +207,7 @@ class Shapes:
         narrow = 1.0 if stretch is None else np.sqrt(np.maximum(stretch, 1 / stretch))
         return np.maximum(scale, max(self.body.cell) / 4 * narrow)
 
-    def _rendered(
+    def _render_parts(
         self,
         levels: list[Tensor],
         shape: np.ndarray,
@@ -257,7 +257,7 @@ class Shapes:
         return left + right
 
 
-def _interpolated(shape: np.ndarray, at: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolate(shape: np.ndarray, at: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the values (B,) at places (B,), between the known ones (N, K) of each shape."""
     result = np.empty(len(shape))
     for number in np.unique(shape):
@@ -295,7 +295,7 @@ class Fit(NamedTuple):
             for row, shape in np.ndindex(portions.shape):
                 same, number = np.full(_PROBES, bool(row)), np.full(_PROBES, shape)
                 arguments = settings, shapes, chance[row], number
-                drawn = _fitted(same, *arguments, same) if fitted else _as_they_are(same, *arguments)
+                drawn = _draw_fitted(same, *arguments, same) if fitted else _draw_unfitted(same, *arguments)
                 portions[row, shape] = drawn["fits"].mean()
             return portions
 
@@ -305,7 +305,7 @@ class Fit(NamedTuple):
             return None
         small, big = fits(fitted=True) >= _RARE
         if not big.any():
-            raise _no_room(settings, shapes.body.size)
+            raise _explain_no_room(settings, shapes.body.size)
         return cls(big, small | big)
 
     def draw(self, big: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -351,10 +351,10 @@ def draw_bodies(
         chance = generator.random((len(big), 3 if fit is None else 4))[todo]
         if fit is None or kept is None:
             shape = (chance[:, 0] * len(shapes.names)).astype(int)
-            bodies = _as_they_are(big[todo], settings, shapes, chance, shape)
+            bodies = _draw_unfitted(big[todo], settings, shapes, chance, shape)
         else:
             shape = kept[todo]
-            bodies = _fitted(big[todo], settings, shapes, chance, shape, fit.big[shape])
+            bodies = _draw_fitted(big[todo], settings, shapes, chance, shape, fit.big[shape])
         fits = bodies.pop("fits")
         for name, value in bodies.items():
             drawn.setdefault(name, np.empty((len(big), *value.shape[1:]), value.dtype))[todo] = value
@@ -362,10 +362,10 @@ def draw_bodies(
         drawn["misfits"][todo] += 1
         if not len(todo):
             return drawn
-    raise _no_room(settings, shapes.body.size)
+    raise _explain_no_room(settings, shapes.body.size)
 
 
-def _as_they_are(
+def _draw_unfitted(
     big: np.ndarray, settings: GestureSettings, shapes: Shapes, chance: np.ndarray, shape: np.ndarray
 ) -> Draws:
     angle = 2 * np.pi * chance[:, 1]
@@ -376,7 +376,7 @@ def _as_they_are(
     return body | {"low": low, "high": high, "fits": fits}
 
 
-def _fitted(
+def _draw_fitted(
     big: np.ndarray,
     settings: GestureSettings,
     shapes: Shapes,
@@ -404,7 +404,7 @@ def _area(big: np.ndarray, settings: GestureSettings, chance: np.ndarray) -> np.
     return least + (most - least) * chance
 
 
-def _no_room(settings: GestureSettings, size: tuple[float, float]) -> InputError:
+def _explain_no_room(settings: GestureSettings, size: tuple[float, float]) -> InputError:
     least, most = settings.big_area
     return InputError(
         f"none of touch.shapes={list(settings.shapes)} covers {least:g} to {most:g} of a sheet of "

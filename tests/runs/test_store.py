@@ -89,7 +89,7 @@ def test_a_signal_leaves_no_finished_run(begin, tmp_path, settings, store, numbe
 
 
 def test_a_run_whose_process_is_gone_is_called_killed(settings, store):
-    here, number, started = json.loads(tracking._me())
+    here, number, started = json.loads(tracking._identify_process())
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     tags = {

@@ -91,13 +91,13 @@ def place_sensors(
     if depths.dtype.kind not in "if":
         raise InputError(f"layout.depth must be a length in m or null, got {depth!r}: as in 0.004")
     positions = np.column_stack([x, y, np.broadcast_to(depths, x.shape)])
-    _inside(body, positions)
-    _apart(positions)
+    _check_inside(body, positions)
+    _check_distances(positions)
     extent = float(footprint[0]), float(footprint[1])
     return Sensors(positions, extent) if normals is None else Sensors(positions, extent, normals)
 
 
-def _inside(body: AbstractBody, positions: np.ndarray) -> None:
+def _check_inside(body: AbstractBody, positions: np.ndarray) -> None:
     extent = np.array([*body.size, body.thickness])
     outside = ((positions < 0) | (positions > extent + 1e-9)).any(axis=1)
     if outside.any():
@@ -111,7 +111,7 @@ def _inside(body: AbstractBody, positions: np.ndarray) -> None:
         )
 
 
-def _apart(positions: np.ndarray) -> None:
+def _check_distances(positions: np.ndarray) -> None:
     # Not all pairs, which would take gigabytes for the most sensors that a file may have.
     from scipy.spatial import cKDTree  # a mistake in the settings must not wait for it
 

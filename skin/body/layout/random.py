@@ -43,7 +43,7 @@ class Random(AbstractLayout):
         """Return the sensors from the top down, to the micrometre."""
         draw, extent = np.random.default_rng(self.seed), np.array(self.footprint)
         if (extent > body.size).any():
-            raise self._full(body)
+            raise self._explain_no_room(body)
         places = np.empty((0, 2))
         for _ in range(_TRIES):
             candidate = np.round(extent / 2 + draw.random(2) * (np.array(body.size) - extent), 6)
@@ -52,9 +52,9 @@ class Random(AbstractLayout):
             if len(places) == self.count:
                 x, y = places[np.argsort(places[:, 1], kind="stable")].T
                 return place_sensors(body, x, y, self.depth, self.footprint)
-        raise self._full(body)
+        raise self._explain_no_room(body)
 
-    def _full(self, body: AbstractBody) -> InputError:
+    def _explain_no_room(self, body: AbstractBody) -> InputError:
         width, height = self.footprint
         return InputError(
             f"{self.count} sensors of {width:g} x {height:g} m do not fit at random on {body.size[0]:g} x "

@@ -369,13 +369,13 @@ class Emulator:
     def _pieces(self, count: int | None) -> Iterator[tuple[np.ndarray, tuple[int, Gesture] | None]]:
         """Yield counts at rest, then of each gesture with the gap after it."""
         settings, sensors = self.settings, len(self.device.sensors)
-        yield self._felt(np.zeros((round(settings.idle * settings.rate), sensors))), None
+        yield self._convert_to_counts(np.zeros((round(settings.idle * settings.rate), sensors))), None
         gap = np.zeros((round(settings.gap * settings.rate), sensors))
         for number, gesture in enumerate(islice(emulated_gestures(self.device, settings.seed), count)):
             true = upsample(gesture.force, self.device.model_rate, settings.rate)
-            yield self._felt(np.concatenate([true, gap])), (number, gesture)
+            yield self._convert_to_counts(np.concatenate([true, gap])), (number, gesture)
 
-    def _felt(self, true: np.ndarray) -> np.ndarray:
+    def _convert_to_counts(self, true: np.ndarray) -> np.ndarray:
         """Return the counts for true readings (F, S), N."""
         if len(true) < 2:
             return np.zeros((0, true.shape[1]))

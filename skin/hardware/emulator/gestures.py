@@ -72,16 +72,16 @@ def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gest
 
 def gestures_with_labels(device: AbstractSimulated, labels: np.ndarray, seed: int = 0) -> list[Gesture]:
     """Return one gesture for each row of labels (B, 4), 0 or 1, in the order of ``TOUCH``."""
-    return _drawn(device, labels, generator(Stream.TEST, 5, seed))
+    return _draw_gestures(device, labels, generator(Stream.TEST, 5, seed))
 
 
 def _batch(device: AbstractSimulated, seed: int, number: int) -> list[Gesture]:
     draw = generator(Stream.TEST, 2, seed, number)
-    return _drawn(device, balanced(_BATCH, draw), draw)
+    return _draw_gestures(device, balanced(_BATCH, draw), draw)
 
 
 @torch.no_grad()
-def _drawn(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
+def _draw_gestures(device: AbstractSimulated, labels: np.ndarray, draw: np.random.Generator) -> list[Gesture]:
     movie = device.sampler.sample(len(labels), draw, labels)
     readings = device.model.respond(movie, displacement=False).readings.double().numpy()
     names, rows, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()

@@ -358,7 +358,7 @@ class Engine:
             self._idle = readings, valid
         lasted = None if self._contact.since is None else time - self._contact.since
         unknown = ~self._responds[:, valid[-1]].any(axis=1)
-        readings, presented = self._presented(readings, valid, lasted or 0.0)
+        readings, presented = self._cut_window(readings, valid, lasted or 0.0)
         return [
             _Decision(
                 frame=frame,
@@ -376,7 +376,7 @@ class Engine:
             )
         ]
 
-    def _presented(
+    def _cut_window(
         self, readings: np.ndarray, valid: np.ndarray, lasted: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the window (T, S) as the model sees it, during a contact of ``lasted`` s."""

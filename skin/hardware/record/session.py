@@ -230,7 +230,7 @@ class _Reading:
             valid |= saturated
         number_of = int(seq) if seq else None
         frame = Frame(number_of, float(t), float(t), row, valid, 0, self._missing, "", saturated)
-        self._in_time(frame)
+        self._check_time(frame)
         self._missing = 0
         self._last = [*self._last[-1:], (number, frame)]
         self.stored.frames, self.stored.end = self.stored.frames + 1, frame.t
@@ -238,7 +238,7 @@ class _Reading:
         if self._gesture is not None:
             self._sums[id(frame)] = line_sum(text)
 
-    def _in_time(self, frame: Frame) -> None:
+    def _check_time(self, frame: Frame) -> None:
         """Check that time increases; of two contradicting frames, drop the one that does not fit."""
         if not self._last or frame.t >= self._last[-1][1].t:
             return

@@ -225,7 +225,7 @@ def detect_format(data: bytes, sensors: int | None, format: Format) -> Detection
 
 def detection_error(data: bytes, result: DetectionResult, sensors: int | None) -> InputError:
     """Return the error for data in which no format was detected."""
-    if _still(run := _lines(data)):
+    if _has_constant_time(run := _lines(data)):
         return stopped_clock_error(len(run), run[0].fields[1])
     if result.sensors is not None and sensors is not None:
         return InputError(
@@ -246,12 +246,12 @@ def stopped_clock_error(frames: int, t_us: float) -> InputError:
     )
 
 
-def _numeric(line: Line) -> bool:
+def _is_numeric(line: Line) -> bool:
     """Return whether more than half of the fields are numbers; only such lines show a format."""
     return line.finite or 2 * sum(map(isfinite, line.fields)) > len(line.fields)
 
 
-def _still(run: Sequence[Line]) -> bool:
+def _has_constant_time(run: Sequence[Line]) -> bool:
     """Return whether the first column counts while the next one, the time, is constant."""
     run = [line for line in run if len(line.fields) > 2]
     times = {line.fields[1] for line in run}
@@ -266,7 +266,7 @@ def _lines(data: bytes) -> list[Line]:
     for piece in data.split(b"\n")[1:-1]:
         with suppress(FrameError):
             lines.append(parse_line(piece.removesuffix(b"\r")))
-    return [line for line in lines if _numeric(line)]
+    return [line for line in lines if _is_numeric(line)]
 
 
 def _binary_counts(data: bytes) -> list[int]:
@@ -289,7 +289,7 @@ def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> De
         except FrameError:
             run = []
             continue
-        if not _numeric(read):
+        if not _is_numeric(read):
             run = []
             continue
         if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
@@ -314,7 +314,7 @@ def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat 
         return TextFormat(count, False, check)
     if sensors is not None and count == sensors + 2 and counting:
         return TextFormat(sensors, True, check)
-    if not learn or len(run) < _LINES_UNKNOWN or _still(run):
+    if not learn or len(run) < _LINES_UNKNOWN or _has_constant_time(run):
         return None
     counting = _all_count(run)
     return TextFormat(count - 2 * counting, counting, check)
@@ -456,7 +456,7 @@ class Decoder:
                 return None
             if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
-            return self._placed(raw, now)
+            return self._place_frame(raw, now)
         except FrameError as bad:
             self._count_bad(bad)
             return None
@@ -475,7 +475,7 @@ class Decoder:
         self.stats.bad[bad.reason] += 1
         self.quality.note(bad)
 
-    def _placed(self, raw: RawFrame, now: float) -> Frame:
+    def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         t_us = raw.t_us
         if t_us is None:
             rate = None if self.header is None else self.header.rate
@@ -493,18 +493,18 @@ class Decoder:
             self._clock.restart()
         if self._channels is not None:
             raw = raw._replace(values=raw.values[self._channels])
-        values, valid = (raw.values, self._all_valid) if raw.finite else self._masked(raw)
+        values, valid = (raw.values, self._all_valid) if raw.finite else self._mask_missing(raw)
         self._latest = values
         frame = Frame(raw.seq, t, self._clock(t, now), values, valid, segment, lost, after)
-        return frame if self._polarity is None else self._oriented(frame, self._polarity)
+        return frame if self._polarity is None else self._apply_polarity(frame, self._polarity)
 
-    def _oriented(self, frame: Frame, polarity: np.ndarray) -> Frame:
+    def _apply_polarity(self, frame: Frame, polarity: np.ndarray) -> Frame:
         """Return a frame with its polarity; channels whose values fall with force end at 0 counts."""
         at_limit = (polarity < 0) & (frame.values <= 0)
         counted = self.header is not None and self.header.bits is not None
         return frame._replace(polarity=polarity, saturated=at_limit if counted else None)
 
-    def _masked(self, raw: RawFrame) -> tuple[np.ndarray, np.ndarray]:
+    def _mask_missing(self, raw: RawFrame) -> tuple[np.ndarray, np.ndarray]:
         """Return values without NaN, (S,), and which of them the device sent, (S,), bool."""
         valid = np.isfinite(raw.values)
         self.stats.invalid += len(valid) - int(np.count_nonzero(valid))

@@ -327,7 +327,7 @@ class WireFeed:
             raise error
         if now - self._said_at >= 1:
             self._say(now)
-        return [self._judged(frame) for frame in frames]
+        return [self._judge(frame) for frame in frames]
 
     def states(self) -> tuple[ChannelState, ...]:
         """Return the state of each channel."""
@@ -359,7 +359,7 @@ class WireFeed:
         if now - self._clock_since >= least and self._clock_frames >= few:
             raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
 
-    def _judged(self, frame: Frame) -> Frame:
+    def _judge(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
         valid, saturated = self._health.check(frame.values, frame.t)

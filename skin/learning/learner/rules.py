@@ -87,8 +87,8 @@ class Rules(AbstractLearner):
             {
                 name: _tune(
                     name,
-                    _defined(train_features, train.known_labels, data.task, i),
-                    _defined(validation_features, validation.known_labels, data.task, i),
+                    _select_defined(train_features, train.known_labels, data.task, i),
+                    _select_defined(validation_features, validation.known_labels, data.task, i),
                 )
                 for i, name in enumerate(data.task.names)
             }
@@ -126,7 +126,7 @@ class Rules(AbstractLearner):
         self.parameters = 2 * len(rules)
 
 
-def _defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
+def _select_defined(values: dict[str, Tensor], labels: Tensor, task: Task, label: int) -> _Split:
     """Return the features and one label of the touches for which that label is defined."""
     rows = task.counts(labels)[:, label].cpu()
     return {name: column[rows] for name, column in values.items()}, labels[:, label].cpu()[rows].numpy()

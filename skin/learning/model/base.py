@@ -102,11 +102,8 @@ def encoder(
     return result
 
 
-# Poolings: modules that reduce the nodes of a graph to one vector.
-#
-# PyTorch Geometric's aggregations take 2.9 (max), 1.0 to 1.5 (mean), 1.1 to 1.2 (attention) and 1.0 to 1.3
-# (set2set) times as long as these, and 0.7 s to import.
-
+# Poolings of the nodes of a graph to one vector. PyTorch Geometric's take 2.9 (max), 1.0 to 1.5 (mean), 1.1
+# to 1.2 (attention) and 1.0 to 1.3 (set2set) times as long, and 0.7 s to import.
 
 Pooling = Literal["max", "mean", "attention", "set2set"]
 

@@ -11,15 +11,9 @@ from torch.nn import functional as F
 from skin.errors import InputError
 from skin.learning.model.base import AbstractModel, Kind
 
-# Convolution and pooling of images of which only a few pixels ever differ from a constant.
-#
-# An image of 25 sensors has 25 pixels that may differ from zero. After a 3x3 convolution and a 2x2 pooling
-# they
-# touch 100 of 961 cells; every other cell holds the same value in all images, the *background*. So a layer
-# needs the cells that differ (their difference from the background) and the background itself. This is the
-# same
-# mathematics as the dense layer, at about a quarter of its time; a test compares the two.
-
+# Sparse convolution and pooling. The 25 pixels of 25 sensors touch 100 of 961 cells after a 3x3 convolution
+# and a 2x2 pooling; every other cell holds the same value in all images, the *background*. A layer computes
+# both: the same mathematics as the dense layer, which a test compares, at about a quarter of its time.
 
 TAPS = 9  # of a 3x3 kernel
 WINDOW = 4  # a pooled cell sees 4x4 inputs

@@ -133,12 +133,12 @@ class _State:
         self.deflection = self.pressure @ compliance
         self.direction = torch.zeros_like(gap)
         self.carried = torch.zeros_like(total)  # share of the last direction in the next, times its square
-        self._look()
+        self._update_contact()
 
     def _loaded(self, pressure: Tensor, total: Tensor) -> Tensor:
         return pressure * (total / pressure.sum(1))[:, None]
 
-    def _look(self) -> None:
+    def _update_contact(self) -> None:
         """Find the cells in contact and how far each surface is from the mean of theirs."""
         self.touches = self.pressure > 0
         self.count = self.touches.sum(1).clamp(min=1)
@@ -185,7 +185,7 @@ class _State:
         if changed.any():
             self.pressure[changed] = self._loaded(projected[changed], self.total[changed])
             self.deflection[changed] = self.pressure[changed] @ self.compliance
-        self._look()
+        self._update_contact()
 
 
 # Checkerboard stabilisation of the compliance of a mesh that is as coarse as the loaded cells.
@@ -443,7 +443,7 @@ class Rigid(AbstractContact):
         full = np.zeros(len(trajectories.peak))
         np.maximum.at(full, trajectories.owner, trajectories.share)
         reference = _reference_frames(trajectories, full, gap, problem.footprints)
-        forces, lost = self._sought(trajectories, gap, reference, problem)
+        forces, lost = self._search_forces(trajectories, gap, reference, problem)
         force = forces.load / full
         refused = np.isnan(force)
 
@@ -487,7 +487,7 @@ class Rigid(AbstractContact):
         )
         return lower - lower.amin(1, keepdim=True)
 
-    def _sought(
+    def _search_forces(
         self, trajectories: Trajectories, gap: Tensor, reference: np.ndarray, problem: ContactProblem
     ) -> tuple[ForceSearch, np.ndarray]:
         """Return the loads of each gesture's reference frame, and how many of these did not converge."""

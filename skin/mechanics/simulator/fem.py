@@ -20,11 +20,8 @@ from skin.mechanics.simulator._strain import largest, squeeze
 from skin.mechanics.simulator.base import AbstractSimulator, Response, factorised, flatten
 from skin.mechanics.simulator.plates import Constraint, Structure
 
-# What a sheet's sensors see of a pressure on it, as matrices: solved once, then kept on disk.
-#
-# The sheet is linear, so every functional s of its motion is a fixed row over the cells: s' K^-1 P p = (K^-1
-# s)' P p. One factorisation and one solve per functional replace one solve per frame.
-
+# Readings as matrices, solved once and kept on disk: the sheet is linear, so a functional s of its motion is
+# a fixed row over the cells, s' K^-1 P p = (K^-1 s)' P p. One solve per functional replaces one per frame.
 
 # Raise it when the meaning of a stored file changes.
 _FORMAT = 2

@@ -17,11 +17,8 @@ from skin.body.material import Material
 from skin.body.sensors import Sensors
 from skin.errors import InputError
 
-# An upright Euler-Bernoulli beam of rectangular section.
-#
-# Its ends are the lower and the upper node, each with the degrees of freedom (u, v, w, rx, ry, rz), w
-# upwards.
-
+# An upright Euler-Bernoulli beam of rectangular section, from the lower node to the upper one, each with the
+# degrees of freedom (u, v, w, rx, ry, rz), w upwards.
 
 # Local axes in the rows: x runs up the beam, y along the sheet's y, z against the sheet's x. PyNite turns an
 # upright member without rotation like this.
@@ -78,11 +75,8 @@ def _unit(mode: str, length: float) -> np.ndarray:
     return matrix
 
 
-# A rectangular plate: Adini-Clough-Melosh bending and a bilinear membrane.
-#
-# Nodes run (0, 0), (a, 0), (a, b), (0, b); each has the six degrees of freedom (u, v, w, rx, ry, rz) with w
-# upwards, rx = dw/dy and ry = -dw/dx. Rotation about z has no stiffness: supports hold it.
-
+# A rectangular plate: Adini-Clough-Melosh bending and a bilinear membrane. Nodes run (0, 0), (a, 0), (a, b),
+# (0, b), with the beam's degrees of freedom, rx = dw/dy, ry = -dw/dx; supports hold rz.
 
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 # Powers (of x, of y) of the twelve terms of the deflection (Melosh 1963).

@@ -39,7 +39,7 @@ def first_order_lag(readings: Tensor, time_constant: Tensor, time: Tensor) -> Te
 
 
 def running_peak(readings: Tensor) -> Tensor:
-    """Return the largest |reading| since a sensor was last at rest, (B, T, S), N."""
+    """Return the largest magnitude of the reading since a sensor was last at rest, (B, T, S), N."""
     size, peaks = readings.abs(), torch.empty_like(readings)
     peak = torch.zeros_like(size[:, 0])
     for number, frame in enumerate(size.unbind(1)):

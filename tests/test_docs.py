@@ -1,11 +1,13 @@
-"""Links of the pages lead somewhere, on GitHub as on the site, and every page is in the site."""
+"""Links of the pages lead somewhere, every page is in the site, and commands name what exists."""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 import skin
+from skin.__main__ import verbs
 from skin.core.files import ROOT
 
 DOCS = ROOT / "docs"
@@ -45,3 +47,22 @@ def test_every_page_is_in_the_table_of_contents():
 def test_the_reference_lists_the_public_names():
     names = set(re.findall(r"^\| `skin\.(\w+)`", (DOCS / "api.md").read_text(), re.MULTILINE))
     assert names == set(skin.__all__)
+
+
+def documented_commands(page: Path) -> list[list[str]]:
+    """Return the words behind ``skin`` of each command in the code blocks of a page."""
+    blocks = re.findall(r"^```(?:bash|sh)\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    matches = (re.match(r"(?:\S*/)?skin (?!-)([^|]+)", line) for line in lines)
+    return [shlex.split(match[1], comments=True) for match in matches if match]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_name_existing_verbs_and_options(page):
+    for verb, *words in documented_commands(page):
+        assert verb in verbs()
+        for word in words if "--config-dir" not in words else ():
+            group, _, options = word.partition("=")
+            if (ROOT / "conf" / group).is_dir():
+                for option in options.split(","):
+                    assert (ROOT / "conf" / group / f"{option}.yaml").exists(), word

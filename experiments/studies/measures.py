@@ -209,10 +209,10 @@ class Holds:
     def __call__(self, subject: Subject) -> Measurement:
         from rich.progress import track
 
+        from experiments.studies.alarm_timing import FIELDS, time_courses
         from experiments.studies.pages import Page
         from skin.hardware.live import engine_builder
         from skin.hardware.live.engine import DebounceSettings
-        from skin.hardware.live.selftest import FIELDS, time_courses
         from skin.runs.model_of_run import load_model
 
         run = subject.of.trained.run

@@ -33,15 +33,14 @@ def main(config: DictConfig) -> None:
 
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
-    from skin.hardware.calibration.bench import read_bench_session, read_gauge
-    from skin.hardware.calibration.fit import (
+    from skin.hardware.bench import read_bench_session, read_gauge, write_demo_session
+    from skin.hardware.calibration import (
         evaluate_held_out,
         fit_calibration,
         print_calibration,
         summarise_held_out,
     )
-    from skin.hardware.calibration.presses import write_demo_session
-    from skin.hardware.calibration.wiring import Confirmed, check_usable, device_channels, wired_bench
+    from skin.hardware.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.runs.build import build_device
 
     settings = plain(config)["calibrate"]

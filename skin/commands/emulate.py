@@ -25,7 +25,7 @@ def main(config: DictConfig) -> None:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
 
     from skin.core.settings import configured
-    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
+    from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.runs.build import build_device
 
     groups = plain(config)

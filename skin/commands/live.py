@@ -60,7 +60,7 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]
     from hydra import compose
 
     from skin.core.messages import quiet
-    from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
+    from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.runs.build import build_device
     from skin.runs.finished_run import FinishedRun
 
@@ -142,7 +142,7 @@ def _watch(config: DictConfig, live: "LiveSettings", changes: Sequence[str], own
 def _views(display: "Display", config: DictConfig, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
     """Open what shows the verdicts; yield messages."""
     if live.log is not None:
-        from skin.hardware.live.verdict_stream import log_alarms
+        from skin.hardware.live.loop import log_alarms
 
         open_.enter_context(log_alarms(display, Path(live.log).expanduser()))
     if config.web:
@@ -150,7 +150,7 @@ def _views(display: "Display", config: DictConfig, live: "LiveSettings", open_: 
 
         yield f"page: {open_.enter_context(serve_page(display, live.web_port))}"
     if live.verdicts is not None:
-        from skin.hardware.live.verdict_stream import stream_verdicts
+        from skin.hardware.live.loop import stream_verdicts
 
         yield f"verdicts: {open_.enter_context(stream_verdicts(display, live.verdicts))}"
     if live.verdicts != "stdout":

@@ -25,7 +25,7 @@ def main(config: DictConfig) -> None:
     if unknown := sorted(set(settings) - {"free", "finish"}):
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
-    from skin.hardware.record.recorder import convert_session, record_session
+    from skin.hardware.recorder import convert_session, record_session
     from skin.hardware.serial import AbstractWired
     from skin.runs.build import build_device
 

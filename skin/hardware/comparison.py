@@ -21,11 +21,10 @@ from skin.device.base import AbstractSimulated
 from skin.device.resampling import resample
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.hardware.calibration.bench import read_bench_session, read_gauge
-from skin.hardware.calibration.presses import BenchData, build_bench_data
-from skin.hardware.emulator.gestures import Gesture, emulated_gestures, gestures_with_labels
-from skin.hardware.record.recorder import check_session
-from skin.hardware.record.session import read_session
+from skin.hardware.bench import BenchData, build_bench_data, read_bench_session, read_gauge
+from skin.hardware.emulator import Gesture, emulated_gestures, gestures_with_labels
+from skin.hardware.recorder import check_session
+from skin.hardware.session import read_session
 from skin.hardware.wire.segmentation import label_text
 from skin.plot.figures import COLOURS, save_figure
 from skin.touch.labels import TOUCH

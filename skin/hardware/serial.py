@@ -30,8 +30,7 @@ from skin.hardware.wire.segmentation import (
     label_plan,
     label_text,
 )
-from skin.hardware.wire.skin import Skin, play
-from skin.hardware.wire.source import SerialSource, Source
+from skin.hardware.wire.skin import SerialSource, Skin, Source, play
 from skin.touch.gesture import GestureSettings, model_window
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 

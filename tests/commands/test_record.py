@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
 from skin.device.files import read_recording
-from skin.hardware.record.recorder import locked
-from skin.hardware.record.session import read_session
+from skin.hardware.recorder import locked
+from skin.hardware.session import read_session
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 
 SKIN = ["layout=grid", "layout.rows=2", "layout.columns=2", "simulator=naive", "touch.window=0.5"]

@@ -17,8 +17,8 @@ from skin.device.files import write_recording as write_recording
 from skin.device.touches import Recording
 from skin.errors import InputError
 from skin.evaluation.report import write_chances
-from skin.hardware.calibration.bench import BenchSession
-from skin.hardware.calibration.bench import write_bench_session as write_session
+from skin.hardware.bench import BenchSession
+from skin.hardware.bench import write_bench_session as write_session
 from skin.mechanics.simulator import solid as _elastic
 from skin.plot import animation, figures
 from skin.plot.animation import simulate_scene

@@ -58,7 +58,7 @@ def test_parts_of_libraries_may_be_built(name):
         "skin.learning.learner.network.torch.optim.Adam",
         "skin.learning.learner.base.AbstractLearner",
         "skin.learning.learner.rules.Rules.load",
-        "skin.hardware.emulator.emulator.AbstractPort",
+        "skin.hardware.emulator.AbstractPort",
         "skinny.Learner",
         "experiments.peers.rocket.AbstractLearner",
         "experiments.peers.rocket.subprocess.Popen",

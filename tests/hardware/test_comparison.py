@@ -12,8 +12,7 @@ from skin.body.sheet import Sheet
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench import write_bench_session
-from skin.hardware.calibration.presses import Protocol, emulate_session
+from skin.hardware.bench import Protocol, emulate_session, write_bench_session
 from skin.hardware.comparison import (
     Agreement,
     compare_gestures,
@@ -22,8 +21,8 @@ from skin.hardware.comparison import (
     holds_gestures,
     publish_comparison,
 )
-from skin.hardware.emulator.gestures import emulated_gestures, upsample
-from skin.hardware.record.recorder import SessionLog
+from skin.hardware.emulator import emulated_gestures, upsample
+from skin.hardware.recorder import SessionLog
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.segmentation import RecordedGesture
 from skin.mechanics.simulator.naive import Naive

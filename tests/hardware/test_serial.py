@@ -13,8 +13,7 @@ from skin.body.sheet import Sheet
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
-from skin.hardware.emulator.gestures import emulated_gestures
+from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
 from skin.hardware.serial import Serial
 from skin.hardware.wire.channels import unit_conversion
 from skin.hardware.wire.protocol import Header

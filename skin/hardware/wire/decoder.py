@@ -1,36 +1,180 @@
-"""Decode bytes into frames, without input or output.
+"""Decode bytes into frames, without input or output: their order, their time, and statistics."""
 
-The format is detected from two binary frames or three lines with equal numbers of fields.
-"""
-
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from math import isfinite, nan
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from skin.device.resampling import After, Check, Frame, FrameError
+from skin.device.resampling import After, Frame, FrameError
 from skin.errors import InputError
 from skin.hardware.wire.protocol import (
+    DetectionResult,
+    Format,
+    FrameFormat,
     Header,
-    Line,
-    decode_comment,
-    decode_frame,
-    ends_with_separator,
+    RawFrame,
+    detect_format,
+    detection_error,
+    frames_ahead,
     parse_header,
-    parse_line,
 )
-from skin.hardware.wire.sequence import FrameClock, HostClock, SequenceTracker, frames_ahead
 
-Format = Literal["auto", "text", "binary"]
+_WRAP = 2**32  # microseconds: 71.6 minutes
+_WRAP_GAP = 60_000_000  # microseconds that may be missing where the clock wraps
 
-_LINES, _FRAMES = 3, 2
-_LINES_UNKNOWN = 8  # three lines of noise may count upwards by chance, eight hardly
-_STEP = 1000  # frames that may be missing between two consecutive lines
+
+class FramePosition(NamedTuple):
+    """Time, segment and losses of a frame, as in :class:`skin.device.resampling.Frame`."""
+
+    t: float
+    segment: int
+    lost: int
+    after: After
+
+
+class SequenceTracker:
+    """Tracks seq and the device's clock from frame to frame."""
+
+    def __init__(self) -> None:
+        self.segment = 0
+        self._after: After = ""
+        self._last: tuple[int, float] | None = None
+        self._wrapped = 0
+
+    def cut(self, after: After) -> None:
+        """Start a new segment with the next frame; ``after`` is the reason."""
+        self._after = after
+
+    def place(self, seq: int | None, t_us: float, missing: int) -> FramePosition:
+        """Return the time, segment and losses of a frame.
+
+        Args:
+            seq: its number; None if the device sends none.
+            t_us: the device's clock, microseconds.
+            missing: number of bad frames since the last good one, used without seq.
+
+        Raises:
+            FrameError: ``repeat``: the same number at the same time once more.
+        """
+        if seq is None:
+            return self._begin(t_us) if self._after else self._follow(t_us, missing)
+        last, self._last = self._last, (seq, t_us)
+        if self._after or last is None:
+            return self._begin(t_us)
+        if last == (seq, t_us):
+            raise FrameError("repeat")
+        ahead, elapsed = frames_ahead(last[0], seq), t_us - last[1]
+        if elapsed < 0 and last[1] < _WRAP and elapsed + _WRAP <= _WRAP_GAP:
+            elapsed += _WRAP
+            self._wrapped += _WRAP
+        if not ahead or elapsed < 0:
+            self._after = "reset"
+            return self._begin(t_us)
+        return self._follow(t_us + self._wrapped, ahead - 1)
+
+    def _follow(self, t_us: float, lost: int) -> FramePosition:
+        return FramePosition(t_us * 1e-6, self.segment, lost, "gap" if lost else "")
+
+    def _begin(self, t_us: float) -> FramePosition:
+        after, self._after, self._wrapped = self._after, "", 0
+        self.segment += bool(after)
+        return FramePosition(t_us * 1e-6, self.segment, 0, after)
+
+
+class FrameClock:
+    """Time of frames that carry none, from their number and their arrival.
+
+    Frames may arrive in bursts of up to a second. Their number tells how far apart they were measured, once
+    the rate is known: measured over the last seconds, or that of the header until then.
+    """
+
+    _SPAN = 8.0  # s over which the rate is measured
+    _ENOUGH = 1.5  # s
+    _OFTEN = 0.02  # s between two counts: more often would not help
+    _STEADY = 2.0  # s after which the shortest delay is removed
+    _BEHIND = 1.5  # s: a longer pause is one of the device
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, int]] = deque()
+        self._count, self._period = 0, 0.0
+        self._time: float | None = None
+        self._shortest, self._since = float("inf"), 0.0
+
+    def restart(self) -> None:
+        """Begin another connection; the rate is kept."""
+        self._counts.clear()
+        self._time = None
+
+    def __call__(self, arrival: float, frames: int, rate: float | None) -> float:
+        """Return the time of a frame, s.
+
+        Args:
+            arrival: host's time, s.
+            frames: 1, and those known to be missing before it.
+            rate: of the header, Hz.
+        """
+        self._note(arrival, rate)
+        self._count += frames
+        if self._time is None or not self._period:
+            time = arrival
+        else:
+            time = min(self._time + frames * self._period, arrival)
+            time = arrival if arrival - time > self._BEHIND else time
+        self._time = self._steady(time, arrival)
+        return self._time
+
+    def _note(self, arrival: float, rate: float | None) -> None:
+        """Measure the rate from the counts before each arrival."""
+        if self._counts and arrival - self._counts[-1][0] < self._OFTEN:
+            return
+        if self._counts and arrival - self._counts[-1][0] > self._BEHIND:
+            self._counts.clear()
+        self._counts.append((arrival, self._count))
+        while arrival - self._counts[0][0] > self._SPAN:
+            self._counts.popleft()
+        passed = arrival - self._counts[0][0]
+        received = self._count - self._counts[0][1]
+        if passed >= self._ENOUGH and received:
+            self._period = passed / received
+        elif rate and not self._period:
+            self._period = 1 / rate
+
+    def _steady(self, time: float, arrival: float) -> float:
+        """Return a time without the delay that all frames of the last seconds had."""
+        self._shortest = min(self._shortest, arrival - time)
+        if arrival - self._since > self._STEADY:
+            time, self._shortest, self._since = time + self._shortest, float("inf"), arrival
+        return time
+
+
+class HostClock:
+    """Maps the device's clock to the host's by the least delayed frames of the last seconds.
+
+    Frames are buffered for different times: the smallest difference between arrival and the device's clock
+    is the best estimate. It is updated every few seconds, so a clock error of 0.5 % (a ceramic resonator)
+    causes an error of t_host of 20 ms at most.
+    """
+
+    _SPAN = 2.0  # s
+
+    def __init__(self) -> None:
+        self._latest = float("-inf")
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset the relation of the clocks after a restart of the device."""
+        self._least = self._before = float("inf")
+        self._since: float | None = None
+
+    def __call__(self, t: float, arrival: float) -> float:
+        """Return the host's time of a frame, s, from the device's and that of its arrival, s."""
+        if self._since is None or arrival - self._since > self._SPAN:
+            self._before, self._least, self._since = self._least, float("inf"), arrival
+        self._least = min(self._least, arrival - t)
+        self._latest = max(self._latest, t + min(self._least, self._before))
+        return self._latest
 
 
 @dataclass
@@ -82,254 +226,6 @@ class Stats:
         """Return counts above 0 in words, as ``3 lost``; ``words`` has the word of each."""
         counts = [(getattr(self, name), word) for name, word in words.items()]
         return [f"{count} {word}" for count, word in counts if count]
-
-
-class RawFrame(NamedTuple):
-    """Content of one frame.
-
-    Attributes:
-        seq: number of the frame, or None.
-        t_us: the device's clock, microseconds, or None.
-        values: (S,); NaN or infinite where the device sent no number.
-        finite: whether all values are numbers.
-    """
-
-    seq: int | None
-    t_us: float | None
-    values: np.ndarray
-    finite: bool = True
-
-
-class FrameFormat(Protocol):
-    """A detected format.
-
-    Attributes:
-        name: ``text`` or ``binary``.
-        delimiter: the end of a frame.
-        check: kind of its checksum.
-        sensors: S.
-    """
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def delimiter(self) -> bytes: ...
-    @property
-    def check(self) -> Check: ...
-    @property
-    def sensors(self) -> int: ...
-    def read(self, piece: bytes) -> RawFrame | None:
-        """Return the frame between two delimiters; None for a comment or an empty piece; or FrameError."""
-
-    def comment(self, piece: bytes) -> bytes | None:
-        """Return a piece as a comment line; None if it is not a comment."""
-
-
-@dataclass(frozen=True)
-class TextFormat:
-    """Lines.
-
-    Attributes:
-        counted: seq and t_us stand before the values.
-        trailing: every line ends with a separator, so no line means an empty field by it.
-    """
-
-    sensors: int
-    counted: bool
-    check: Check
-    trailing: bool = False
-    name: ClassVar[str] = "text"
-    delimiter: ClassVar[bytes] = b"\n"
-
-    def read(self, piece: bytes) -> RawFrame | None:
-        """Return the frame in a line."""
-        line = piece.removesuffix(b"\r")
-        if not line or line.startswith(b"#"):
-            return None
-        fields, check, finite = parse_line(line)
-        if check != self.check:
-            raise FrameError("checksum")
-        if (missing := self.sensors + 2 * self.counted - len(fields)) != 0:
-            if missing != 1 or self.trailing or not ends_with_separator(line):
-                raise FrameError("fields", len(fields) - 2 * self.counted)
-            fields, finite = [*fields, nan], False
-        if not self.counted:
-            return RawFrame(None, None, np.array(fields), finite)
-        seq, t_us = fields[:2]
-        if not (seq >= 0 and t_us >= 0) or seq % 1:
-            raise FrameError("number")
-        return RawFrame(int(seq), t_us, np.array(fields[2:]), finite)
-
-    def comment(self, piece: bytes) -> bytes | None:
-        """Return the comment line; None if it is not a comment."""
-        return piece.removesuffix(b"\r") if piece.startswith(b"#") else None
-
-
-@dataclass(frozen=True)
-class BinaryFormat:
-    """COBS frames."""
-
-    sensors: int
-    name: ClassVar[str] = "binary"
-    delimiter: ClassVar[bytes] = b"\0"
-    check: ClassVar[Check] = "crc16"
-
-    def read(self, piece: bytes) -> RawFrame | None:
-        """Return the frame between two zeros."""
-        if not piece or self.comment(piece) is not None:
-            return None
-        seq, t_us, values = decode_frame(piece)
-        if len(values) != self.sensors:
-            raise FrameError("fields", len(values))
-        return RawFrame(seq, t_us, values, bool(np.isfinite(values).all()))
-
-    def comment(self, piece: bytes) -> bytes | None:
-        """Return the text of a comment; None if it is not a comment."""
-        return decode_comment(piece)
-
-
-@dataclass(frozen=True)
-class DetectionResult:
-    """Result of :func:`detect_format`.
-
-    Attributes:
-        frame_format: the format, or None if it is not known yet.
-        sensors: number of values in readable frames that do not match the layout; or None.
-        header: the last one received.
-    """
-
-    frame_format: FrameFormat | None
-    sensors: int | None
-    header: Header | None
-
-
-def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectionResult:
-    """Detect the format from the first bytes of a connection.
-
-    Args:
-        data: from the first byte on; an incomplete piece at the end is ignored.
-        sensors: S, or None to detect it.
-        format: only this format, or ``auto``.
-    """
-    count_seen = None
-    if format != "text":
-        counts = _binary_counts(data)
-        for count in counts:
-            if counts.count(count) >= _FRAMES and sensors in (None, count):
-                return DetectionResult(BinaryFormat(count), None, None)
-            count_seen = count
-    if format == "binary":
-        return DetectionResult(None, count_seen, None)
-    return _detect_text(data, sensors, count_seen)
-
-
-def detection_error(data: bytes, result: DetectionResult, sensors: int | None) -> InputError:
-    """Return the error for data in which no format was detected."""
-    if _has_constant_time(run := _lines(data)):
-        return stopped_clock_error(len(run), run[0].fields[1])
-    if result.sensors is not None and sensors is not None:
-        return InputError(
-            f"the device sends {result.sensors} values per frame, the layout has {sensors} sensors: give its "
-            "own layout, as in layout=file layout.path=FILE.csv"
-        )
-    return InputError(
-        f"no frame in {len(data)} bytes, which begin with {data[:64].hex(' ')}: is the baud rate right, "
-        "as in device.baudrate=115200? Or give the format, as in device.format=text or device.format=binary"
-    )
-
-
-def stopped_clock_error(frames: int, t_us: float) -> InputError:
-    """Return the error for frames whose clock does not move: no window would ever fill."""
-    return InputError(
-        f"the device's clock stands still: t_us was {t_us:.0f} in all of {frames} frames; let the firmware "
-        "send micros(), or lines of values alone"
-    )
-
-
-def _is_numeric(line: Line) -> bool:
-    """Return whether more than half of the fields are numbers; only such lines show a format."""
-    return line.finite or 2 * sum(map(isfinite, line.fields)) > len(line.fields)
-
-
-def _has_constant_time(run: Sequence[Line]) -> bool:
-    """Return whether the first column counts while the next one, the time, is constant."""
-    run = [line for line in run if len(line.fields) > 2]
-    times = {line.fields[1] for line in run}
-    if len(run) < _LINES_UNKNOWN or len(times) > 1 or not all(map(isfinite, times)):
-        return False
-    return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
-
-
-def _lines(data: bytes) -> list[Line]:
-    """Return the lines of numbers; the first piece may be half a line."""
-    lines = []
-    for piece in data.split(b"\n")[1:-1]:
-        with suppress(FrameError):
-            lines.append(parse_line(piece.removesuffix(b"\r")))
-    return [line for line in lines if _is_numeric(line)]
-
-
-def _binary_counts(data: bytes) -> list[int]:
-    counts = []
-    for piece in data.split(b"\0")[:-1]:
-        with suppress(FrameError):
-            counts.append(len(decode_frame(piece).values))
-    return counts
-
-
-def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectionResult:
-    header, run = None, list[Line]()
-    for piece in data.split(b"\n")[:-1]:
-        line = piece.removesuffix(b"\r")
-        if line.startswith(b"#"):
-            header = parse_header(line) or header
-            continue
-        try:
-            read = parse_line(line)
-        except FrameError:
-            run = []
-            continue
-        if not _is_numeric(read):
-            run = []
-            continue
-        if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
-            run = []
-        run = [*run[1 - _LINES_UNKNOWN :], read] if read.fields else []
-        expected = sensors or (header.n if header else None)
-        if frame_format := _judge(run, expected, learn=sensors is None):
-            detected = replace(frame_format, trailing=ends_with_separator(line))
-            return DetectionResult(detected, None, header)
-        if len(run) >= _LINES:
-            count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
-    return DetectionResult(None, count_seen, header)
-
-
-def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:
-    """Return the format of similar lines, or None if they do not determine it."""
-    if len(run) < _LINES:
-        return None
-    count, check = len(run[-1].fields), run[-1].check
-    counting = _all_count(run[-_LINES:])
-    if count == sensors:
-        return TextFormat(count, False, check)
-    if sensors is not None and count == sensors + 2 and counting:
-        return TextFormat(sensors, True, check)
-    if not learn or len(run) < _LINES_UNKNOWN or _has_constant_time(run):
-        return None
-    counting = _all_count(run)
-    return TextFormat(count - 2 * counting, counting, check)
-
-
-def _all_count(run: Sequence[Line]) -> bool:
-    """Return whether the two columns before the values are a frame number and a time."""
-    return len(run) > 1 and all(_counts(before.fields, line.fields) for before, line in pairwise(run))
-
-
-def _counts(before: Sequence[float], line: Sequence[float]) -> bool:
-    if len(line) < 3 or any(field < 0 or field % 1 for field in (before[0], line[0])):
-        return False
-    later = line[1] > before[1] or line[1] < 2**31 < before[1]
-    return later and 0 < frames_ahead(int(before[0]), int(line[0])) <= _STEP
 
 
 _LONGEST = 65536  # bytes of a line

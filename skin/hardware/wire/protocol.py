@@ -14,15 +14,18 @@ Announcements: comments of the text protocol in which an emulated skin describes
 import binascii
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import reduce
+from itertools import pairwise
 from math import isfinite, nan
 from operator import xor
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from skin.device.resampling import Check, FrameError
+from skin.errors import InputError
 
 
 def crc16(data: bytes) -> int:
@@ -207,15 +210,20 @@ _NUMBER: dict[Kind, int] = {"u16": 1, "i16": 2, "f32": 3}
 _TYPE: dict[int, np.dtype] = {1: np.dtype("<u2"), 2: np.dtype("<i2"), 3: np.dtype("<f4")}
 
 
-class Payload(NamedTuple):
-    """Content of a binary frame: its number, the device's clock (microseconds) and the values, (S,).
+class RawFrame(NamedTuple):
+    """Content of one frame.
 
-    Values of type f32 may be NaN or infinite.
+    Attributes:
+        seq: number of the frame, or None.
+        t_us: the device's clock, microseconds, or None.
+        values: (S,); NaN or infinite where the device sent no number.
+        finite: whether all values are numbers.
     """
 
-    seq: int
-    t_us: int
+    seq: int | None
+    t_us: float | None
     values: np.ndarray
+    finite: bool = True
 
 
 def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind: Kind = "u16") -> bytes:
@@ -233,7 +241,7 @@ def encode_frame(values: Sequence[float] | np.ndarray, seq: int, t_us: int, kind
     return stuff(body + _TAIL.pack(crc16(body))) + b"\0"
 
 
-def decode_frame(data: bytes) -> Payload:
+def decode_frame(data: bytes) -> RawFrame:
     """Decode the bytes between two zeros.
 
     Raises:
@@ -248,7 +256,8 @@ def decode_frame(data: bytes) -> Payload:
     kind = _TYPE[number]
     if len(body) != _HEAD.size + count * kind.itemsize + _TAIL.size:
         raise FrameError("fields", (len(body) - _HEAD.size - _TAIL.size) // kind.itemsize)
-    return Payload(seq, t_us, np.frombuffer(body, kind, count, _HEAD.size).astype(np.float64))
+    values = np.frombuffer(body, kind, count, _HEAD.size).astype(np.float64)
+    return RawFrame(seq, t_us, values, bool(np.isfinite(values).all()))
 
 
 def encode_comment(text: bytes) -> bytes:
@@ -340,3 +349,235 @@ def parse_announcement(line: bytes) -> Announcement | None:
         return Announcement(number, seq, frames, numbers)
     except (KeyError, ValueError):
         return None
+
+
+Format = Literal["auto", "text", "binary"]
+
+_LINES, _FRAMES = 3, 2
+_LINES_UNKNOWN = 8  # three lines of noise may count upwards by chance, eight hardly
+_STEP = 1000  # frames that may be missing between two consecutive lines
+
+
+_WRAPS = (2**16, 2**32)  # of seq: what firmware counts in
+_ACROSS = 4096  # frames that may be missing where seq wraps
+
+
+def frames_ahead(before: int, seq: int) -> int:
+    """Return by how many frames ``seq`` is ahead of ``before``, u16 or u32 wrapped; 0 if it is not."""
+    if seq > before:
+        return seq - before
+    for wrap in _WRAPS:
+        if wrap - _ACROSS <= before < wrap and seq - before + wrap <= _ACROSS:
+            return seq - before + wrap
+    return 0
+
+
+@dataclass(frozen=True)
+class TextFormat:
+    """Lines.
+
+    Attributes:
+        counted: seq and t_us stand before the values.
+        trailing: every line ends with a separator, so no line means an empty field by it.
+    """
+
+    sensors: int
+    counted: bool
+    check: Check
+    trailing: bool = False
+    name: ClassVar[str] = "text"
+    delimiter: ClassVar[bytes] = b"\n"
+
+    def read(self, piece: bytes) -> RawFrame | None:
+        """Return the frame in a line."""
+        line = piece.removesuffix(b"\r")
+        if not line or line.startswith(b"#"):
+            return None
+        fields, check, finite = parse_line(line)
+        if check != self.check:
+            raise FrameError("checksum")
+        if (missing := self.sensors + 2 * self.counted - len(fields)) != 0:
+            if missing != 1 or self.trailing or not ends_with_separator(line):
+                raise FrameError("fields", len(fields) - 2 * self.counted)
+            fields, finite = [*fields, nan], False
+        if not self.counted:
+            return RawFrame(None, None, np.array(fields), finite)
+        seq, t_us = fields[:2]
+        if not (seq >= 0 and t_us >= 0) or seq % 1:
+            raise FrameError("number")
+        return RawFrame(int(seq), t_us, np.array(fields[2:]), finite)
+
+    def comment(self, piece: bytes) -> bytes | None:
+        """Return the comment line; None if it is not a comment."""
+        return piece.removesuffix(b"\r") if piece.startswith(b"#") else None
+
+
+@dataclass(frozen=True)
+class BinaryFormat:
+    """COBS frames."""
+
+    sensors: int
+    name: ClassVar[str] = "binary"
+    delimiter: ClassVar[bytes] = b"\0"
+    check: ClassVar[Check] = "crc16"
+
+    def read(self, piece: bytes) -> RawFrame | None:
+        """Return the frame between two zeros."""
+        if not piece or self.comment(piece) is not None:
+            return None
+        frame = decode_frame(piece)
+        if len(frame.values) != self.sensors:
+            raise FrameError("fields", len(frame.values))
+        return frame
+
+    def comment(self, piece: bytes) -> bytes | None:
+        """Return the text of a comment; None if it is not a comment."""
+        return decode_comment(piece)
+
+
+FrameFormat = TextFormat | BinaryFormat
+"""A detected format: S ``sensors``, the ``delimiter`` at the end of a frame and the kind of its ``check``."""
+
+
+@dataclass(frozen=True)
+class DetectionResult:
+    """Result of :func:`detect_format`.
+
+    Attributes:
+        frame_format: the format, or None if it is not known yet.
+        sensors: number of values in readable frames that do not match the layout; or None.
+        header: the last one received.
+    """
+
+    frame_format: FrameFormat | None
+    sensors: int | None
+    header: Header | None
+
+
+def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectionResult:
+    """Detect the format from the first bytes of a connection.
+
+    Args:
+        data: from the first byte on; an incomplete piece at the end is ignored.
+        sensors: S, or None to detect it.
+        format: only this format, or ``auto``.
+    """
+    count_seen = None
+    if format != "text":
+        counts = _binary_counts(data)
+        for count in counts:
+            if counts.count(count) >= _FRAMES and sensors in (None, count):
+                return DetectionResult(BinaryFormat(count), None, None)
+            count_seen = count
+    if format == "binary":
+        return DetectionResult(None, count_seen, None)
+    return _detect_text(data, sensors, count_seen)
+
+
+def detection_error(data: bytes, result: DetectionResult, sensors: int | None) -> InputError:
+    """Return the error for data in which no format was detected."""
+    if _has_constant_time(run := _lines(data)):
+        return stopped_clock_error(len(run), run[0].fields[1])
+    if result.sensors is not None and sensors is not None:
+        return InputError(
+            f"the device sends {result.sensors} values per frame, the layout has {sensors} sensors: give its "
+            "own layout, as in layout=file layout.path=FILE.csv"
+        )
+    return InputError(
+        f"no frame in {len(data)} bytes, which begin with {data[:64].hex(' ')}: is the baud rate right, "
+        "as in device.baudrate=115200? Or give the format, as in device.format=text or device.format=binary"
+    )
+
+
+def stopped_clock_error(frames: int, t_us: float) -> InputError:
+    """Return the error for frames whose clock does not move: no window would ever fill."""
+    return InputError(
+        f"the device's clock stands still: t_us was {t_us:.0f} in all of {frames} frames; let the firmware "
+        "send micros(), or lines of values alone"
+    )
+
+
+def _is_numeric(line: Line) -> bool:
+    """Return whether more than half of the fields are numbers; only such lines show a format."""
+    return line.finite or 2 * sum(map(isfinite, line.fields)) > len(line.fields)
+
+
+def _has_constant_time(run: Sequence[Line]) -> bool:
+    """Return whether the first column counts while the next one, the time, is constant."""
+    run = [line for line in run if len(line.fields) > 2]
+    times = {line.fields[1] for line in run}
+    if len(run) < _LINES_UNKNOWN or len(times) > 1 or not all(map(isfinite, times)):
+        return False
+    return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
+
+
+def _lines(data: bytes) -> list[Line]:
+    """Return the lines of numbers; the first piece may be half a line."""
+    lines = []
+    for piece in data.split(b"\n")[1:-1]:
+        with suppress(FrameError):
+            lines.append(parse_line(piece.removesuffix(b"\r")))
+    return [line for line in lines if _is_numeric(line)]
+
+
+def _binary_counts(data: bytes) -> list[int]:
+    counts = []
+    for piece in data.split(b"\0")[:-1]:
+        with suppress(FrameError):
+            counts.append(len(decode_frame(piece).values))
+    return counts
+
+
+def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectionResult:
+    header, run = None, list[Line]()
+    for piece in data.split(b"\n")[:-1]:
+        line = piece.removesuffix(b"\r")
+        if line.startswith(b"#"):
+            header = parse_header(line) or header
+            continue
+        try:
+            read = parse_line(line)
+        except FrameError:
+            run = []
+            continue
+        if not _is_numeric(read):
+            run = []
+            continue
+        if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
+            run = []
+        run = [*run[1 - _LINES_UNKNOWN :], read] if read.fields else []
+        expected = sensors or (header.n if header else None)
+        if frame_format := _judge(run, expected, learn=sensors is None):
+            detected = replace(frame_format, trailing=ends_with_separator(line))
+            return DetectionResult(detected, None, header)
+        if len(run) >= _LINES:
+            count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
+    return DetectionResult(None, count_seen, header)
+
+
+def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:
+    """Return the format of similar lines, or None if they do not determine it."""
+    if len(run) < _LINES:
+        return None
+    count, check = len(run[-1].fields), run[-1].check
+    counting = _all_count(run[-_LINES:])
+    if count == sensors:
+        return TextFormat(count, False, check)
+    if sensors is not None and count == sensors + 2 and counting:
+        return TextFormat(sensors, True, check)
+    if not learn or len(run) < _LINES_UNKNOWN or _has_constant_time(run):
+        return None
+    counting = _all_count(run)
+    return TextFormat(count - 2 * counting, counting, check)
+
+
+def _all_count(run: Sequence[Line]) -> bool:
+    """Return whether the two columns before the values are a frame number and a time."""
+    return len(run) > 1 and all(_counts(before.fields, line.fields) for before, line in pairwise(run))
+
+
+def _counts(before: Sequence[float], line: Sequence[float]) -> bool:
+    if len(line) < 3 or any(field < 0 or field % 1 for field in (before[0], line[0])):
+        return False
+    later = line[1] > before[1] or line[1] < 2**31 < before[1]
+    return later and 0 < frames_ahead(int(before[0]), int(line[0])) <= _STEP

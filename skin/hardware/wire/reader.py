@@ -21,7 +21,8 @@ from skin.core.settings import RISING, check_settings
 from skin.device.resampling import After, Frame
 from skin.errors import InputError
 from skin.hardware.wire.channels import ChannelHealth, ChannelState, Limits
-from skin.hardware.wire.decoder import Decoder, Format, stopped_clock_error
+from skin.hardware.wire.decoder import Decoder
+from skin.hardware.wire.protocol import Format, stopped_clock_error
 
 _log = logging.getLogger("skin.hardware.wire")
 

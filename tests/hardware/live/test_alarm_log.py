@@ -9,8 +9,7 @@ import pytest
 
 from skin.errors import InputError
 from skin.hardware.live.engine import Verdict
-from skin.hardware.live.loop import Display, DisplayInfo
-from skin.hardware.live.verdict_stream import AlarmLog, log_alarms
+from skin.hardware.live.loop import AlarmLog, Display, DisplayInfo, log_alarms
 
 
 def display():

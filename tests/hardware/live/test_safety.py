@@ -11,12 +11,12 @@ import torch
 
 from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings
+from skin.hardware.live.engine_builder import SelfTest
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
-from skin.hardware.live.selftest import SelfTest
 from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 from skin.hardware.wire.reader import PortSettings
-from skin.hardware.wire.source import SerialSource
+from skin.hardware.wire.skin import SerialSource
 from skin.runs.model_of_run import window_classifier
 from skin.touch.labels import TOUCH
 

@@ -12,7 +12,7 @@ from skin.body.sheet import Sheet
 from skin.device.files import read_recording
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
-from skin.hardware.record.recorder import convert_session, record_session
+from skin.hardware.recorder import convert_session, record_session
 from skin.hardware.serial import Serial
 from skin.hardware.wire.protocol import (
     Announcement,

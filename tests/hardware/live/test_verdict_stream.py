@@ -15,8 +15,7 @@ import pytest
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.hardware.live.engine import Verdict
-from skin.hardware.live.loop import Display, DisplayInfo
-from skin.hardware.live.verdict_stream import HEARTBEAT, stream_verdicts
+from skin.hardware.live.loop import HEARTBEAT, Display, DisplayInfo, stream_verdicts
 
 PATIENCE = 60  # s
 

@@ -13,9 +13,9 @@ from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import LiveLoop
-from skin.hardware.record.recorder import record_session
-from skin.hardware.record.session import read_session
+from skin.hardware.recorder import record_session
 from skin.hardware.serial import Serial
+from skin.hardware.session import read_session
 from skin.hardware.wire.channels import Tare
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 from skin.hardware.wire.skin import open_skin

@@ -14,8 +14,7 @@ from skin.hardware.wire.channels import Tare, unit_conversion
 from skin.hardware.wire.decoder import Decoder
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
 from skin.hardware.wire.reader import PortSettings
-from skin.hardware.wire.skin import open_skin
-from skin.hardware.wire.source import SerialSource
+from skin.hardware.wire.skin import SerialSource, open_skin
 
 FALLING = Calibration(
     {"gain": [2.0, 0.5, 1.0], "offset": [0.1, -0.2, 0.0], "clip": [10.0, 10.0, 10.0]},

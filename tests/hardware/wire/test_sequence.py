@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from skin.device.resampling import FrameError
-from skin.hardware.wire.sequence import FrameClock, HostClock, SequenceTracker, frames_ahead
+from skin.hardware.wire.decoder import FrameClock, HostClock, SequenceTracker
+from skin.hardware.wire.protocol import frames_ahead
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from skin.device.resampling import Frame
-from skin.hardware.wire.source import Source
+from skin.hardware.wire.skin import Source
 
 
 def test_values_in_newtons_stay_what_they_are():

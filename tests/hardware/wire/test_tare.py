@@ -8,7 +8,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.wire.channels import SkinTouched, Tare, unit_conversion
 from skin.hardware.wire.protocol import Header
-from skin.hardware.wire.source import warm_up
+from skin.hardware.wire.skin import warm_up
 
 REST = np.array([512.0, 300.0, 40.0])
 RATE = 10.0  # Hz, of the model

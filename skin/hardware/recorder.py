@@ -20,8 +20,8 @@ from skin.device.files import write_recording
 from skin.device.resampling import Frame
 from skin.device.touches import concatenate
 from skin.errors import InputError
-from skin.hardware.record.session import StoredSession, encode_event, line_sum, read_session, write_about
 from skin.hardware.serial import AbstractWired
+from skin.hardware.session import StoredSession, encode_event, line_sum, read_session, write_about
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.protocol import Header
 from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.record.recorder import SessionLog
-from skin.hardware.record.session import read_session
+from skin.hardware.recorder import SessionLog
+from skin.hardware.session import read_session
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.segmentation import RecordedGesture
 from tests.damage import DAMAGED_FILES, damaged, opened

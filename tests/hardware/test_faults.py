@@ -5,7 +5,7 @@ import pytest
 
 from skin.core.settings import configured
 from skin.errors import InputError
-from skin.hardware.emulator.emulator import Faults
+from skin.hardware.emulator import Faults
 
 
 def test_no_fault_changes_nothing():

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
 from skin.errors import InputError
-from skin.hardware.emulator.emulator import _Tcp, open_port
+from skin.hardware.emulator import _Tcp, open_port
 from skin.hardware.wire.reader import open_stream
 
 

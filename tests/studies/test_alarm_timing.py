@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from experiments.studies.alarm_timing import COURSES, dangerous_touches, play_touch
 from skin.errors import InputError
 from skin.hardware.live.engine import DebounceSettings
 from skin.hardware.live.engine_builder import engine_settings
-from skin.hardware.live.selftest import COURSES, dangerous_touches, play_touch
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.model_of_run import RunModel
 

@@ -12,10 +12,9 @@ from skin.body.sheet import Sheet
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench import BenchSession, Gauge
-from skin.hardware.calibration.fit import fit_calibration
-from skin.hardware.calibration.presses import BenchData, Protocol, emulate_session
-from skin.hardware.calibration.wiring import (
+from skin.hardware.bench import BenchData, BenchSession, Gauge, Protocol, emulate_session
+from skin.hardware.calibration import fit_calibration
+from skin.hardware.wiring import (
     TURNS,
     Confirmed,
     check_usable,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.hardware.calibration.channels import find_quantum, fit_clip_and_gain, fit_decay, measure_idle
+from skin.hardware.calibration import fit_clip_and_gain, fit_decay
+from skin.hardware.wiring import find_quantum, measure_idle
 
 TIME = np.arange(6000) / 100
 

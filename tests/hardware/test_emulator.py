@@ -9,7 +9,7 @@ import pytest
 from skin.body.layout.grid import Grid
 from skin.body.sheet import Sheet
 from skin.device.simulated import Simulated
-from skin.hardware.emulator.emulator import Emulator, EmulatorSettings, Faults, open_port
+from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
 from skin.mechanics.simulator.naive import Naive
 
 SHEET = Sheet((0.16, 0.16), (16, 16), [{"material": "EcoFlex 00-30", "thickness": 0.005}])

@@ -14,8 +14,8 @@ pytest.importorskip("fcntl", reason="file limits need a POSIX system")
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.record.recorder import LineWriter, SessionLog, locked
-from skin.hardware.record.session import decode_event, encode_event, read_session
+from skin.hardware.recorder import LineWriter, SessionLog, locked
+from skin.hardware.session import decode_event, encode_event, read_session
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.segmentation import RecordedGesture
 
@@ -129,8 +129,8 @@ def test_a_folder_that_may_not_be_written_is_said(tmp_path):
     # As root nothing is forbidden, so another user tries; by then everything is imported.
     code = (
         "import os, sys; from pathlib import Path\n"
-        "from skin.hardware.record.recorder import locked\n"
-        "from skin.hardware.record.recorder import SessionLog\n"
+        "from skin.hardware.recorder import locked\n"
+        "from skin.hardware.recorder import SessionLog\n"
         "os.geteuid() or os.seteuid(65534)\n"
         "about = {'positions': [[0, 0, 0]], 'unit': 'N'}\n"
         "for attempt in (lambda p: locked(p).__enter__(), lambda p: SessionLog(p, about, 1)):\n"
@@ -209,7 +209,7 @@ def test_one_writer_keeps_others_out_until_it_ends(tmp_path):
 
 def test_kill_9_lets_go_of_the_lock(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from skin.hardware.record.recorder import locked\n"
+        "import sys; from pathlib import Path; from skin.hardware.recorder import locked\n"
         "with locked(Path(sys.argv[1])):\n"
         "    print('locked', flush=True)\n"
         "    sys.stdin.read()\n"

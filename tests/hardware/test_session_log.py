@@ -11,8 +11,8 @@ import pytest
 
 from skin.device.resampling import Frame
 from skin.errors import InputError
-from skin.hardware.record.recorder import SessionLog
-from skin.hardware.record.session import read_session
+from skin.hardware.recorder import SessionLog
+from skin.hardware.session import read_session
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.segmentation import RecordedGesture
 
@@ -24,7 +24,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from test_session_log import ABOUT, MEANING, frame
-from skin.hardware.record.recorder import SessionLog
+from skin.hardware.recorder import SessionLog
 log = SessionLog(Path(sys.argv[1]), ABOUT, 2)
 log.conversion(MEANING)
 print("ready", flush=True)

@@ -1,5 +1,6 @@
 """Fit the constants of a simulated device to a bench session, and test them on held-out presses."""
 
+import math
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -13,16 +14,16 @@ from rich.table import Table
 from skin.device.calibration import QUANTITIES, Calibration
 from skin.device.imperfection import Imperfection
 from skin.errors import InputError
-from skin.hardware.calibration.channels import (
+from skin.hardware.bench import BenchData
+from skin.hardware.wiring import (
+    _MAD,
+    _MEDIAN,
     Idle,
     collect_responses,
     find_polarity,
     find_quantum,
-    fit_clip_and_gain,
-    fit_decay,
     measure_idle,
 )
-from skin.hardware.calibration.presses import BenchData
 from skin.mechanics.relaxation import first_order_lag, running_peak
 
 _PRESSED = 0.05  # of the largest true reading: less determines no gain
@@ -143,6 +144,70 @@ def _fit_time_constant(bench: BenchData, used: np.ndarray, number: int, channel:
         decays.append(fit_decay(time[release][start:], np.nan_to_num(values[start:]), floor))
     weight = sum(share for _, share in decays)
     return sum(value * share for value, share in decays) / weight if weight else 0.0
+
+
+def fit_decay(time: np.ndarray, values: np.ndarray, floor: float) -> tuple[float, float]:
+    """Return the time constant of a decay to 0, s, and its weight; (0, 0) with fewer than 3 frames.
+
+    Args:
+        time: s.
+        values: after the release, without offset.
+        floor: level of the noise.
+    """
+    below = np.flatnonzero(values <= floor)
+    count = below[0] if len(below) else len(values)
+    if count < 3:
+        return 0.0, 0.0
+    weights = values[:count]  # of the logarithm, whose error is noise / value
+    slope = np.polyfit(time[:count], np.log(values[:count]), 1, w=weights)[0]
+    if slope >= 0:
+        return 0.0, 0.0
+    return float(-1 / slope), float((weights**2).sum())
+
+
+def fit_clip_and_gain(
+    true: np.ndarray, measured: np.ndarray, noise: float
+) -> tuple[float, float, float | None]:
+    """Return the slope of measured over true readings, its standard error, and the plateau or None.
+
+    The slope is NaN if fewer than three readings are below the plateau.
+
+    Args:
+        true: (n,), above 0, loading frames.
+        measured: (n,), without offset.
+        noise: of a frame.
+    """
+    top = true >= 0.9 * true.max()
+    level = float(np.median(measured[top]))
+    if level <= 5 * noise:  # it does not respond, which is no plateau
+        return *_slope(true, measured), None
+    low = measured < min(0.9 * level, level - 5 * noise)
+    slope, error = _slope(true[low], measured[low])
+    margin = max(2 * noise, 0.02 * level)
+    if math.isnan(slope):
+        return slope, error, level
+    if slope * np.median(true[top]) <= level + margin:
+        return *_slope(true, measured), None
+    level = float(np.median(measured[slope * true > level + margin]))
+    below = slope * true < level - margin
+    return *_slope(true[below], measured[below]), level
+
+
+def _slope(true: np.ndarray, measured: np.ndarray) -> tuple[float, float]:
+    """Return the slope of the line through 0 with the least absolute error, and its standard error.
+
+    It is the median of the ratios, weighted with ``true`` > 0. A line with an intercept would be fitted to
+    the differences between presses with one force, which are due to their places. NaN and infinity with
+    fewer than 3 readings.
+    """
+    if len(true) < 3:
+        return math.nan, math.inf
+    ratios = measured / true
+    order = np.argsort(ratios)
+    weight = np.cumsum(true[order])
+    slope = float(ratios[order][np.searchsorted(weight, weight[-1] / 2)])
+    spread = _MAD * float(np.median(np.abs(measured - slope * true)))
+    return slope, _MEDIAN * spread / math.sqrt(float((true**2).sum()))
 
 
 def _simulate_lag(
@@ -319,7 +384,7 @@ def estimate_force(raw: np.ndarray, each: np.ndarray, calibration: Calibration) 
     Args:
         raw: (..., S), in the session's unit.
         each: (S,), true readings per N of that indenter at that place, as
-            :func:`skin.hardware.calibration.bench.per_newton` gives them.
+            :func:`skin.hardware.bench.per_newton` gives them.
         calibration: of this skin.
 
     Returns:

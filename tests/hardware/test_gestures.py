@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin.device.resampling import resample
-from skin.hardware.emulator.gestures import Converter, upsample
+from skin.hardware.emulator import Converter, upsample
 
 RATE = 10.0
 

@@ -10,14 +10,13 @@ from skin.device.calibration import Calibration, write_calibration
 from skin.device.imperfection import Imperfection
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.calibration.bench import Gauge, per_newton
-from skin.hardware.calibration.fit import (
+from skin.hardware.bench import BenchData, Gauge, Protocol, build_bench_data, emulate_session, per_newton
+from skin.hardware.calibration import (
     estimate_force,
     evaluate_held_out,
     fit_calibration,
     print_calibration,
 )
-from skin.hardware.calibration.presses import BenchData, Protocol, build_bench_data, emulate_session
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.solid import Solid
 

@@ -1,1 +1,0 @@
-"""Calibration: fit the constants of a simulated device to presses of known force."""

@@ -1,1 +1,0 @@
-"""The emulator: a simulated skin behind a pseudo-terminal or a TCP port, in real time."""

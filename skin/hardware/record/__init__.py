@@ -1,1 +1,0 @@
-"""Sessions: raw frames and gestures of a real skin, recorded to disk and read back."""

@@ -18,7 +18,7 @@ from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import Skin
 from skin.hardware.wire.source import SerialSource, Source
-from skin.runs.exported.model import ExportedModel
+from skin.runs.exported_model import ExportedModel
 from skin.runs.trained_model import TrainedModel
 
 # The settings of ``skin live``.

@@ -29,7 +29,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from skin.body.layout.random import Random
+from skin.body.layout import Random
 from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
 from skin.device.base import AbstractSimulated
@@ -40,7 +40,7 @@ from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.decoder import Decoder
 from skin.hardware.wire.protocol import encode_line
 from skin.learning.data import TouchData
-from skin.learning.learner.network import Network
+from skin.learning.network import Network
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import validate_config
 from skin.runs.model_of_run import RunModel, window_classifier
@@ -313,8 +313,8 @@ def measure_latency(row: str, frames: int) -> dict[str, float]:
 
 def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
     """Return the times of :func:`measure_latency` for the exported row, without torch in the engine."""
-    from skin.runs.exported.model import ExportedModel
-    from skin.runs.exported.writer import write_model
+    from skin.runs.exported_model import ExportedModel
+    from skin.runs.onnx_writer import write_model
 
     torch.set_num_threads(1)
     device, learner, data = _untrained(row)

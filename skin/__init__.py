@@ -7,10 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skin.body.arm import Arm as Arm
-    from skin.body.layout.file import File as LayoutFile
-    from skin.body.layout.grid import Grid as Grid
-    from skin.body.sheet import Sheet as Sheet
+    from skin.body.base import Arm as Arm
+    from skin.body.base import Sheet as Sheet
+    from skin.body.layout import File as LayoutFile
+    from skin.body.layout import Grid as Grid
     from skin.device.files import read_recording as read_recording
     from skin.errors import InputError as InputError
     from skin.hardware.wire.skin import open_skin as open_skin
@@ -23,12 +23,12 @@ __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet",
 __all__ += ["load_run", "open_skin", "read_recording"]
 
 _PLACES = {
-    "Arm": "skin.body.arm",
-    "Grid": "skin.body.layout.grid",
+    "Arm": "skin.body.base",
+    "Grid": "skin.body.layout",
     "InputError": "skin.errors",
-    "LayoutFile": "skin.body.layout.file:File",
+    "LayoutFile": "skin.body.layout:File",
     "PlatesAndBeams": "skin.mechanics.simulator.fem",
-    "Sheet": "skin.body.sheet",
+    "Sheet": "skin.body.base",
     "Solid": "skin.mechanics.simulator.solid",
     "load_run": "skin.runs.model_of_run",
     "open_skin": "skin.hardware.wire.skin",

@@ -14,8 +14,8 @@ from torch_geometric.data import Batch, Data
 from torch_geometric.nn import AttentionalAggregation, GCNConv, global_max_pool
 
 from skin.device.touches import Touches
-from skin.learning.representation.graph import adjacency, neighbours
-from skin.learning.representation.image import pixel_of
+from skin.learning.graph import adjacency, neighbours
+from skin.learning.representation import pixel_of
 
 PIXELS, SCALE, WINDOW, LABELS = 64, 10.0, 30, 4
 

@@ -29,8 +29,8 @@ WARM = (
     "mlflow.store.tracking.sqlalchemy_store",
     "pytorch_lightning.callbacks",
     "skfem",
-    "skin.learning.learner.boosted_trees",
-    "skin.learning.learner.network",
+    "skin.learning.boosted_trees",
+    "skin.learning.network",
     "skin.evaluation.report",
     "skin.runs.train",
 )

@@ -8,7 +8,7 @@ import torch
 from hydra.utils import instantiate
 from torch.nn import functional as F
 
-from skin.body.layout.file import File
+from skin.body.layout import File
 from skin.core.files import ROOT
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches

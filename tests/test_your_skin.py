@@ -65,7 +65,7 @@ def test_the_configuration_that_the_page_prints_is_the_users(home):
     assert (
         shown.simulator._target_ == shown.device.simulator._target_ == "skin.mechanics.simulator.solid.Solid"
     )
-    assert shown.layout._target_ == "skin.body.layout.file.File"
+    assert shown.layout._target_ == "skin.body.layout.File"
     depths = instantiate(OmegaConf.merge(shown.layout, {"path": str(home / "my-skin/sensors.csv")}))
     # Inside a layer, where only the solid has sensors.
     assert set(depths.sensors(body).positions[:, 2]) == {0.006}

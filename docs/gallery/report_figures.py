@@ -14,9 +14,7 @@ from hydra import compose, initialize_config_dir
 
 from experiments.studies.study_page import draw_skin
 from skin.core.files import CONF
-from skin.learning.representation.fourier import Fourier
-from skin.learning.representation.image import Image
-from skin.learning.representation.interp import Interpolation
+from skin.learning.representation import Fourier, Image, Interpolation
 from skin.plot import figures
 from skin.plot.plot3d import deflection, surface
 from skin.runs.build import build_device

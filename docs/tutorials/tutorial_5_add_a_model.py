@@ -30,7 +30,7 @@ from typing import Annotated
 from annotated_types import Ge
 from torch import Tensor, nn
 
-from skin.learning.model.base import AbstractModel, Kind
+from skin.learning.model import AbstractModel, Kind
 
 
 class Squared(AbstractModel):

@@ -18,7 +18,7 @@ from skin.core.safe_loading import load_npz
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import above_idle
-from skin.learning.learner.base import AbstractLearner
+from skin.learning.learner import AbstractLearner
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger

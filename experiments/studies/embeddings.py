@@ -22,12 +22,12 @@ from sklearn.svm import SVC
 from experiments.studies.comparison import combine_verdicts, judge_claim, paired
 from experiments.studies.measures import ProbeSettings
 from experiments.studies.pages import Page
-from skin.body.layout.scattered import Scattered
+from skin.body.layout import Scattered
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.learner.base import AbstractLearner
-from skin.learning.representation.graph import adjacency, neighbours
+from skin.learning.graph import adjacency, neighbours
+from skin.learning.learner import AbstractLearner
 from skin.plot.figures import COLOURS, MARKS
 
 _POWERS = 5

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from experiments.studies.pages import Page
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
-    from skin.learning.learner.base import AbstractLearner
+    from skin.learning.learner import AbstractLearner
     from skin.runs.model_of_run import RunModel
     from skin.runs.store import Store
 
@@ -139,10 +139,10 @@ class Accuracy:
 @dataclass(frozen=True)
 class SelfShare:
     """How much of its own row a node of the run's graph is
-    (:func:`skin.learning.representation.graph.self_share`)."""
+    (:func:`skin.learning.graph.self_share`)."""
 
     def __call__(self, subject: Subject) -> Measurement:
-        from skin.learning.representation.graph import self_share
+        from skin.learning.graph import self_share
         from skin.runs.build import build_data
 
         data = build_data(subject.config, subject.device)

@@ -19,8 +19,7 @@ from scipy.sparse.linalg import spsolve
 from experiments.validation import CheckResult, Finding, pynite_model, relative_finding
 from experiments.validation.references import solve_frame
 from experiments.validation.solid import default_sheet
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.core.files import ROOT
 from skin.errors import InputError
 from skin.mechanics.contact.rigid import solve_contact, stabilise_checkerboard

@@ -32,7 +32,7 @@ from skfem import (
 )
 from skfem.helpers import ddot, div, sym_grad, trace
 
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator.base import factorised
 

@@ -27,10 +27,7 @@ from experiments.validation.references import (
     solve_block,
     square_punch,
 )
-from skin.body.arm import Arm
-from skin.body.base import AbstractBody
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody, Arm, Sensors, Sheet
 from skin.mechanics.contact.rigid import solve_contact as press
 from skin.mechanics.contact.rigid import stabilise_checkerboard
 from skin.mechanics.simulator._hexahedra import Hexahedra

@@ -1,26 +1,66 @@
-"""The interface of a body: layers of silicone on a rigid support, and a chart of their surface."""
+"""Bodies: layers of silicone on a rigid support, a chart of their surface, and sensors in them."""
 
 import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import psutil
-from annotated_types import Ge
+from annotated_types import Ge, Gt, Lt
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from skin.body.material import Material
-from skin.body.sensors import Sensors
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured
 from skin.errors import InputError
 
-if TYPE_CHECKING:
-    from skin.body.sensors import Sensors
+MOST = 10_000
+"""Sensors that a file may have: a thousand times those of a usual skin."""
+
+REACHES = (0.0, 0.01, 0.02, 0.04)
+"""Distances from a sensor at which its response to a fingertip is known, m."""
+
+GEOMETRY = (
+    *("x", "y", "depth", "normal_x", "normal_y", "normal_z", "footprint_x", "footprint_y"),
+    *("width", "height", "thickness", "share"),
+    *(f"response_{1e3 * reach:g}mm" for reach in REACHES),
+)
+"""What is known of a sensor and its skin: m, unit vectors; extent and thickness of the body, m; reading under
+uniform pressure as a share of the force on the footprint; readings under a fingertip of 1 N at the distances
+:data:`REACHES`, N."""
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Sensors placed in a body.
+
+    Attributes:
+        positions: (S, 3), m: x to the right and y downwards from the body's upper left corner, z the depth
+            below the surface. The order of the sensors is the order of the readings everywhere.
+        footprint: extent (x, y) of the area over which one sensor feels, m.
+        normals: (S, 3), unit vectors n, in the local frame (x, y, into the skin), along which each sensor
+            feels: it reads n . sigma . n. One (3,) holds for all; by default they face the surface.
+    """
+
+    positions: np.ndarray
+    footprint: tuple[float, float]
+    normals: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+
+    def __post_init__(self) -> None:
+        normals = np.broadcast_to(np.asarray(self.normals, dtype=float), self.positions.shape)
+        object.__setattr__(self, "normals", normals.copy())
+
+    @property
+    def tilted(self) -> np.ndarray:
+        """Which sensors do not face the surface, (S,), bool; up or down reads the same."""
+        return (self.normals[:, :2] != 0).any(axis=1)
+
+    def __len__(self) -> int:
+        return len(self.positions)
 
 
 # Check that arrays fit into memory before they are allocated.
@@ -362,3 +402,88 @@ def warn_of_surface(body: AbstractBody, sensors: Sensors) -> None:
             UserWarning,
             stacklevel=3,
         )
+
+
+# A flat sheet of silicone layers on a rigid base.
+
+
+@checked("body")
+@dataclass(frozen=True)
+class Sheet(AbstractBody):
+    """A rectangular sheet of layers on a rigid base; its chart is the sheet seen from above.
+
+    In space x and y are those of the chart, and z points up from the surface.
+    """
+
+    flat: ClassVar[bool] = True
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (..., 3) of the chart, m, are in space: (x, y, -depth), m."""
+        return np.asarray(points) * np.array([1.0, 1.0, -1.0])
+
+    def frame(self, points: np.ndarray) -> np.ndarray:
+        """Return the local axes at points (..., 3), (..., 3, 3): everywhere x, y and down."""
+        return np.broadcast_to(np.diag([1.0, 1.0, -1.0]), (*np.shape(points)[:-1], 3, 3)).copy()
+
+
+# A sleeve of silicone layers around a part of an arm.
+
+
+@checked("body")
+@dataclass(frozen=True)
+class Arm(AbstractBody):
+    """Layers on a rigid cylinder, over a part of its circumference: a rolled-up sheet (docs/adr/0005).
+
+    The chart is the unrolled outer surface: x runs around the arm, y along it. Distances on the surface are
+    those of the chart; below the surface an arc over the same x is shorter. In space y is the axis of the
+    arm, and the middle of the sleeve is at the top, along z.
+
+    Attributes:
+        radius: of the outer surface, m.
+        length: of the sleeve along the arm, m.
+        angle: of the sleeve, rad; less than a full turn.
+        size: (radius * angle, length), m.
+        cells, layers, variation, variation_seed: as in :class:`skin.body.base.AbstractBody`; layers from the
+            core outwards.
+
+    Raises:
+        InputError: as in :class:`skin.body.base.AbstractBody`, and a closed sleeve, or layers that are
+            thicker than the radius.
+    """
+
+    size: tuple[float, float] = field(init=False)
+    radius: PositiveFloat = field(kw_only=True)
+    length: PositiveFloat = field(kw_only=True)
+    angle: Annotated[float, Gt(0), Lt(2 * math.pi)] = field(kw_only=True)
+
+    flat: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", (self.radius * self.angle, self.length))
+        super().__post_init__()
+        if self.thickness >= self.radius:
+            raise InputError(
+                f"layers of {self.thickness:g} m together leave no core within "
+                f"body.radius={self.radius:g} m: give a larger body.radius or thinner layers"
+            )
+
+    def resized(self, size: tuple[float, float]) -> str:
+        """Return the overrides that give the sleeve an extent (x, y), m."""
+        return f"body.angle={size[0] / self.radius:g} body.length={size[1]:g}"
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (..., 3) of the chart, m, are in space, (..., 3), m."""
+        x, y, depth = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        turn, radius = self._turn(x), self.radius - depth
+        return np.stack([radius * np.sin(turn), y, radius * np.cos(turn)], axis=-1)
+
+    def frame(self, points: np.ndarray) -> np.ndarray:
+        """Return the local axes at points (..., 3), (..., 3, 3): around the arm, along it, to its axis."""
+        turn = self._turn(np.asarray(points, dtype=float)[..., 0])
+        sine, cosine, none = np.sin(turn), np.cos(turn), np.zeros_like(turn)
+        around, along, inwards = (cosine, none, -sine), (none, none + 1, none), (-sine, none, -cosine)
+        return np.stack([np.stack(axis, axis=-1) for axis in (around, along, inwards)], axis=-2)
+
+    def _turn(self, x: np.ndarray) -> np.ndarray:
+        """Return the angle from the middle of the sleeve at a place around it (...,), m, in rad."""
+        return x / self.radius - self.angle / 2

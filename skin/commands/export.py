@@ -96,11 +96,16 @@ def _export_file(config: DictConfig, steps: "Steps") -> None:
 
     from skin.core.messages import quiet
     from skin.hardware.live.engine import DebounceSettings
-    from skin.runs.exported.model import describe_skin
-    from skin.runs.exported.writer import write_model
+    from skin.runs.exported_model import describe_skin
     from skin.runs.finished_run import FinishedRun
     from skin.runs.model_of_run import equation10_warning, load_model
 
+    try:
+        from skin.runs.onnx_writer import write_model
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "skin export needs onnx, onnxscript and onnxruntime: pip install 'tactile-skin[export]'"
+        ) from error
     quiet()
     run = FinishedRun.named(config)
     whole = run.configured(config, overrides())

@@ -112,7 +112,7 @@ def _watch(config: DictConfig, live: "LiveSettings", changes: Sequence[str], own
     messages = Console(stderr=True, highlight=False)
     if str(config.run).endswith(".onnx"):
         from skin.hardware.live.engine_builder import watch_exported
-        from skin.runs.exported.model import check_overrides
+        from skin.runs.exported_model import check_overrides
 
         check_overrides(config.run, config, changes)
         device = plain(config)["device"]

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
+from skin.core.files import CONF
 from skin.errors import InputError
 
 _Made = TypeVar("_Made")
@@ -248,17 +249,17 @@ def _written(default: Any) -> str:
 
 
 GROUPS = {
-    "body": "skin.body",
+    "body": "skin.body.base",
     "layout": "skin.body.layout",
-    "simulator": "skin.mechanics.simulator",
-    "contact": "skin.mechanics.contact",
-    "device": "skin.device",
+    "simulator": "skin.mechanics.simulator.base",
+    "contact": "skin.mechanics.contact.base",
+    "device": "skin.device.base",
     "representation": "skin.learning.representation",
     "model": "skin.learning.model",
     "fusion": "skin.learning.fusion",
     "learner": "skin.learning.learner",
 }
-"""Configuration groups whose options are classes -> package; its ``base.py`` holds what they derive from."""
+"""Configuration groups whose options are classes -> module of the abstract class that they derive from."""
 
 # Package -> base classes, as (module, name). Not every module of PyTorch Geometric: some of them fetch models
 # from the network and run what these contain.
@@ -270,12 +271,10 @@ _TRUSTED_LIBRARIES = {
         ("torch_geometric.nn.models.basic_gnn", "BasicGNN"),
     ),
 }
-_BASES = {
-    "skin": tuple((f"{package}.base", f"Abstract{group.capitalize()}") for group, package in GROUPS.items())
-}
+_BASES = {"skin": tuple((module, f"Abstract{group.capitalize()}") for group, module in GROUPS.items())}
 _BASES |= _TRUSTED_LIBRARIES
 # Models of other libraries: their learners run one program, which no setting can change.
-_BASES["experiments.peers"] = (("skin.learning.learner.base", "AbstractLearner"),)
+_BASES["experiments.peers"] = (("skin.learning.learner", "AbstractLearner"),)
 
 
 def check_targets(config: Any, where: str) -> None:
@@ -361,8 +360,17 @@ def import_name(name: str) -> Any:
 
 
 def option_name(made: object) -> str:
-    """Return the name of the option that an object, its class or its factory is: that of its module.
+    """Return the name of the option that an object or its class is.
 
-    ``skin.mechanics.simulator.fem.PlatesAndBeams`` is the option ``fem``, as in ``simulator=fem``.
+    It is that of the YAML file in ``conf/`` that names the class: ``PlatesAndBeams`` is the option ``fem``,
+    as in ``simulator=fem``. A class from outside ``skin`` is named after its module.
     """
-    return made.__module__.rpartition(".")[2]
+    kind = made if hasattr(made, "__qualname__") else type(made)
+    return _options().get(f"{kind.__module__}.{kind.__qualname__}", kind.__module__.rpartition(".")[2])
+
+
+@cache
+def _options() -> dict[str, str]:
+    """Return the names of the options of ``skin`` by the dotted name of their class."""
+    paths = (path for group in GROUPS for path in (CONF / group).glob("*.yaml"))
+    return {path.read_text().partition("_target_: ")[2].split()[0]: path.stem for path in paths}

@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from skin.body.base import AbstractBody
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
 from skin.design.precision import Findings
 from skin.design.sweep import Step
 from skin.plot.figures import COLOURS, MARKS, save_figure

@@ -17,7 +17,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from skin.body.sensors import Sensors
+from skin.body.base import Sensors
 from skin.core.files import json_text, write
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked

@@ -15,10 +15,8 @@ from matplotlib.path import Path as Polygon
 from PIL import Image
 from scipy.linalg import cho_factor, cho_solve, eigh, eigvalsh, solve
 
-from skin.body.base import AbstractBody, overlaps
-from skin.body.layout.base import place_sensors
-from skin.body.layout.grid import Grid
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors, overlaps
+from skin.body.layout import Grid, place_sensors
 from skin.core.files import candidates
 from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated

@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from skin.body.base import Layer
-from skin.body.layout.base import Footprint
-from skin.body.layout.grid import Grid
+from skin.body.layout import Footprint, Grid
 from skin.body.material import Material
 from skin.core.files import whole
 from skin.core.settings import checked

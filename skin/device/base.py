@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from skin.body.base import AbstractBody
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
 from skin.core.rng import Stream, generator
 from skin.device.touches import Part, Recording, Touches, concatenate
 from skin.errors import InputError

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skin.body.sensors import MOST
+from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import candidates
 from skin.core.safe_loading import TEXT, ChecksumError, check_text, parse_yaml, read_file, text_sum

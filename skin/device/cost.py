@@ -14,9 +14,8 @@ import torch
 from rich.console import Console
 from rich.progress import wrap_file
 
-from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, tile_centres
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
+from skin.body.layout import AbstractLayout, tile_centres
 from skin.core.array_cache import folder
 from skin.core.files import whole
 from skin.core.rng import Stream, generator

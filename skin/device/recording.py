@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from skin.body.base import AbstractBody, require_memory
-from skin.body.layout.base import AbstractLayout
+from skin.body.layout import AbstractLayout
 from skin.device.base import AbstractDevice, Blank, Split, split_rows, split_shards
 from skin.device.files import DataSet, read_recording
 from skin.device.touches import Part, Recording, Touches, concatenate

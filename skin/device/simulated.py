@@ -12,9 +12,8 @@ from annotated_types import Ge
 from torch import Tensor
 
 from skin import __version__
-from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
+from skin.body.layout import AbstractLayout
 from skin.core.rng import Stream, generator
 from skin.core.settings import check_settings
 from skin.device.balance import summarise

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from skin.body.sensors import GEOMETRY
+from skin.body.base import GEOMETRY
 from skin.errors import InputError
 from skin.touch.labels import Task
 

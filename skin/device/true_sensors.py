@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from skin.body.base import AbstractBody
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
 from skin.core.rng import Stream, generator
 from skin.errors import InputError
 from skin.mechanics.relaxation import Relaxing, relaxes

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from skin.body.layout.scattered import Scattered
+from skin.body.layout import Scattered
 from skin.core.files import whole, write
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.touches import Touches

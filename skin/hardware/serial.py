@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from pydantic import PositiveFloat
 
-from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
+from skin.body.layout import AbstractLayout
 from skin.device.base import AbstractDevice, Blank, Split
 from skin.device.resampling import Frame, Resampled, Window
 from skin.device.touches import Recording, Touches

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from skin.body.sensors import MOST
+from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import json_line
 from skin.core.safe_loading import parse_json, read_file, regular, sha256

@@ -16,9 +16,9 @@ from torch.nn import functional as F
 from torch.optim.lr_scheduler import OneCycleLR
 
 from skin.device.touches import Touches
-from skin.learning.fusion.base import AbstractFusion
-from skin.learning.model.base import activation as activation_of
-from skin.learning.representation.base import AbstractRepresentation, Frames
+from skin.learning.fusion import AbstractFusion
+from skin.learning.model import make_activation
+from skin.learning.representation import AbstractRepresentation, Frames
 from skin.touch.labels import Task
 
 Batch = tuple[Frames, Tensor]
@@ -74,7 +74,7 @@ class TouchClassifier(pl.LightningModule):
         for before, after in pairwise(widths):
             # Without dropout there is no layer, so that older weights keep their names.
             dropped = [nn.Dropout(dropout)] if dropout else []
-            layers += [*dropped, nn.Linear(before, after), activation_of(activation)]
+            layers += [*dropped, nn.Linear(before, after), make_activation(activation)]
         self.head = nn.Sequential(*layers, nn.Linear(widths[-1], len(task)))
         self.task = task
         self._make_optimizer, self._warmup = optimizer, warmup
@@ -179,9 +179,9 @@ class _Summary(nn.Module):
         self.layers = nn.Sequential(
             _Standardised(numbers, affine=False, momentum=None),
             nn.Linear(numbers, width),
-            activation_of(activation),
+            make_activation(activation),
             nn.Linear(width, width),
-            activation_of(activation),
+            make_activation(activation),
         )
 
     def forward(self, summary: Tensor | None) -> Tensor:

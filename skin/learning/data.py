@@ -16,7 +16,7 @@ from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
 from skin.learning.classifier import Batch
-from skin.learning.representation.base import AbstractRepresentation, Frames
+from skin.learning.representation import AbstractRepresentation, Frames
 from skin.touch.labels import Task
 
 # Data augmentation: changes of a touch that keep its labels.

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.base import AbstractBody
-from skin.body.sensors import GEOMETRY, REACHES, Sensors
+from skin.body.base import GEOMETRY, REACHES, AbstractBody, Sensors
 from skin.mechanics.simulator.base import AbstractSimulator
 
 # The pressure of a fingertip, differentiable in its place, radius and force.

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from skin.body.base import AbstractBody
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 
 # First-order lag, hysteresis and rounding of readings in time.

@@ -19,8 +19,7 @@ from skin.core.files import whole
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.representation.image import centres
-from skin.learning.representation.interp import weights
+from skin.learning.representation import centres, weights
 from skin.plot.figures import save_figure
 from skin.plot.plot3d import (
     FORCE,

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from skin.body.base import AbstractBody, check_plausibility, warn_of_surface
-from skin.body.layout.base import AbstractLayout
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors, check_plausibility, warn_of_surface
+from skin.body.layout import AbstractLayout
 from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
-from skin.learning.learner.base import AbstractLearner
+from skin.learning.learner import AbstractLearner
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.runs.configuration import plain
 

@@ -31,7 +31,7 @@ from skin.core.settings import check_settings, check_targets
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.learning.data import TouchData
-from skin.learning.learner.base import AbstractLearner
+from skin.learning.learner import AbstractLearner
 from skin.runs.configuration import validate_config
 from skin.runs.overrides import apply_overrides
 from skin.runs.store import Store

@@ -15,19 +15,19 @@ from torch import Tensor
 
 from skin import __version__
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout
+from skin.body.layout import AbstractLayout
 from skin.core.messages import to_input_error
 from skin.core.settings import configured
 from skin.device.base import AbstractDevice
-from skin.device.skin_distribution import SkinDistribution
+from skin.device.skins import SkinDistribution
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL, ContactThreshold, OperatingPoint, Predictor, Watching, rise
-from skin.learning.learner.base import AbstractLearner
+from skin.learning.learner import AbstractLearner
 from skin.runs.alarm_threshold import alarm_point, alarm_point_for_touches
 from skin.runs.build import build_data, build_device, build_learner, build_skin
 from skin.runs.configuration import Tracking, plain, validate_config
-from skin.runs.exported.model import ExportedModel, ModelMetadata
+from skin.runs.exported_model import ExportedModel, ModelMetadata
 from skin.runs.finished_run import FinishedRun, find_run
 from skin.runs.overrides import with_skin
 from skin.runs.progress import Steps
@@ -246,9 +246,9 @@ def load_run(
             run that finished.
         uri: of the runs, as MLflow takes it; None: ``mlflow.db`` in the current folder.
         trust: allow any class in its configuration, which may run any code.
-        body: the body of the skin to use it on, such as :class:`skin.body.sheet.Sheet`, or the name of an
+        body: the body of the skin to use it on, such as :class:`skin.body.base.Sheet`, or the name of an
             option, such as ``arm``; None: that of the run.
-        layout: the sensors of this skin: a layout such as :class:`skin.body.layout.grid.Grid`, the name of an
+        layout: the sensors of this skin: a layout such as :class:`skin.body.layout.Grid`, the name of an
             option, or the path of a CSV file; None: those of the run.
 
     Raises:

@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from skin.body.base import AbstractBody
-from skin.body.layout.base import AbstractLayout, Listed
+from skin.body.layout import AbstractLayout, Listed
 from skin.core.files import CONF
 from skin.core.settings import check_groups
 from skin.errors import InputError

@@ -35,8 +35,8 @@ from skin.evaluation.operating_point import choose_operating_point
 from skin.evaluation.report import Report, evaluate, metrics_table
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
-from skin.learning.learner.base import AbstractLearner
-from skin.learning.learner.network import LAST
+from skin.learning.learner import AbstractLearner
+from skin.learning.network import LAST
 from skin.plot.figures import confusions, save_figure
 from skin.runs.alarm_threshold import threshold_device
 from skin.runs.build import build_data, build_device, build_learner

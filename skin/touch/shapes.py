@@ -13,8 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from skin.body.base import AbstractBody
-from skin.body.sheet import Sheet
+from skin.body.base import AbstractBody, Sheet
 from skin.errors import InputError
 from skin.touch.images import hulls, load_image, pyramid
 

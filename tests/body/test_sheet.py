@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.errors import InputError
 
 LAYERS = [

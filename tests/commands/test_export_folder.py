@@ -35,7 +35,7 @@ def test_the_folder_has_weights_configuration_hashes_and_card(folder):
     written = {path.name for path in (folder / "models" / "small").iterdir()}
     assert written == {"README.md", "SHA256SUMS", "config.yaml", "rules.json", "run.json"}
     card = (folder / "models" / "small" / "README.md").read_text()
-    assert "`skin.learning.learner.rules.Rules`" in card
+    assert "`skin.learning.learner.Rules`" in card
     assert "Mlp" not in card
     assert "Of the first 96 test gestures" in card
 

@@ -83,8 +83,8 @@ def test_what_does_not_fit_is_refused_by_name(wrong, said):
             "model._target_=absent.Thing cannot be imported: No module named 'absent'",
         ),
         (
-            {"_target_": "skin.learning.model.mlp.Mpl"},
-            "model._target_=skin.learning.model.mlp.Mpl cannot be imported",
+            {"_target_": "skin.learning.model.Mpl"},
+            "model._target_=skin.learning.model.Mpl cannot be imported",
         ),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
 from skin.design.placement import candidate_sites, keep_out
 from skin.errors import InputError
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.design.precision import Noise, Sensitivity, local_covariance, sensitivity
 from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator.fem import PlatesAndBeams

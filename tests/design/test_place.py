@@ -7,8 +7,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
-from skin.body.layout.file import File
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import File
 from skin.core.files import CONF
 from skin.design.place import Place
 from skin.errors import InputError

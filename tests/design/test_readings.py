@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.sensors import Sensors
+from skin.body.base import Sensors
 from skin.core.rng import Stream, generator
 from skin.design.place import reading_covariance
 from skin.runs.build import build_device

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.layout.grid import Grid
-from skin.body.layout.scattered import Scattered
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid, Scattered
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
 from skin.device.simulated import Simulated

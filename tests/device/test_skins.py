@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from skin.body.sensors import GEOMETRY
+from skin.body.base import GEOMETRY
 from skin.core.rng import generator
 from skin.device import skins
 from skin.errors import InputError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.arm import Arm
+from skin.body.base import Arm
 from skin.device.files import read_recording, write_recording
 from skin.errors import InputError
 from skin.runs.build import build_data, build_device

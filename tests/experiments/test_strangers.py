@@ -11,7 +11,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator.solid import Elastic, build_mesh
 from skin.runs.build import build_device, build_learner
@@ -97,7 +97,7 @@ CASES = {
     "a function of the standard library": ("study study=embeddings study.run={}", lambda bait, marker: {
         "layout": {"_target_": "shutil.copyfile", "src": str(bait), "dst": str(marker)}}),
     "deep in a list, with arguments by place": ("study study=margins study.run={}", lambda bait, marker: {
-        "learner": {"_target_": "skin.learning.learner.ensemble.Ensemble", "members": {"a": [
+        "learner": {"_target_": "skin.learning.learner.Ensemble", "members": {"a": [
             [{"_target_": "os.mkdir", "_args_": [str(marker)]}]]}}}),
     "a module that torch.optim imports": ("study study=streams study.run={}", lambda bait, marker: {
         "layout": {"_target_": "torch.optim.optimizer.torch.load", "f": str(bait), "weights_only": False}}),

@@ -4,8 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.errors import InputError
 from skin.hardware.bench import BenchSession
 from skin.hardware.calibration import bench

@@ -7,8 +7,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.errors import InputError

@@ -6,8 +6,8 @@ from threading import Thread
 
 import pytest
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.device.simulated import Simulated
 from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
 from skin.mechanics.simulator.naive import Naive

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.device.calibration import Calibration, write_calibration
 from skin.device.imperfection import Imperfection
 from skin.device.simulated import Simulated

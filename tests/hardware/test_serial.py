@@ -8,8 +8,8 @@ import torch
 
 pytest.importorskip("termios", reason="pseudo-terminals need a POSIX system")
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError

@@ -6,9 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from skin.body.layout.file import File
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import File, Grid
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError

@@ -10,7 +10,7 @@ from skin.device.base import AbstractDevice
 from skin.device.touches import Part, Recording, Touches
 from skin.errors import InputError
 from skin.learning.data import Augmentation, TouchData
-from skin.learning.representation.readings import Readings
+from skin.learning.representation import Readings
 from skin.runs.build import build_data, build_device
 from skin.runs.configuration import validate_config
 from skin.touch.labels import TOUCH_SLIDING

@@ -6,11 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from skin.body.base import Layer
-from skin.body.layout.grid import Grid
+from skin.body.base import GEOMETRY, Layer, Sheet
+from skin.body.layout import Grid
 from skin.body.material import Material
-from skin.body.sensors import GEOMETRY
-from skin.body.sheet import Sheet
 from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid

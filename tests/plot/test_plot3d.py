@@ -5,7 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Path3DCollection, Poly3DCollection
 
-from skin.body.arm import Arm
+from skin.body.base import Arm
 from skin.errors import InputError
 from skin.plot.animation import still, write_animation
 from skin.plot.plot3d import Scene, sensors_in_space, skin_in_space

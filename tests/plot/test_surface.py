@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.arm import Arm
-from skin.body.layout.grid import Grid
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Arm, Sensors, Sheet
+from skin.body.layout import Grid
 from skin.mechanics.simulator.fem import build
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.plates import Structure

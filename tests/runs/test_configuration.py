@@ -3,6 +3,8 @@
 import csv
 import subprocess
 import sys
+from importlib import import_module
+from inspect import isabstract
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -14,7 +16,7 @@ from omegaconf.errors import ReadonlyConfigError
 
 from skin.commands._command import command
 from skin.core.files import CONF, ROOT
-from skin.core.settings import GROUPS
+from skin.core.settings import GROUPS, option_name
 from skin.errors import InputError
 from skin.evaluation.settings import check_evaluation
 from skin.runs.build import build_device, build_learner
@@ -36,24 +38,35 @@ def keys(value):
     return {key for entry in value for key in keys(entry)} if isinstance(value, list) else set()
 
 
-def place_of(group, option):
-    return "skin.hardware.serial" if (group, option) == ("device", "serial") else f"{GROUPS[group]}.{option}"
+def target(group, option):
+    return OmegaConf.load(CONF / group / f"{option}.yaml")["_target_"]
 
 
-@pytest.mark.parametrize("group", sorted({*GROUPS} - {"body", "device"}))
-def test_options_are_the_public_modules_of_the_folder(group):
-    folder = ROOT / GROUPS[group].replace(".", "/")
-    modules = {path.stem for path in folder.glob("*.py") if not path.stem.startswith("_")}
-    if group == "simulator":
-        modules -= {"plates"}
-    assert {path.stem for path in (CONF / group).glob("*.yaml")} == modules - {"base"}
+def base_of(group):
+    return get_class(f"{GROUPS[group]}.Abstract{group.capitalize()}")
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_public_class_beside_an_option_is_an_option(group):
+    targets = {target(group, option) for folder, option in OPTIONS if folder == group}
+    modules = {import_module(name.rpartition(".")[0]) for name in targets}
+    classes = {
+        f"{kind.__module__}.{name}"
+        for module in modules
+        for name, kind in vars(module).items()
+        if isinstance(kind, type) and issubclass(kind, base_of(group)) and kind.__module__ == module.__name__
+        if not isabstract(kind) and not name.startswith("_")
+    }
+    assert classes - {"skin.body.layout.Listed"} == targets  # which is made of an object in Python
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_an_option_names_a_class_of_its_own_module(group, option):
-    stored = OmegaConf.load(CONF / group / f"{option}.yaml")
-    assert stored["_convert_"] == "all"
-    assert get_class(stored["_target_"]).__module__ == place_of(group, option)
+def test_an_option_names_a_class_of_its_group(group, option):
+    name, kind = target(group, option), get_class(target(group, option))
+    assert f"{kind.__module__}.{kind.__qualname__}" == name
+    assert issubclass(kind, base_of(group))
+    assert option_name(kind) == option
+    assert OmegaConf.load(CONF / group / f"{option}.yaml")["_convert_"] == "all"
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "simulator").glob("*.yaml")))
@@ -70,7 +83,7 @@ def test_groups_of_values_build_nothing(group):
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes(configured, group, option):
     config = plain(validate_config(configured(f"{group}={option}")))
-    assert config[group]["_target_"].rpartition(".")[0] == place_of(group, option)
+    assert config[group]["_target_"] == target(group, option)
 
 
 @pytest.mark.parametrize("simulator", ["naive", "fem"])

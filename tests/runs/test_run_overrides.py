@@ -66,7 +66,7 @@ OWN = """\
 defaults:
   - override /simulator: solid
 body:
-  _target_: skin.body.sheet.Sheet
+  _target_: skin.body.base.Sheet
   _convert_: all
   size: [0.30, 0.10]
   cells: [30, 20]
@@ -92,7 +92,7 @@ def with_folder(run, folder, *overrides):
 def test_all_that_a_chosen_option_sets_is_taken(folder, trained):
     back = with_folder(stored(trained, "device.offset=0.3"), folder, "body=mine")
     assert back["body"]["size"] == [0.30, 0.10]
-    assert back["layout"]["_target_"] == "skin.body.layout.file.File"
+    assert back["layout"]["_target_"] == "skin.body.layout.File"
     assert (back["layout"]["path"], back["layout"]["footprint"]) == ("mine.csv", [0.008, 0.008])
     assert (
         back["simulator"]["_target_"]

@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 from hydra.utils import instantiate
 
-from skin.body.arm import Arm
-from skin.body.base import Layer
-from skin.body.layout.file import File
-from skin.body.layout.grid import Grid
-from skin.body.layout.random import Random
+from skin.body.base import Arm, Layer, Sheet
+from skin.body.layout import File, Grid, Random
 from skin.body.material import Material, Relaxation
-from skin.body.sheet import Sheet
 from skin.runs.overrides import with_skin
 
 LAYERS = [
@@ -44,9 +40,9 @@ def test_the_settings_build_the_same_skin(body, layout):
 
 def test_names_and_files_are_options():
     settings = with_skin({}, "arm", "sensors.csv")
-    assert settings["body"]["_target_"] == "skin.body.arm.Arm"
+    assert settings["body"]["_target_"] == "skin.body.base.Arm"
     assert settings["layout"] == {
-        "_target_": "skin.body.layout.file.File", "_convert_": "all", "path": "sensors.csv",
+        "_target_": "skin.body.layout.File", "_convert_": "all", "path": "sensors.csv",
         "footprint": [0.01, 0.01], "depth": None,
     }  # fmt: skip
     assert with_skin({"layout": 1}, None, None) == {"layout": 1}

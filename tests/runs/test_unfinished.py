@@ -18,7 +18,7 @@ from mlflow.exceptions import MlflowException
 from pytorch_lightning.loggers import MLFlowLogger
 
 from skin.errors import InputError
-from skin.learning.learner.network import LAST
+from skin.learning.network import LAST
 from skin.runs.configuration import Tracking, source_tags
 from skin.runs.store import PROCESS, Store
 from skin.runs.train import RunLogger, alone, find_unfinished

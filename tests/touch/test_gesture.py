@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
 from skin.errors import InputError
 from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading, model_window
 from skin.touch.labels import Thresholds

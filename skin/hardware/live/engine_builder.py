@@ -21,7 +21,7 @@ from skin.hardware.live.engine import DebounceSettings, Detection, Engine, Engin
 from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
-from skin.runs.exported.model import ExportedModel
+from skin.runs.exported_model import ExportedModel
 from skin.runs.trained_model import TrainedModel
 
 STRENGTH = 1.5

@@ -20,8 +20,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayState
 from skin.hardware.wire.segmentation import typed_lines
-from skin.learning.representation.image import centres
-from skin.learning.representation.interp import weights
+from skin.learning.representation import centres, weights
 
 _FEWEST = 3
 _INWARDS = 1e-6

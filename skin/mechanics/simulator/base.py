@@ -12,7 +12,7 @@ import torch
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor, nn
 
-from skin.body.sensors import Sensors
+from skin.body.base import Sensors
 from skin.core.settings import option_name
 from skin.errors import InputError
 from skin.touch.movie import Movie

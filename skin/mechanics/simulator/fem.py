@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.base import AbstractBody, require_memory
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.core import array_cache
 from skin.core.array_cache import folder
 from skin.core.settings import checked

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.base import AbstractBody
-from skin.body.sensors import Sensors
+from skin.body.base import AbstractBody, Sensors
 from skin.mechanics.simulator.base import AbstractSimulator, Response, flatten
 
 

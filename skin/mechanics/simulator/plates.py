@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 from scipy import sparse
 
-from skin.body.base import AbstractBody, overlaps
+from skin.body.base import AbstractBody, Sensors, overlaps
 from skin.body.material import Material
-from skin.body.sensors import Sensors
+from skin.core.settings import option_name
 from skin.errors import InputError
 
 # An upright Euler-Bernoulli beam of rectangular section, from the lower node to the upper one, each with the
@@ -198,7 +198,7 @@ class Structure:
 
     def __post_init__(self) -> None:
         if not self.body.flat:
-            name = type(self.body).__module__.rpartition(".")[2]
+            name = option_name(self.body)
             raise InputError(
                 f"plates and beams are flat, body={name} is not: set simulator=solid or "
                 "simulator=naive, or body=sheet"

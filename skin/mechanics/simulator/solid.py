@@ -16,9 +16,8 @@ from rich.progress import track
 from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
-from skin.body.base import AbstractBody, require_memory
+from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.body.material import MATERIALS
-from skin.body.sensors import Sensors
 from skin.core import array_cache
 from skin.core.files import whole
 from skin.core.settings import checked

@@ -9,9 +9,8 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from skin.body.layout.base import AbstractLayout
-from skin.body.layout.grid import Grid
-from skin.body.sensors import Sensors
+from skin.body.base import Sensors
+from skin.body.layout import AbstractLayout, Grid
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive

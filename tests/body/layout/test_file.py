@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin.body.layout.file import File
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import File, Grid
 from skin.errors import InputError
 from tests.damage import DAMAGED_FILES, damaged, opened
 

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from skin.body.layout.file import File
-from skin.body.layout.grid import Grid
-from skin.body.layout.scattered import Scattered
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import File, Grid, Scattered
 from skin.errors import InputError
 
 LAYERS = [

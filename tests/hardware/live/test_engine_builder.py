@@ -17,8 +17,8 @@ from skin.evaluation.operating_point import OperatingPoint
 from skin.hardware.live.engine import DebounceSettings
 from skin.hardware.live.engine_builder import LiveSettings, watch_exported
 from skin.hardware.wire.protocol import Header, encode_header, encode_line
-from skin.learning.learner.network import Network
-from skin.runs.exported.writer import write_model
+from skin.learning.network import Network
+from skin.runs.onnx_writer import write_model
 
 pytest.importorskip("onnxruntime")
 RATE = 100.0  # Hz, of the device

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.device.files import read_recording
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop

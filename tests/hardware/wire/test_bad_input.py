@@ -9,8 +9,8 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid
 from skin.hardware.live.engine import Detection, Engine
 from skin.hardware.live.loop import LiveLoop
 from skin.hardware.recorder import record_session

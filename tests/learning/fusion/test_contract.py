@@ -9,12 +9,11 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from skin.errors import InputError
-from skin.learning.fusion.late import HEADS
-from skin.learning.model.cnn import Cnn
-from skin.learning.model.gcn import Gcn
-from skin.learning.model.mlp import Mlp
-from skin.learning.representation.base import Frames
-from skin.learning.representation.graph import Graph
+from skin.learning.cnn import Cnn
+from skin.learning.fusion import HEADS
+from skin.learning.graph import Graph
+from skin.learning.model import Gcn, Mlp
+from skin.learning.representation import Frames
 
 OPTIONS = sorted((Path(__file__).parents[3] / "conf" / "fusion").glob("*.yaml"))
 MODELS = {

@@ -2,8 +2,8 @@
 
 import torch
 
-from skin.learning.fusion.early import Early
-from skin.learning.representation.base import Frames
+from skin.learning.fusion import Early
+from skin.learning.representation import Frames
 
 
 class Spy(torch.nn.Module):

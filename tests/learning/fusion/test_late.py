@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.learning.fusion.late import HEADS, Late, positions
-from skin.learning.model.gcn import Gcn
-from skin.learning.model.mlp import Mlp
-from skin.learning.representation.base import Frames
+from skin.learning.fusion import HEADS, Late, positions
+from skin.learning.model import Gcn, Mlp
+from skin.learning.representation import Frames
 
 MODEL = partial(Mlp, widths=[8])
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.learning.fusion.linked import Linked, link
-from skin.learning.model.cnn import Cnn
-from skin.learning.model.gcn import Gcn
-from skin.learning.representation.base import Frames
-from skin.learning.representation.graph import normalised
+from skin.learning.cnn import Cnn
+from skin.learning.fusion import Linked, link
+from skin.learning.graph import normalised
+from skin.learning.model import Gcn
+from skin.learning.representation import Frames
 
 PAIR = np.array([[0.0, 0.5], [0.5, 0.0]])
 

@@ -9,9 +9,9 @@ import torch
 
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.learning.boosted_trees import BoostedTrees
 from skin.learning.data import TouchData
-from skin.learning.learner.boosted_trees import BoostedTrees
-from skin.learning.representation.readings import Readings
+from skin.learning.representation import Readings
 from skin.touch.labels import Task
 
 

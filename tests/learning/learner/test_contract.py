@@ -12,7 +12,7 @@ from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics
 from skin.learning.data import TouchData
-from skin.learning.learner.rules import Rules
+from skin.learning.learner import Rules
 from skin.touch.labels import TOUCH_SLIDING
 
 OPTIONS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "learner").glob("*.yaml"))

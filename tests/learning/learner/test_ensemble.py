@@ -5,9 +5,9 @@ import torch
 from hydra.utils import instantiate
 
 from skin.errors import InputError
+from skin.learning.boosted_trees import BoostedTrees
 from skin.learning.data import TouchData
-from skin.learning.learner.boosted_trees import BoostedTrees
-from skin.learning.learner.ensemble import Ensemble
+from skin.learning.learner import Ensemble
 
 
 def test_it_says_the_mean_of_what_its_members_say(configured, made_up_device):

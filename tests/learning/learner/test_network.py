@@ -5,7 +5,7 @@ import torch
 from hydra.utils import instantiate
 from pytorch_lightning.loggers import CSVLogger
 
-from skin.body.layout.scattered import Scattered
+from skin.body.layout import Scattered
 from skin.errors import InputError
 from skin.learning.data import TouchData
 from skin.runs.build import build_data, build_device, build_learner

@@ -7,8 +7,8 @@ import pytest
 
 from skin.errors import InputError
 from skin.learning.data import TouchData
-from skin.learning.learner.rules import Rules, _threshold
-from skin.learning.representation.readings import Readings
+from skin.learning.learner import Rules, _threshold
+from skin.learning.representation import Readings
 from skin.touch.labels import Task
 
 

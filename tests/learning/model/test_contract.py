@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from skin.errors import InputError
-from skin.learning.representation.graph import Graph
+from skin.learning.graph import Graph
 
 OPTIONS = sorted((Path(__file__).parents[3] / "conf" / "model").glob("*.yaml"))
 NETWORKS = {

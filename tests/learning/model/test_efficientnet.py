@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.learning.model.efficientnet import HEAD, EfficientNet
+from skin.learning.cnn import HEAD, EfficientNet
 
 STAGES = [928, 1448, 16714, 46640, 242930, 543148, 2026348, 717232, 412160]  # parameters of torchvision's
 EMBEDDINGS = [  # every 160th of the 1280, in double precision
@@ -88,7 +88,7 @@ def test_one_channel_is_fed_three_times(file):
 def test_many_images_are_encoded_in_parts(file, monkeypatch):
     images, model = noise((7, 1, 32, 32), 0).float(), loaded(file).eval()
     whole = model(images, None)
-    monkeypatch.setattr("skin.learning.model.efficientnet.CHUNK", 3)
+    monkeypatch.setattr("skin.learning.cnn.CHUNK", 3)
     torch.testing.assert_close(model(images, None), whole)
 
 

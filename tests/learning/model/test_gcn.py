@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.learning.model.base import POOLINGS
-from skin.learning.model.gcn import Gcn, _InstanceNorm
-from skin.learning.representation.graph import adjacency, neighbours, normalised
+from skin.learning.graph import adjacency, neighbours, normalised
+from skin.learning.model import POOLINGS, Gcn, _InstanceNorm
 
 PLACES = 0.1 * np.random.default_rng(0).random((8, 3))
 EDGES = adjacency(PLACES, neighbours(PLACES, "knn", 3), "exp")

@@ -2,7 +2,7 @@
 
 import torch
 
-from skin.learning.model.mlp import Mlp
+from skin.learning.model import Mlp
 
 
 def test_no_layer_leaves_the_readings_as_they_are():

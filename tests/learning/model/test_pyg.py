@@ -7,8 +7,8 @@ from torch_geometric.nn.models import GCN, GraphSAGE
 
 from skin.errors import InputError
 from skin.learning.data import TouchData
-from skin.learning.model.pyg import Pyg
-from skin.learning.representation.graph import Graph
+from skin.learning.graph import Graph
+from skin.learning.pyg import Pyg
 from skin.runs.build import build_data, build_learner
 
 

@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional as F
 
 from skin.errors import InputError
-from skin.learning.model.transformer import Transformer
+from skin.learning.model import Transformer
 
 NO_EDGES = torch.eye(8)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.learning.features import engineered_features
-from skin.learning.representation.features import Features
+from skin.learning.representation import Features
 
 TIME, SENSORS = 30, 5
 

@@ -3,8 +3,7 @@
 import numpy as np
 import torch
 
-from skin.learning.representation.fourier import Fourier
-from skin.learning.representation.image import Image
+from skin.learning.representation import Fourier, Image
 
 
 def test_the_spectrum_is_that_of_numpy(made_up_device):

@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.layout.grid import Grid
-from skin.body.layout.scattered import Scattered
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Grid, Scattered
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.fusion.early import Early
-from skin.learning.fusion.late import Late
-from skin.learning.fusion.linked import Linked
-from skin.learning.model.gcn import Gcn
-from skin.learning.representation.graph import (
+from skin.learning.fusion import Early, Late, Linked
+from skin.learning.graph import (
     Graph,
     adjacency,
     neighbours,
@@ -23,6 +19,7 @@ from skin.learning.representation.graph import (
     self_share,
     typical_distance,
 )
+from skin.learning.model import Gcn
 
 # a square of side 1, a point to its right, and one far away
 #   0---1

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.learning.representation.image import Image
+from skin.learning.representation import Image
 
 
 def image(positions, readings, **options):

@@ -7,8 +7,7 @@ from hydra.utils import instantiate
 from scipy.spatial import Delaunay
 
 from skin.errors import InputError
-from skin.learning.representation.image import centres
-from skin.learning.representation.interp import Interpolation, weights
+from skin.learning.representation import Interpolation, centres, weights
 
 SIZE = (0.16, 0.12)
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from skin.learning.representation.readings import Readings
+from skin.learning.representation import Readings
 
 
 def test_readings_then_their_mask():

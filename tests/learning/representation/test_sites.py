@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from skin.body.sensors import GEOMETRY
+from skin.body.base import GEOMETRY
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.representation.sites import Sites
+from skin.learning.representation import Sites
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
 from skin.mechanics.contact.rigid import stabilise_checkerboard
 
 from .halfspace import love

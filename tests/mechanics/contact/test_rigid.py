@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.arm import Arm
-from skin.body.layout.grid import Grid
-from skin.body.sheet import Sheet
+from skin.body.base import Arm, Sheet
+from skin.body.layout import Grid
 from skin.device.base import in_threads
 from skin.errors import InputError
 from skin.mechanics.contact.prescribed import Prescribed

@@ -8,8 +8,8 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from skin.body.layout.scattered import Scattered
-from skin.body.sheet import Sheet
+from skin.body.base import Sheet
+from skin.body.layout import Scattered
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator, Response
 

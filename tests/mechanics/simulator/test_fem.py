@@ -8,10 +8,8 @@ import torch
 from scipy.sparse.linalg import spsolve
 from scipy.special import erf
 
-from skin.body.layout.grid import Grid
-from skin.body.layout.scattered import Scattered
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
+from skin.body.layout import Grid, Scattered
 from skin.errors import InputError
 from skin.mechanics.simulator.fem import PlatesAndBeams, build
 from skin.mechanics.simulator.naive import Naive

@@ -7,8 +7,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
 from experiments.validation import pynite_model
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.plates import Structure
 

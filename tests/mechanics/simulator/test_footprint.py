@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skin.body.sensors import Sensors
+from skin.body.base import Sensors
 from skin.mechanics.simulator.solid import quadrature
 
 LINES = (np.linspace(0, 0.16, 17), np.linspace(0, 0.12, 13), np.array([0, 0.0025, 0.005, 0.010, 0.015]))

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.mechanics.simulator.naive import Naive
 
 BODY = Sheet([0.04, 0.03], [4, 3], [{"material": "EcoFlex 00-30", "thickness": 0.005}])

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.core.array_cache import folder as cache_folder
 from skin.mechanics.simulator import fem as _operator
 from skin.mechanics.simulator.fem import build, cached

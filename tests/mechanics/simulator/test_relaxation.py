@@ -7,9 +7,8 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from skin.body.layout.grid import Grid
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
+from skin.body.layout import Grid
 from skin.device.simulated import Simulated
 from skin.errors import InputError
 from skin.mechanics.relaxation import Relaxing, speeds, times

@@ -6,8 +6,7 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator.solid import Elastic, Solid, build_mesh, reading_rows

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.sensors import Sensors
-from skin.body.sheet import Sheet
+from skin.body.base import Sensors, Sheet
 from skin.mechanics.simulator._strain import largest
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive

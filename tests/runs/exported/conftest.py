@@ -31,7 +31,7 @@ def untrained(configured):
 def exported(untrained, tmp_path_factory) -> tuple[RunModel, Path]:
     """Return the run with features, and its exported file."""
     pytest.importorskip("onnxruntime")
-    from skin.runs.exported.writer import write_model
+    from skin.runs.onnx_writer import write_model
 
     of = untrained("experiment=best_fresh")
     path = tmp_path_factory.mktemp("exported") / "skin.onnx"

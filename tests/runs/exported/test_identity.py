@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from skin.core.files import CONF
 from skin.core.safe_loading import KEY as CHECKSUM
 from skin.errors import InputError
-from skin.runs.exported.model import check_overrides, describe_skin
+from skin.runs.exported_model import check_overrides, describe_skin
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -19,7 +19,7 @@ SIZES = ["layout=grid", "layout.rows=2", "layout.columns=3"]
 @pytest.fixture(scope="module")
 def model(untrained, configured, tmp_path_factory):
     """Return the file of a network with the description of its skin."""
-    from skin.runs.exported.writer import write_model
+    from skin.runs.onnx_writer import write_model
 
     of = untrained("representation=readings", "model=mlp", "fusion=early")
     skin = describe_skin(configured("simulator=naive", *SIZES), of.positions)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from skin.core import safe_loading as checksum
 from skin.errors import InputError
-from skin.runs.exported.model import KEY, ExportedModel, ModelMetadata
+from skin.runs.exported_model import KEY, ExportedModel, ModelMetadata
 from tests.damage import DAMAGED_FILES, damaged, mutated, opened
 
 onnx = pytest.importorskip("onnx")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.runs.exported.model import KEY, ExportedModel, ModelMetadata
+from skin.runs.exported_model import KEY, ExportedModel, ModelMetadata
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

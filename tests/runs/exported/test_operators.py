@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import nn
 
-from skin.runs.exported.writer import _quiet
+from skin.runs.onnx_writer import _quiet
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
@@ -26,7 +26,7 @@ class Operators(nn.Module):
 @pytest.fixture(scope="module")
 def translated(tmp_path_factory):
     """Return a function that computes the operators with ONNX Runtime."""
-    from skin.runs.exported.operators import TRANSLATIONS
+    from skin.runs.onnx_writer import TRANSLATIONS
 
     path = tmp_path_factory.mktemp("operators") / "operators.onnx"
     example = torch.rand(3, 9), torch.ones(3, 6, 2, dtype=torch.int32), torch.eye(2)[None].repeat(3, 1, 1)

@@ -6,12 +6,12 @@ import torch
 
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.learner.rules import Rules
-from skin.learning.representation.graph import Graph
-from skin.runs.exported.model import ExportedModel
+from skin.learning.graph import Graph
+from skin.learning.learner import Rules
+from skin.runs.exported_model import ExportedModel
 
 pytest.importorskip("onnxruntime")
-from skin.runs.exported.writer import TOLERANCE, write_model
+from skin.runs.onnx_writer import TOLERANCE, write_model
 
 
 def difference(of, path, readings, valid):

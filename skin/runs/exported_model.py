@@ -1,7 +1,6 @@
 """An exported network: the description in its ONNX file, its skin, and how ONNX Runtime runs it safely.
 
-torch is not imported.
-"""
+torch is not imported."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +17,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from skin.body.sensors import Sensors
+from skin.body.base import Sensors
 from skin.core.files import json_line
 from skin.core.safe_loading import KEY as CHECKSUM
 from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file

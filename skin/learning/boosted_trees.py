@@ -21,14 +21,13 @@ from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import direction_features, engineered_features
-from skin.learning.learner.base import AbstractLearner
+from skin.learning.learner import AbstractLearner
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
     from skin.learning.data import TouchData
-
 
 Trees: TypeAlias = HistGradientBoostingClassifier | HistGradientBoostingRegressor
 _KINDS: dict[bool, type[Trees]] = {

@@ -17,9 +17,9 @@ from skin.core.messages import PARENT, one_line
 from skin.core.safe_loading import check_archive
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.fusion.base import AbstractFusion
-from skin.learning.learner.base import AbstractLearner
-from skin.learning.representation.base import Frames
+from skin.learning.fusion import AbstractFusion
+from skin.learning.learner import AbstractLearner
+from skin.learning.representation import Frames
 
 if TYPE_CHECKING:
     from pytorch_lightning import Callback, Trainer

@@ -13,7 +13,7 @@ from skin.body.base import AbstractBody
 from skin.core.settings import checked
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.learning.representation.base import AbstractRepresentation, Frames, channels
+from skin.learning.representation import AbstractRepresentation, Frames, channels
 
 Edges = Literal["knn", "delaunay"]
 Weight = Literal["exp", "distance", "stiffness", "none"]

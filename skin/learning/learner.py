@@ -1,7 +1,9 @@
-"""One threshold per label on an engineered feature."""
+"""Learners: fitted to touches, they predict the probability of each label."""
 
 import json
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,19 +11,90 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
-from torch import Tensor
+from torch import Tensor, nn
 
 from skin.core.safe_loading import TEXT, parse_json, read_file
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.learning.features import engineered_features
-from skin.learning.learner.base import AbstractLearner
 from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
+    from skin.learning.classifier import TouchClassifier
     from skin.learning.data import TouchData
+
+
+class AbstractLearner(ABC):
+    """Learns the labels of touches, for example by gradient descent, boosting or rules.
+
+    Attributes:
+        parameters: number of trained parameters, known after ``fit`` or ``load``.
+        seconds_per_epoch: median duration of one training epoch, s, known after ``fit``.
+        unfinished: existing folder in which ``fit`` may keep its progress, and from which a later ``fit``
+            with the same settings and data continues; None: nothing is kept.
+    """
+
+    parameters: int
+    seconds_per_epoch: float
+    unfinished: Path | None = None
+
+    def check(self, data: "TouchData") -> None:  # noqa: B027 - most have nothing that could be missing
+        """Raise InputError if the learner cannot be fitted, before anything is logged."""
+
+    @abstractmethod
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Fit to the training split of ``data``; model selection uses its validation split only."""
+
+    @abstractmethod
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the probability of each label, (B, L), for touches of any supported layout."""
+
+    def embeddings(self, touches: Touches) -> Tensor:
+        """Return the embeddings of touches, (B, E).
+
+        Raises:
+            InputError: this learner has no encoder.
+        """
+        raise InputError(f"{type(self).__name__} has no encoder: give a run of a network")
+
+    def pipeline(self, positions: Tensor) -> nn.Module:
+        """Return a torch module of readings (B, T, S), N, and valid (B, T, S), bool; it gives probabilities.
+
+        Args:
+            positions: (S, 3), m.
+
+        Raises:
+            InputError: this learner is no network.
+        """
+        raise InputError(
+            f"learner {type(self).__name__} cannot be exported: give a run of learner=network, or of an "
+            "ensemble of networks"
+        )
+
+    @property
+    def network(self) -> "TouchClassifier":
+        """The trained network; what changes its weights changes the learner.
+
+        Raises:
+            InputError: this learner is no network.
+        """
+        raise InputError(
+            f"{type(self).__name__} has no network to fine-tune: give a run of a network, such as best_fresh"
+        )
+
+    @abstractmethod
+    def save(self, folder: Path) -> Path:
+        """Write what was learned to a file in ``folder`` and return its path."""
+
+    @abstractmethod
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Load the file that :meth:`save` wrote; ``data`` gives the shapes as in :meth:`fit`."""
+
+
+# One threshold per label on an engineered feature.
+
 
 LOOK_AT = {
     "big": ("sensors above", "most sensors above"),
@@ -163,3 +236,78 @@ def _threshold(scores: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
         return float(max(truth.mean(), 1 - truth.mean())), float(scores[0])
     i = int(np.argmax(np.where(cut, right[:-1], -1)))
     return float(right[i] / len(truth)), float((scores[i] + scores[i + 1]) / 2)
+
+
+# Learning by several learners whose probabilities are averaged.
+
+
+class Ensemble(AbstractLearner):
+    """Trains its members on the same touches, each with its own seed, and averages their probabilities.
+
+    Members with different errors (trees and networks) improve most. It accepts the touches that all members
+    accept.
+
+    Args:
+        members: name -> a learner without its seed.
+        copies: name -> number of copies, each with another seed; 1 by default.
+        seed: member number i has the seed 1000 ``seed`` + i.
+
+    Raises:
+        InputError: no member, or copies of an unknown member.
+    """
+
+    def __init__(
+        self,
+        members: Mapping[str, Callable[..., AbstractLearner]],
+        copies: Mapping[str, int] | None = None,
+        seed: int = 0,
+    ) -> None:
+        copies = dict(copies or {})
+        if unknown := sorted(copies.keys() - members.keys()):
+            raise InputError(f"learner.copies names {', '.join(unknown)}, members are {', '.join(members)}")
+        makers = [make for name, make in members.items() for _ in range(copies.get(name, 1))]
+        if not makers:
+            raise InputError("learner=ensemble has no member: set learner.copies.network=1 or more")
+        self._members = [make(seed=1000 * seed + number) for number, make in enumerate(makers)]
+
+    def check(self, data: "TouchData") -> None:
+        """Check every member."""
+        for member in self._members:
+            member.check(data)
+
+    def fit(self, data: "TouchData", logger: "Logger | None" = None) -> None:
+        """Train one member after the other; the last one's training is logged."""
+        for member in self._members[:-1]:
+            member.fit(data)
+        self._members[-1].fit(data, logger)
+        self.seconds_per_epoch = sum(member.seconds_per_epoch for member in self._members)
+        self._count()
+
+    def probabilities(self, touches: Touches) -> Tensor:
+        """Return the mean of the members' probabilities, (B, L)."""
+        return torch.stack([member.probabilities(touches) for member in self._members]).mean(dim=0)
+
+    def pipeline(self, positions: Tensor) -> nn.Module:
+        """Return the mean of the members' pipelines."""
+        from skin.learning.classifier import Mean
+
+        return Mean([member.pipeline(positions) for member in self._members])
+
+    def save(self, folder: Path) -> Path:
+        """Write what each member learned to a numbered folder in ``folder/members``; return that."""
+        whole = Path(folder) / "members"
+        for number, member in enumerate(self._members):
+            place = whole / str(number)
+            place.mkdir(parents=True)
+            member.save(place)
+        return whole
+
+    def load(self, data: "TouchData", path: Path) -> None:
+        """Load the folder that :meth:`save` wrote."""
+        for number, member in enumerate(self._members):
+            (file,) = (Path(path) / str(number)).iterdir()
+            member.load(data, file)
+        self._count()
+
+    def _count(self) -> None:
+        self.parameters = sum(member.parameters for member in self._members)

@@ -1,16 +1,147 @@
-"""A model on each frame, then a head over time."""
+"""Fusions: how the embeddings of the frames of a window become one."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from skin.core.settings import checked
-from skin.learning.fusion.base import AbstractFusion, MakeModel
-from skin.learning.model.base import Kind, Reduced, encoder
-from skin.learning.representation.base import Frames
+from skin.errors import InputError
+from skin.learning.model import AbstractModel, Kind, Reduced, encoder
+from skin.learning.representation import Frames
+
+
+class MakeModel(Protocol):
+    """A model without the arguments that the data decide."""
+
+    def __call__(self, kind: Kind, shape: Sequence[int]) -> AbstractModel: ...
+
+
+class AbstractFusion(nn.Module, ABC):
+    """Computes one embedding of a window of frames.
+
+    Built as ``cls(model, kind, shape, window, **options)``: the model without its shapes, the kind of
+    representation, the shape of one frame and the number of frames.
+
+    Attributes:
+        width: E, the width of the embedding.
+    """
+
+    width: int
+
+    @staticmethod
+    def common(adjacency: Tensor | None) -> Tensor | None:
+        """Return the graph that all frames share, (S, S), if there is one.
+
+        Raises:
+            InputError: each frame has its own graph.
+        """
+        if adjacency is not None and adjacency.ndim > 2:
+            raise InputError("one graph per frame needs fusion=late, or representation.positions=layout")
+        return adjacency
+
+    @abstractmethod
+    def forward(self, frames: Frames) -> Tensor:
+        """Return the embeddings (B, E) of windows.
+
+        Raises:
+            InputError: the length of the window does not fit the weights.
+        """
+
+
+# Time as channels.
+
+
+class Early(AbstractFusion):
+    """Stacks the frames as channels of one image or as features of one graph (report, 3.2.2 and 3.2.3).
+
+    It is fast, because the model runs once per window. Each frame has its own weights, so the length of the
+    window is fixed, and the model is not invariant to shifts in time.
+
+    Args:
+        model: without its shapes.
+        kind: kind of representation.
+        shape: of one frame: (C, H, W), (S, F) or (F,).
+        window: number of frames.
+    """
+
+    def __init__(self, model: MakeModel, kind: Kind, shape: Sequence[int], window: int) -> None:
+        super().__init__()
+        stacked = (shape[0], window * shape[1]) if kind == "graph" else (window * shape[0], *shape[1:])
+        self.kind, self.window = kind, window
+        self.model = model(kind, stacked)
+        self.width = self.model.width
+
+    def forward(self, frames: Frames) -> Tensor:
+        """Return the embeddings (B, E) of windows of the length given at construction."""
+        x, adjacency = frames.x, self.common(frames.adjacency)
+        if x.shape[1] != self.window:
+            raise InputError(
+                f"fusion=early is made for windows of {self.window} frames, got {x.shape[1]}: "
+                "train with fusion=late, which takes any length"
+            )
+        stacked = x.transpose(1, 2).flatten(2) if self.kind == "graph" else x.flatten(1, 2)
+        return self.model(stacked, adjacency)
+
+
+# All frames as one graph with edges in time.
+
+
+def link(adjacency: Tensor, window: int) -> Tensor:
+    """Return the normalised adjacency (T S, T S) of a graph that holds one copy of a sensor graph per frame.
+
+    Every sensor has an edge of weight 1 (that of distance 0) to itself in the following frame, directed: row
+    (t, s) gathers from (t - 1, s). Normalised with the rows' sums D as D^-1/2 (A + I) D^-1/2.
+
+    Args:
+        adjacency: (S, S), normalised with self-loops of weight 1.
+        window: T, number of frames.
+    """
+    sensors = len(adjacency)
+    degree = 1 / adjacency.diagonal()  # since the self-loops have weight 1
+    within = adjacency * (degree[:, None] * degree).sqrt()
+    big = torch.block_diag(*[within] * window)
+    later = torch.arange(sensors, window * sensors, device=adjacency.device)
+    big[later, later - sensors] = 1
+    root = big.sum(dim=1).sqrt()
+    return big / (root[:, None] * root)
+
+
+class Linked(AbstractFusion):
+    """Connects each sensor to itself in the following frame and encodes one graph (report, 3.2.1).
+
+    Accepts windows of any length. Information moves one frame per convolution, so a shallow network has a
+    small receptive field in time.
+
+    Args:
+        model: without its shapes.
+        kind: must be ``graph``.
+        shape: of one frame: (S, F).
+        window: number of frames; any other length is accepted too.
+
+    Raises:
+        InputError: not a graph.
+    """
+
+    def __init__(self, model: MakeModel, kind: Kind, shape: Sequence[int], window: int) -> None:
+        super().__init__()
+        if kind != "graph":
+            raise InputError(
+                f"fusion=linked needs representation=graph, got {kind}: add representation=graph model=gcn"
+            )
+        self.model = model(kind, (window * shape[0], shape[1]))
+        self.width = self.model.width
+
+    def forward(self, frames: Frames) -> Tensor:
+        """Return the embeddings (B, E) of windows of any length."""
+        x, adjacency = frames.x, self.common(frames.adjacency)
+        if adjacency is None:
+            raise ValueError("fusion=linked needs a graph, got frames without")
+        return self.model(x.flatten(1, 2), link(adjacency, x.shape[1]))
+
 
 # Heads: modules that reduce a sequence of embeddings to one.
 

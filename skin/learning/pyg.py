@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_geometric.nn.models.basic_gnn import BasicGNN
 
 from skin.errors import InputError
-from skin.learning.model.base import POOLINGS, AbstractModel, Kind, Pooling
+from skin.learning.model import POOLINGS, AbstractModel, Kind, Pooling
 
 
 class Pyg(AbstractModel):

@@ -1,1 +1,0 @@
-"""Sensor layouts: each module is one choice of ``layout=``."""

@@ -1,1 +1,0 @@
-"""Fusion of the frames of a window: each module is one choice of ``fusion=``."""

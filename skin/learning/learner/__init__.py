@@ -1,1 +1,0 @@
-"""What learns from touches: each module is one choice of ``learner=``."""

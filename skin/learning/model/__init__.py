@@ -1,1 +1,0 @@
-"""Encoders of frames: each module is one choice of ``model=``."""

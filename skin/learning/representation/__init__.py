@@ -1,1 +1,0 @@
-"""How readings are shown to a network: each module is one choice of ``representation=``."""

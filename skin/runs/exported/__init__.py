@@ -1,1 +1,0 @@
-"""Trained networks as ONNX files, which need neither torch nor the run."""

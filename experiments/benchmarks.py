@@ -1,4 +1,4 @@
-"""Measure speed and memory.
+"""Measure what docs/results.md publishes of speed and memory.
 
     python -m experiments.benchmarks repeats=3 out=results
     python -m experiments.benchmarks only=live.onnx,wire against=../other
@@ -10,13 +10,11 @@ that checkout, in turns, and ``ratios`` has what this checkout measures over wha
 import json
 import os
 import platform
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -29,7 +27,6 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from skin.body.layout import Random
 from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
 from skin.device.base import AbstractSimulated
@@ -64,11 +61,10 @@ _DEFAULTS = {"repeats": "3", "out": "results", "only": "", "against": ""}
 def benchmarks(repeats: int) -> dict[str, Benchmark]:
     """Return all benchmarks by name."""
     chosen: dict[str, Benchmark] = {}
-    for name in ("naive", "fem", "solid"):
-        chosen[f"generation.{name}"] = ("measure_generation", (name, repeats))
     for name in ("fem", "solid"):
+        chosen[f"generation.{name}"] = ("measure_generation", (name, repeats))
         chosen[f"operator.{name}"] = ("measure_operator", (name, repeats))
-    for row in (*ROWS, "any_skin"):
+    for row in ROWS:
         chosen[f"training.{row}"] = ("measure_training", (row, repeats))
     for row in ("best_fresh", "any_skin"):
         chosen[f"live.{row}"] = ("measure_latency", (row, _FRAMES))
@@ -87,8 +83,12 @@ def main(arguments: Sequence[str]) -> None:
     names = [name for name in settings["only"].split(",") if name] or list(choice)
     if unknown := [name for name in names if name not in choice]:
         raise InputError(f"only={','.join(unknown)} is none of {', '.join(choice)}")
-    about = {"repeats": int(settings["repeats"]), "machine": machine(), "versions": versions(_PACKAGES)}
-    measured: dict[str, Any] = about
+    versions = {name: version(name) for name in _PACKAGES}
+    measured: dict[str, Any] = {
+        "repeats": int(settings["repeats"]),
+        "machine": machine(),
+        "versions": versions,
+    }
     for name in names:
         print(name, file=sys.stderr)
         measured[name] = run_alone(*choice[name])
@@ -162,48 +162,16 @@ def median_seconds(task: Callable[[], object], repeats: int) -> float:
     return median(taken)
 
 
-def peak_memory() -> int:
-    """Return the peak resident memory of this process, bytes.
-
-    On Linux ru_maxrss is inherited from the parent process; VmHWM is that of this process.
-    """
-    status = Path("/proc/self/status")
-    if status.is_file():
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return int(line.split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
-def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions of the installed packages among the given ones."""
-    installed = {}
-    for name in packages:
-        with suppress(PackageNotFoundError):
-            installed[name] = version(name)
-    return installed
-
-
 def machine() -> str:
     """Return a description of the machine."""
-    return f"{platform.machine()}, {os.cpu_count()} cores, {_processor()}"
-
-
-def _processor() -> str:
-    """Return the name of the processor, if known."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+    return f"{platform.machine()}, {os.cpu_count()} cores, {platform.processor() or 'unknown'}"
 
 
 GESTURES = 4038
-_SKINS = 20  # of the 200 of any_skin: a batch mixes skins in the same way
-_SKIN_GESTURES = 8000  # a fifth of those of any_skin
 
 
 def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
-    """Return gestures per second (median), distinct frames per second and peak memory, bytes.
+    """Return gestures per second (median).
 
     The operator is warm; everything else starts from the seed: sampling, redraws, labels, rendering,
     readings, imperfections.
@@ -215,55 +183,31 @@ def measure_generation(simulator: str, repeats: int) -> dict[str, float]:
         began = time.perf_counter()
         device.replace(data_seed=seed).touches("train")
         durations.append(time.perf_counter() - began)
-    speed = GESTURES / median(durations[1:])
-    movie = device.sampler.sample(1024, np.random.default_rng(0))
-    return {
-        "gestures_per_second": speed,
-        "frames_per_second": speed * len(movie.frames) / len(movie),
-        "peak_memory_bytes": peak_memory(),
-    }
+    return {"gestures_per_second": GESTURES / median(durations[1:])}
 
 
 def measure_operator(simulator: str, repeats: int) -> dict[str, float]:
-    """Return the seconds (medians) to build an operator, and the peak memory, bytes.
-
-    ``build_seconds``: of the default skin, with nothing cached. ``layout_seconds``: of a layout that was not
-    seen before, on a body that was.
-    """
+    """Return the seconds (median) to build the operator of the default skin, with nothing cached."""
     config = training_config(f"simulator={simulator}")
     body, make = instantiate(config.body), instantiate(config.simulator)
     sensors = instantiate(config.layout).sensors(body)
-    unseen = iter([Random(seed=seed).sensors(body) for seed in range(repeats + 1)])
 
     def build() -> None:
         with TemporaryDirectory() as empty:
             os.environ["SKIN_CACHE"] = empty
             make(body, sensors)
 
-    build_seconds = median_seconds(build, repeats)
-    with TemporaryDirectory() as warm:
-        os.environ["SKIN_CACHE"] = warm
-        make(body, sensors)
-        layout_seconds = median_seconds(lambda: make(body, next(unseen)), repeats)
-    return {
-        "build_seconds": build_seconds,
-        "layout_seconds": layout_seconds,
-        "peak_memory_bytes": peak_memory(),
-    }
+    return {"build_seconds": median_seconds(build, repeats)}
 
 
 def measure_training(row: str, repeats: int) -> dict[str, float]:
-    """Return the median seconds per epoch of a row, on 4038 finite-element gestures (any_skin: its own)."""
+    """Return the median seconds per epoch of a row, on 4038 finite-element gestures."""
     quiet()
-    settings, share = ["simulator=fem"], 1.0
-    if row == "any_skin":
-        settings = ["simulator=solid", f"device.count={_SKINS}", f"data.gestures={_SKIN_GESTURES}"]
-        share = training_config("experiment=any_skin").data.gestures / _SKIN_GESTURES
-    config = training_config(f"experiment={row}", *settings, f"trainer.max_epochs={repeats + 1}")
+    config = training_config(f"experiment={row}", "simulator=fem", f"trainer.max_epochs={repeats + 1}")
     learner = build_learner(config)
     assert isinstance(learner, Network)
     learner.fit(build_data(config, build_device(config)))
-    return {"seconds_per_epoch": share * learner.seconds_per_epoch}
+    return {"seconds_per_epoch": learner.seconds_per_epoch}
 
 
 RATE = 100.0  # Hz, of the device

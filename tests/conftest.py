@@ -261,8 +261,9 @@ def connected(folder: str) -> TextIO | None:
 
 
 def named(command: str | Path) -> list[str]:
-    """Return what Python is told to run: a verb of ``skin``, or a script, by its name or its path."""
-    return [str(ROOT / "experiments" / command)] if Path(command).suffix else ["-m", "skin", command]
+    """Return what Python is told to run: a script at a path, or a verb of ``skin`` (or ``verb.py``)."""
+    path = Path(command)
+    return [str(path)] if path.is_absolute() else ["-m", "skin", path.stem]
 
 
 def forked(starter: TextIO, job: dict) -> tuple[int, Callable[[], int | None]]:
@@ -286,7 +287,7 @@ def started(job: dict) -> tuple[int, Callable[[], int | None]]:
 
 @pytest.fixture(scope="session")
 def begin(request, tmp_path_factory) -> Callable[..., Command]:
-    """Return a function that starts a verb of ``skin``, or a script of experiments or at a path, in a folder.
+    """Return a function that starts a verb of ``skin``, or a script at a path, in a folder.
 
     The command is a process of its own that shares its imports with others, where there are forks (not on
     Windows) that libraries bear (not on macOS). ``stdin`` is the path of what it reads, such as a terminal.
@@ -309,8 +310,9 @@ def begin(request, tmp_path_factory) -> Callable[..., Command]:
 def run(begin, stores_are_copied) -> Callable[..., subprocess.CompletedProcess]:
     """Return a function that runs a command, named as for ``begin``, in a folder with a store of its own.
 
-    ``store=False`` names no store. A verb of ``skin`` runs in this process; ``apart=True`` gives it a process
-    of its own as ``begin`` does, and ``fresh=True`` one that shares nothing, as where a person starts it.
+    ``store=False`` names no store. A verb of ``skin`` runs in this process; ``apart=True``, or ``.py`` behind
+    it, gives it a process of its own as ``begin`` does, and ``fresh=True`` one that shares nothing, as where
+    a person starts it.
     """
 
     def run(folder, script, *arguments, store=True, apart=False, fresh=False) -> subprocess.CompletedProcess:

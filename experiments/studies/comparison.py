@@ -210,7 +210,7 @@ def combine_verdicts(verdicts: Sequence[str]) -> str:
     return "agree" if verdicts and set(verdicts) == {"agree"} else "undecided"
 
 
-UNITS = {"seconds_per_epoch": "s", "parameters": "", "self_share": "", "same/direction/degrees": "°"}
+UNITS = {"seconds_per_epoch": "s", "parameters": "", "same/direction/degrees": "°"}
 """Metrics that are no shares -> their unit."""
 
 _HEADINGS = {
@@ -218,7 +218,6 @@ _HEADINGS = {
     "same/dangerous/false_alarm_rate": "false alarms",
     "train_accuracy": "training",
     "seconds_per_epoch": "s/epoch",
-    "self_share": "self",
     "same/direction/degrees": "degrees",
     "same/direction/accuracy": "within 45°",
     "device_shift/dangerous/alarm_recall": "its recall",

@@ -23,26 +23,8 @@ if TYPE_CHECKING:
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learning.learner import AbstractLearner
     from skin.runs.model_of_run import RunModel
-    from skin.runs.store import Store
 
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A finished run.
-
-    Attributes:
-        store: where it is.
-        run: as MLflow has it.
-        stored: its configuration.
-        trained: what it learned, and the device that it was trained on.
-    """
-
-    store: "Store"
-    run: "Run"
-    stored: "DictConfig"
-    trained: "RunModel"
 
 
 @dataclass(frozen=True)
@@ -52,43 +34,46 @@ class Subject:
     Attributes:
         config: of the run, with the changes of the condition; that of the command without a run.
         device: as ``config`` describes it.
-        finished: the run; None where a study has none.
+        run: as MLflow has it; None where a study has no runs.
+        model: what the run learned, and the device that it was trained on.
     """
 
     config: "DictConfig"
     device: "AbstractDevice"
-    finished: Finished | None = None
+    run: "Run | None" = None
+    model: "RunModel | None" = None
 
     @property
-    def of(self) -> Finished:
-        """The run.
+    def trained(self) -> "RunModel":
+        """What the run learned.
 
         Raises:
-            InputError: there is none.
+            InputError: there is no run.
         """
-        if self.finished is None:
+        if self.model is None:
             raise InputError("this study needs a finished run: study.run=latest, or study.rows=[features]")
-        return self.finished
+        return self.model
 
     @property
     def title(self) -> str:
         """The name of the run, for pages and figures."""
-        run = self.of.run
+        run = self.run
+        assert run is not None
         # As in the published tables; the id of a run differs between databases.
         return f"{run.info.run_name}, run {run.data.tags.get('fingerprint', run.info.run_id)[:8]}"
 
     @property
     def learner(self) -> "AbstractLearner":
         """What the run learned."""
-        return self.of.trained.learner
+        return self.trained.learner
 
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm on this device."""
         from skin.evaluation.operating_point import OperatingPoint
         from skin.runs.alarm_threshold import alarm_point
 
-        run = self.of.trained.run
-        point = self.of.trained.point if run is None else alarm_point(run, self.learner, self.config)
+        run = self.trained.run
+        point = self.trained.point if run is None else alarm_point(run, self.learner, self.config)
         return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
 
 
@@ -126,7 +111,7 @@ class Accuracy:
         touches = subject.device.touches("test")
         assert touches.labels is not None
         task = subject.device.task
-        point = subject.point() if subject.of.trained.point else None
+        point = subject.point() if subject.trained.point else None
         try:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
@@ -134,20 +119,6 @@ class Accuracy:
         values = compute_metrics(chances, touches.labels, task, point)
         outcomes = encode(chances, touches.labels, task, point)
         return Measurement({f"same/{name}": value for name, value in values.items()}, outcomes=outcomes)
-
-
-@dataclass(frozen=True)
-class SelfShare:
-    """How much of its own row a node of the run's graph is
-    (:func:`skin.learning.graph.self_share`)."""
-
-    def __call__(self, subject: Subject) -> Measurement:
-        from skin.learning.graph import self_share
-        from skin.runs.build import build_data
-
-        data = build_data(subject.config, subject.device)
-        graph = data.representation_for(data.example.positions)
-        return Measurement({"self_share": self_share(graph.adjacency)})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -215,7 +186,7 @@ class Holds:
         from skin.hardware.live.engine import DebounceSettings
         from skin.runs.model_of_run import load_model
 
-        run = subject.of.trained.run
+        run = subject.trained.run
         assert run is not None  # it was loaded
         model = load_model(run, subject.config)
         engine = engine_builder.engine_settings(model, DebounceSettings(), self.touch, self.drift).build()
@@ -259,7 +230,7 @@ class TouchAlarms:
         from skin.touch.labels import TOUCH
         from skin.touch.sampler import balanced
 
-        trained, settings = subject.of.trained, subject.config.evaluation
+        trained, settings = subject.trained, subject.config.evaluation
         device = subject.device.simulated("touches are simulated")
         patience = DebounceSettings().alarm
         aligned = device.rate <= device.model_rate
@@ -322,7 +293,7 @@ class Embeddings(ProbeSettings):
         from experiments.studies.embeddings import build_embeddings_page, probe
         from skin.device.balance import report_balance
 
-        device, learner = subject.device, subject.learner if subject.finished else None
+        device, learner = subject.device, subject.learner if subject.model else None
         report_balance(device)
         count = (len(self.attributes) * 3 + (learner is not None) + 2) * len(self.seeds)
         steps = probe(device, self, learner)

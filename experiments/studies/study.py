@@ -12,7 +12,6 @@ into out=, with the name of the study or the part. A measure of single runs, suc
 each, and of several runs study_<name>.csv with all values. Evaluations are kept in results/trials.
 """
 
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +35,6 @@ from skin.runs.sweep import sweep_jobs
 
 if TYPE_CHECKING:
     from experiments.studies.trials import TrialResult
-    from skin.runs.store import Store
 
 _OWN = ("study", "smoke", "out", "shard")
 _NAMED = ("experiment", "simulator", "row")
@@ -300,49 +298,26 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
     if shard:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
     else:
-        _publish(study, [*trials, *votes(study, trials)], store, config, folder)
+        _publish(study, [*trials, *votes(study, trials)], config, folder)
     return any(run.run is None for run in planned)
 
 
-def _publish(
-    study: Study, trials: Sequence["TrialResult"], store: "Store", config: DictConfig, folder: Path
-) -> None:
-    """Write and print the results of a study, and log their summary."""
+def _publish(study: Study, trials: Sequence["TrialResult"], config: DictConfig, folder: Path) -> None:
+    """Write and print the results of a study."""
     from experiments.studies.study_page import draw_report, publish_files, publish_study
 
     path = folder / f"study_{study.name}"
     if not study.metrics:
-        paths = publish_files(study, trials, path.with_suffix(".csv"))
+        publish_files(study, trials, path.with_suffix(".csv"))
     else:
         smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
         small = study.small if smoke else ()
         title = smoke + ", ".join([f"{study.name}: {study.about}", *small, *settings])
-        paths = publish_study(study, title, trials, path)
-        _log_summary(study, trials, store, paths)
+        publish_study(study, title, trials, path)
     if study.report_figures:
         paths = draw_report(trials, folder)
         print(f"{len(paths)} figures of the report in {folder}")
-
-
-def _log_summary(
-    study: Study, trials: Sequence["TrialResult"], store: "Store", paths: Sequence[Path]
-) -> None:
-    """Log the means and the files of a study in its run in MLflow, the same one each time."""
-    from experiments.studies.comparison import group_trials, values
-
-    earlier = store.find(study=study.name)
-    with store.run(f"study {study.name}", {"study": study.name}, again=next(iter(earlier), None)) as run:
-        means = {}
-        for (variant, condition), group in group_trials(trials).items():
-            for metric in study.metrics:
-                if figures := values(group, metric):
-                    # MLflow takes these characters only.
-                    name = re.sub(r"[^\w\-. :/]", "_", "/".join(filter(None, (variant, condition, metric))))
-                    means[name] = sum(figures.values()) / len(figures)
-        store.log_metrics(run, means)
-        for path in paths:
-            store.client.log_artifact(run.info.run_id, str(path))
 
 
 def _measure_skin(study: Study, folder: Path) -> None:

@@ -230,7 +230,7 @@ def _cell(trials: Sequence[TrialResult], metric: str, reference: Reference | Non
     if not figures:
         return "cannot" if any(metric.startswith(tuple(trial.cannot)) for trial in trials) else ""
     mean, _, margin = mean_and_margin(trials, metric)
-    if metric in ("seconds_per_epoch", "parameters", "self_share"):
+    if metric in ("seconds_per_epoch", "parameters"):
         return f"{mean:.{0 if metric == 'parameters' else 2}f}"
     several = len(figures) > 1 or margin > 0 or by_gesture(trials, metric) is not None
     referred = _referred(trials[0], metric, reference or {})

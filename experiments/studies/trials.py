@@ -28,7 +28,7 @@ from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
-from experiments.studies.measures import Accuracy, Finished, StudyMeasure, Subject
+from experiments.studies.measures import Accuracy, StudyMeasure, Subject
 from experiments.studies.pages import publish_page
 from experiments.studies.study import Study, Variant, as_overrides, passed_overrides, sweeps, variants
 from skin.commands import train
@@ -328,7 +328,7 @@ class RestoredRun:
     """
 
     def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
-        self.store, self.run, self.config = store, run, config
+        self.run, self.config = run, config
         self.finished = FinishedRun(store, run, config.trust)
 
     @cached_property
@@ -359,9 +359,7 @@ class RestoredRun:
 
     def _measured(self, measure: StudyMeasure, config: DictConfig, name: str) -> dict[str, Any]:
         """Measure, and return the row; its files have a name."""
-        subject = Subject(
-            config, build_device(config), Finished(self.store, self.run, self.finished.stored, self.trained)
-        )
+        subject = Subject(config, build_device(config), self.run, self.trained)
         result = measure(subject)
         files: dict[str, bytes] = {}
         if result.page is not None:

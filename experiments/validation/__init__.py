@@ -109,10 +109,10 @@ Results = Sequence[tuple[Law, CheckResult]]
 
 _HEAD = """# Physics, verified
 
-Written by `make physics`. Each law is checked against an independent solution. The
-command exits with code 1 if a law does not hold. The page shows only digits that are the same on every
-processor; rounding errors are shown as an upper bound. `results/physics.json` holds all digits of one
-machine.
+Written by `make physics`, which exits with code 1 if a law does not hold: each is checked against an
+independent solution. Only digits that are the same on every processor are shown; rounding errors are an
+upper bound. `results/physics.json` holds all digits of one machine. `pytest tests/mechanics` checks what
+small examples can show: balance and reciprocity, `fem` against PyNite, relaxation, `naive`, and contact.
 
 | law | reference | numbers | worst error | tolerance | |
 |---|---|---|---|---|---|
@@ -127,17 +127,17 @@ _LIMITS = """
 
 - **Only the linear theory is verified.** Most default gestures strain the skin beyond its range; see
   [limitations](limitations.md).
-- **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Material under a
-  wide object must move sideways. Elements that are as long as the skin is thick restrict this motion, most
-  of all beside the edge of the object: see `mesh` for the default mesh, a finer one and coarser ones.
-  Readings are more accurate, because the layers transmit the applied force. Beside an edge, however, an
-  error of 1 % of the reading under the object can be a large part of a small reading.
-- **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of a
-  half-space. Refining the mesh does not reduce this error.
-- **A sensor at the interface of two layers** interpolates linearly between the stresses above and below. The
-  stress along the layers is discontinuous there; a tilted sensor reads a mean of both sides.
+- **Surface displacements converge slowly where the skin is thin and nearly incompressible.** Elements as
+  long as the skin is thick restrict the sideways motion of material under a wide object, most of all beside
+  its edge (see `mesh`). Readings are more accurate, because the layers transmit the applied force; beside
+  an edge, however, an error of 1 % of the reading under the object can be a large part of a small reading.
+- **The thick block is finite.** It ends at 60 half sides, and its surface moves about 2 % less than that of
+  a half-space, on any mesh.
+- **A sensor at the interface of two layers** interpolates linearly between the stresses above and below.
+  The stress along the layers is discontinuous there; a tilted sensor reads a mean of both sides.
 - **A footprint is defined on the unrolled surface.** Deep in an arm it covers a shorter arc than the sensor
-  (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full area.
+  (10 % less for the default sleeve). The reading is the mean stress on that arc times the sensor's full
+  area.
 - **Contact is solved without friction.** The tangential traction of a sliding touch is added afterwards.
 """
 

@@ -25,6 +25,7 @@ from experiments.validation.references import (
     round_punch,
     row_means,
     solve_block,
+    solve_frame,
     square_punch,
 )
 from skin.body.base import AbstractBody, Arm, Sensors, Sheet
@@ -116,33 +117,27 @@ def even_pressure(quick: bool) -> CheckResult:
     )
 
 
-def global_balance(quick: bool) -> CheckResult:
-    """Check that the reactions of the support balance the applied force and moment."""
+def single_frames(quick: bool) -> CheckResult:
+    """Compare the precomputed operator with a scikit-fem solution of single frames."""
+    body = default_sheet(8 if quick else 12, 0.12)
+    place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
+    mesh, extent = build_mesh(body, 2, {}), 2 * body.cell[0]
+    sensors = Sensors(place[None], (extent, extent))
+    down, above = np.array([[0.0, 0, 1]]), place * [1, 1, 0]
+    rows = [reading_rows(mesh, sensors), mesh.motion(place[None], down), mesh.motion(above[None], down)]
+    along, _, inwards = Elastic(mesh).transfer(sp.vstack(rows).tocsr())
     findings = []
-    for name, body in _bodies(quick):
-        mesh = build_mesh(body, 2, {})
-        cells = np.random.default_rng(0).random(body.cells[0] * body.cells[1])
-        load = sum(share * (mesh.loads(axis) @ cells) for axis, share in enumerate((0.4, -0.3, 1.0)))
-        moved = Elastic(mesh).solve(load[:, None])[:, 0]
-        table = np.where(mesh.held, mesh.stiffness() @ moved, 0)
-        for kind, total in (("force", _force), ("moment", _moment)):
-            applied, answered = total(mesh, load), total(mesh, table)
-            error = np.abs(applied + answered).max() / np.abs(applied).max()
-            ours, reference = (float(np.linalg.norm(value)) for value in (answered, applied))
-            findings.append(Finding(f"{kind}, {name}", ours, reference, float(error), 1e-8))
-    return CheckResult(findings)
-
-
-def reciprocity(quick: bool) -> CheckResult:
-    """Check reciprocity (Maxwell and Betti): two loads do the same work on each other's displacements."""
-    findings = []
-    for name, body in _bodies(quick):
-        mesh = build_mesh(body, 2, {})
-        random = np.random.default_rng(1).random((3, 2, body.cells[0] * body.cells[1]))
-        loads = sum(mesh.loads(axis) @ random[axis].T for axis in range(3))
-        moves = Elastic(mesh).solve(loads)
-        forth, back = loads[:, 0] @ moves[:, 1], loads[:, 1] @ moves[:, 0]
-        findings.append(relative_finding(f"work, J, {name}", forth, back, 1e-8))
+    for seed, shear in ((0, 0.0), (1, 0.5)):
+        pressure = 1e4 * np.random.default_rng(seed).random(body.shape)
+        ours = (inwards + shear * along) @ pressure.ravel()
+        theirs = solve_frame(mesh, pressure, shear, place, extent)
+        for name, number, reference in zip(
+            ("reading, N", "D_s, m", "D_t, m"),
+            ours,
+            (theirs.reading, theirs.sensor, theirs.surface),
+            strict=True,
+        ):
+            findings.append(relative_finding(f"{name}, friction {shear:g}", number, reference, 1e-8))
     return CheckResult(findings)
 
 
@@ -214,19 +209,6 @@ def _sleeve(radius: float, sheet: Sheet) -> Arm:
 def _rows(body: AbstractBody, sensors: Sensors) -> np.ndarray:
     mesh = build_mesh(body, 2, {})
     return Elastic(mesh).transfer(reading_rows(mesh, sensors))
-
-
-def _bodies(quick: bool) -> list[tuple[str, AbstractBody]]:
-    sheet = default_sheet(8 if quick else 16)
-    return [("sheet", sheet), ("arm", _sleeve(0.05, sheet))]
-
-
-def _force(mesh: Hexahedra, load: np.ndarray) -> np.ndarray:
-    return load.reshape(-1, 3).sum(axis=0)
-
-
-def _moment(mesh: Hexahedra, load: np.ndarray) -> np.ndarray:
-    return np.cross(mesh.nodes, load.reshape(-1, 3)).sum(axis=0)
 
 
 def _bent(points: np.ndarray) -> np.ndarray:

@@ -109,14 +109,6 @@ def normalised(edges: np.ndarray) -> np.ndarray:
     return looped / np.outer(root, root)
 
 
-def self_share(adjacency: Tensor) -> float:
-    """Return the mean diagonal entry of a normalised adjacency (..., S, S).
-
-    Close to 1 the graph mixes neighbours little; close to 1 / S it mixes all nodes.
-    """
-    return float(adjacency.diagonal(dim1=-2, dim2=-1).mean())
-
-
 @checked("representation")
 class Graph(AbstractRepresentation):
     """Represents sensors as nodes with edges between neighbours (report, section 2.2).

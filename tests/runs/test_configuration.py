@@ -25,7 +25,6 @@ from tests.damage import DAMAGED_FILES
 
 ROWS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
-TRAIN = ROOT / "experiments" / "train.py"
 with (ROOT / "docs" / "results" / "tuning.csv").open(newline="") as file:
     TRIALS = list(csv.DictReader(file))
 CHOSEN = [trial for trial in TRIALS if trial["chosen"] == "yes"]
@@ -170,8 +169,8 @@ def test_a_changed_layout_file_changes_the_fingerprint(configured, tmp_path):
 
 
 def train(*arguments: str, code: str = "") -> subprocess.CompletedProcess:
-    """Run train.py, or Python code in its place."""
-    command = [sys.executable, "-c", code] if code else [sys.executable, str(TRAIN)]
+    """Run ``skin train``, or Python code in its place."""
+    command = [sys.executable, *(["-c", code] if code else ["-m", "skin", "train"])]
     return subprocess.run(
         [*command, *arguments], capture_output=True, text=True, timeout=120, check=False, cwd=ROOT
     )
@@ -189,16 +188,16 @@ def test_a_mistake_ends_with_code_2_and_says_which(argument, named, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-LIGHT = f"""
-import runpy, sys
-sys.path.insert(0, {str(TRAIN.parent)!r})
+LIGHT = """
+import sys
+from skin.__main__ import main
 try:
-    runpy.run_path({str(TRAIN)!r}, run_name="__main__")
+    main(["train", *sys.argv[1:]])
 except SystemExit as stop:
-    heavy = {{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)
+    heavy = {"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"} & set(sys.modules)
     print("exit", stop.code, *sorted(heavy))
     raise
-print("exit 0", *sorted({{"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"}} & set(sys.modules)))
+print("exit 0", *sorted({"torch", "mlflow", "pytorch_lightning", "numpy", "scipy"} & set(sys.modules)))
 """
 
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 from hydra import initialize_config_dir
 
-from skin.core.files import CONF, ROOT
+from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import Tracking
 from skin.runs.store import Store
@@ -190,7 +190,7 @@ def test_a_sweep_that_trains_nothing_leaves_no_parent(run, tmp_path, given):
 
 
 def test_what_no_job_could_accept_is_refused_once():
-    command = [sys.executable, str(ROOT / "experiments" / "train.py"), "-m", "+typo=1", "seed=0,1"]
+    command = [sys.executable, "-m", "skin", "train", "-m", "+typo=1", "seed=0,1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 2
     assert "typo" in done.stderr

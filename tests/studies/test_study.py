@@ -22,7 +22,7 @@ SHARES = ("0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "whole")
 STREAMS = {f"share/{share}/overall/accuracy" for share in SHARES} | {
     f"gate/{gate}/accuracy" for gate in ("threshold", "learned")
 }
-OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "self_share", "same/any/disagreement"} | STREAMS
+OTHER = {"train_accuracy", "seconds_per_epoch", "parameters", "same/any/disagreement"} | STREAMS
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from skin.learning.graph import (
     adjacency,
     neighbours,
     normalised,
-    self_share,
     typical_distance,
 )
 from skin.learning.model import Gcn
@@ -155,18 +154,6 @@ def test_coordinates_are_the_last_two_features():
     assert x.shape == (2, 4, 3, 4)
     torch.testing.assert_close(x[..., 0], readings / 10)
     torch.testing.assert_close(x[..., 2:], torch.tensor([[0.25, 0.25], [1, 1], [0, 0.5]]).expand(2, 4, 3, 2))
-
-
-def test_share_of_a_row_that_is_the_node_itself():
-    """In the distance-weighted graph of the report's units, metres, a node is mostly itself; by hand else."""
-    two = torch.from_numpy(normalised(np.array([[0.0, 3.0], [3.0, 0.0]])))
-    assert self_share(two) == pytest.approx(1 / 4)
-    assert self_share(torch.eye(5)) == 1
-    places = Scattered(seed=0).sensors(BODY).positions
-    linked = neighbours(places, "knn", 6)
-    metres = adjacency(places, linked, "distance") * typical_distance(places)
-    assert 0.7 < self_share(torch.from_numpy(normalised(metres))) < 0.85
-    assert self_share(torch.from_numpy(normalised(adjacency(places, linked, "exp")))) < 0.45
 
 
 PLACES = torch.from_numpy(Grid(3, 3).sensors(BODY).positions).float()

@@ -6,10 +6,10 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
-from experiments.validation import pynite_model
 from skin.body.base import Sensors, Sheet
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.plates import Structure
+from tests.mechanics import pynite_model
 
 DRAGON = {"material": "Dragon Skin 10 Medium", "thickness": 0.010}
 ECOFLEX = {"material": "EcoFlex 00-30", "thickness": 0.005}

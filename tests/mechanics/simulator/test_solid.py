@@ -6,7 +6,7 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import spsolve
 
-from skin.body.base import Sensors, Sheet
+from skin.body.base import Arm, Sensors, Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator.solid import Elastic, Solid, build_mesh, reading_rows
@@ -16,6 +16,7 @@ LAYERS = [
     {"material": "EcoFlex 00-30", "thickness": 0.005},
 ]
 SHEET = Sheet([0.12, 0.12], [12, 12], LAYERS)
+ARM = Arm(cells=(8, 8), layers=LAYERS, radius=0.05, length=0.16, angle=3.0)
 FOOTPRINT = (0.01, 0.01)
 
 
@@ -55,13 +56,19 @@ def _interpolated(mesh, points, strain):
     return RegularGridInterpolator(mesh.lines, values)(points)[:, 2]
 
 
-def test_the_table_pushes_back():
-    mesh = build_mesh(SHEET, 2, {})
+@pytest.mark.parametrize("body", [SHEET, ARM], ids=["sheet", "arm"])
+def test_the_table_pushes_back(body):
+    """The reactions of the support balance the applied force and its moment."""
+    mesh = build_mesh(body, 2, {})
     for axis in range(3):
-        load = mesh.loads(axis) @ np.random.default_rng(axis).random(144)
+        load = mesh.loads(axis) @ np.random.default_rng(axis).random(body.cells[0] * body.cells[1])
         moved = Elastic(mesh).solve(load[:, None])[:, 0]
-        total = (mesh.stiffness() @ moved)[mesh.held].reshape(-1, 3).sum(axis=0)
-        assert total == pytest.approx(-load.reshape(-1, 3).sum(axis=0), rel=1e-9, abs=1e-15)
+        table = np.where(mesh.held, mesh.stiffness() @ moved, 0).reshape(-1, 3)
+        load = load.reshape(-1, 3)
+        assert table.sum(axis=0) == pytest.approx(-load.sum(axis=0), rel=1e-9, abs=1e-14)
+        applied = np.cross(mesh.nodes, load).sum(axis=0)
+        answered = np.cross(mesh.nodes, table).sum(axis=0)
+        assert np.abs(applied + answered).max() < 1e-8 * np.abs(applied).max()
 
 
 def test_the_operator_is_a_direct_solve():
@@ -75,6 +82,15 @@ def test_the_operator_is_a_direct_solve():
     frame, shear = torch.from_numpy(pressure).reshape(12, 12), torch.tensor([-0.4, 0.0])
     felt = solid(where)(frame, shear).readings.numpy()
     assert felt == pytest.approx(reading_rows(mesh, where) @ moved, rel=2e-6)
+
+
+@pytest.mark.parametrize("body", [SHEET, ARM], ids=["sheet", "arm"])
+def test_two_loads_do_the_same_work_on_the_motion_of_the_other(body):
+    mesh = build_mesh(body, 2, {})
+    random = np.random.default_rng(1).random((3, 2, body.cells[0] * body.cells[1]))
+    loads = sum(mesh.loads(axis) @ random[axis].T for axis in range(3))
+    moves = Elastic(mesh).solve(loads)
+    assert loads[:, 0] @ moves[:, 1] == pytest.approx(loads[:, 1] @ moves[:, 0], rel=1e-8)
 
 
 def test_forces_are_mutual():

@@ -1,5 +1,6 @@
 """What all tests share."""
 
+import gc
 import json
 import logging
 import os
@@ -42,6 +43,10 @@ from skin.device.touches import Touches
 from skin.touch.labels import TOUCH
 from tests.starter import copying
 
+# The imports of all tests make a million objects that live to the end. To search them for garbage again and
+# again takes a third of the collection.
+gc.disable()
+
 CONF = ROOT / "conf"
 PATIENCE = 600  # s: machines are busy at times
 
@@ -55,6 +60,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first: what is left at the end is shared well among the processes."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+def pytest_collection_finish() -> None:
+    """Search for garbage from now on, but only in what tests make."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

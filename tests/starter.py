@@ -39,12 +39,14 @@ WARM = (
 def main() -> None:
     """Run jobs until nobody is connected; returns in every fork, too, which then runs its script."""
     folder = Path(sys.argv[1])
+    gc.disable()
     made = _warm()
     from skin.runs.store import Store
 
     Store.open = copying(lambda: Path(sys.argv[2]))  # type: ignore[method-assign, assignment]
     assert threading.active_count() == 1, "a fork keeps one thread"
     gc.freeze()  # else every fork would copy what it never changes
+    gc.enable()
     server = socket.socket(socket.AF_UNIX)
     server.bind(str(folder / "jobs"))
     server.listen()

@@ -58,8 +58,7 @@ class Gesture:
 class Converter:
     """Converts N to counts.
 
-    The middle of the converter is at 0 N and its ends are at twice the clip, as in
-    skin.hardware.bench.
+    The middle of the converter is at 0 N and its ends are at twice the clip.
 
     Attributes:
         bits: of the converter; None: N are sent.

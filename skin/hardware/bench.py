@@ -394,7 +394,7 @@ def emulate_session(
     generator: np.random.Generator,
     bits: int | None = None,
 ) -> BenchSession:
-    """Simulate a session of a device under the presses of a gauge, in N, or in counts if ``bits`` is given."""
+    """Simulate a session of a device under the presses of a gauge, in N, or in counts of ``bits``."""
     frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
     time = np.arange(frames) / protocol.rate
     true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)

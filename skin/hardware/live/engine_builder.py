@@ -17,7 +17,7 @@ from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT
-from skin.hardware.live.engine import DebounceSettings, Detection, Engine, EngineSettings, sensor_list
+from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings, sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
@@ -71,7 +71,11 @@ class SelfTest:
         # A place without a valid sensor is shown as unknown, which hides nothing, unless there are many.
         valid = ~conversion.broken[self._sensors]
         missed = np.unique(self._sensors[expected & ~raised & valid])
-        say(self._report(raised, expected, device))
+        text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm, "
+        text += f"{expected.sum()} with nominal settings"
+        if not raised.all():
+            text += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
+        say(text if device.known else f"{text}; the device declares no range, so its scale is not checked")
         few = raised[valid].sum() < _SHARE * expected[valid].sum()
         if not expected.any() or len(missed) or few or conversion.broken.mean() > _MASKED:
             raise InputError(self._refusal(raised, expected, missed, conversion, device))
@@ -100,17 +104,12 @@ class SelfTest:
             frames = list(_frames(number, rise, STRENGTH * self.presses[sensor], conversion, device))
             settling = round(_REST * _RATE)
             engine.push(frames[:settling], None)  # nothing to decide yet
-            raised.append(_alarms(engine, frames[settling:], conversion))
+            pieces = (frames[first : first + _PIECE] for first in range(settling, len(frames), _PIECE))
+            # The frames behind the alarm are left out.
+            raised.append(
+                any(verdict.dangerous for piece in pieces for verdict in engine.push(piece, conversion))
+            )
         return np.array(raised)
-
-    def _report(self, raised: np.ndarray, expected: np.ndarray, device: RawRange) -> str:
-        text = (
-            f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm, "
-            f"{expected.sum()} with nominal settings"
-        )
-        if not raised.all():
-            text += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
-        return text if device.known else f"{text}; the device declares no range, so its scale is not checked"
 
     def _refusal(
         self,
@@ -158,12 +157,6 @@ class SelfTest:
 def nominal_conversion(sensors: int) -> UnitConversion:
     """Return the conversion of a device that sends N."""
     return UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
-
-
-def _alarms(engine: Engine, frames: Sequence[Frame], conversion: UnitConversion) -> bool:
-    """Return whether frames raise the alarm; those behind it are left out."""
-    pieces = (frames[first : first + _PIECE] for first in range(0, len(frames), _PIECE))
-    return any(verdict.dangerous for piece in pieces for verdict in engine.push(piece, conversion))
 
 
 def _frames(

@@ -359,17 +359,13 @@ class Decoder:
                 raise FrameError("structure")
             return self._place_frame(raw, now)
         except FrameError as bad:
-            self._count_bad(bad)
+            if self._synchronous or self._missing:
+                self._synchronous, self._latest_bad = False, bad
+                self._missing += 1
+                self.stats.bad[bad.reason] += 1
+            else:
+                self.stats.skipped += 1
             return None
-
-    def _count_bad(self, bad: FrameError) -> None:
-        if not self._synchronous and not self._missing:
-            self.stats.skipped += 1
-            return
-        self._synchronous = False
-        self._missing += 1
-        self.stats.bad[bad.reason] += 1
-        self._latest_bad = bad
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         t_us = raw.t_us

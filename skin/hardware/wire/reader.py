@@ -149,20 +149,15 @@ def check_port(port: str) -> None:
         InputError: there is no such device, or nothing on this machine listens at the address.
     """
     if port.startswith("socket://"):
-        _check_address(*_address(port), port)
-    elif os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
+        try:
+            *kind, _, address = socket.getaddrinfo(*_address(port), type=socket.SOCK_STREAM)[0]
+            with socket.socket(*kind) as probe:
+                probe.bind(address)  # an address of this machine that could be taken
+        except OSError:
+            return  # something listens, or it is another machine
+        raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
+    if os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
         raise InputError(f"no port {port}: {_existing()}")
-
-
-def _check_address(host: str, number: int, port: str) -> None:
-    """Refuse an address of this machine at which nothing listens: one that could be taken."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.bind(address)
-    except OSError:
-        return  # something listens, or it is another machine
-    raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
 
 
 class _Serial:
@@ -313,11 +308,21 @@ class WireFeed:
         frames = self._decoder.feed(data, now) if data else []
         if frames:
             self._prepare()
-            self._check_clock(frames, now)
+            if frames[-1].t != self._clock:
+                self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
+            self._clock_frames += len(frames)
+            least, few = _STILL
+            if now - self._clock_since >= least and self._clock_frames >= few:
+                raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
         elif data and (error := self._decoder.error()):
             raise error
+        stats = self._decoder.stats
         if now - self._reported_at >= 1:
-            self._report(now)
+            fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
+            if fresh:
+                reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
+                trouble = f"; {stats.trouble}" if stats.trouble else ""
+                _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
         return [self._judge(frame) for frame in frames]
 
     def states(self) -> tuple[ChannelState, ...]:
@@ -338,15 +343,6 @@ class WireFeed:
             self._health.largest = 2**header.bits - 1
             self._health.limits = self._limits or (None, self._health.largest)
 
-    def _check_clock(self, frames: list[Frame], now: float) -> None:
-        """Raise InputError if frames arrive but the device's clock stands still."""
-        if frames[-1].t != self._clock:
-            self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
-        self._clock_frames += len(frames)
-        least, few = _STILL
-        if now - self._clock_since >= least and self._clock_frames >= few:
-            raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
-
     def _judge(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
             self._health.restart()
@@ -354,14 +350,6 @@ class WireFeed:
         if frame.saturated is not None:
             saturated = saturated | frame.saturated
         return frame._replace(valid=valid & frame.valid, saturated=saturated & frame.valid)
-
-    def _report(self, now: float) -> None:
-        stats = self._decoder.stats
-        fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
-        if fresh:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
-            trouble = f"; {stats.trouble}" if stats.trouble else ""
-            _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
 
 
 class PlaybackFeed:

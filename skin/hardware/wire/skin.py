@@ -12,7 +12,7 @@ from functools import partial
 from math import inf
 from threading import Condition, Event, Thread
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,6 +45,7 @@ from skin.hardware.wire.reader import (
 from skin.hardware.wire.segmentation import AnnouncementListener
 
 if TYPE_CHECKING:
+    from skin.device.base import AbstractDevice
     from skin.device.touches import Touches
 
 
@@ -278,19 +279,12 @@ _KEPT = 10_000  # frames for the statistics of channels
 _SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
 
 
-class Playable(Protocol):
-    """A device that can be played, such as :class:`skin.device.simulated.Simulated`."""
-
-    def strips(self) -> "Iterable[Touches]":
-        """Yield touches in N in their order, each of which is a piece of a stream."""
-
-
 def open_skin(
     port: str | PortSettings,
     layout: Sized | None = None,
     *,
     opener: Callable[[], ByteStream] | None = None,
-    device: Playable | None = None,
+    device: "AbstractDevice | None" = None,
     baseline: np.ndarray | None = None,
     channels: Sequence[int] = (),
     polarity: Sequence[int] = (),
@@ -412,7 +406,9 @@ class PortMonitor:
         states = self._skin.channels or ("ok",) * values.shape[1]
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
-        lines = [f"header: {self._header()}", "channel     least    median   largest     noise"]
+        header = self._skin.header
+        words = "none" if header is None else encode_header(header, "none").decode()[len("# skin ") :].strip()
+        lines = [f"header: {words}", "channel     least    median   largest     noise"]
         for channel, (row, state, share) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
             middle = np.median(row)
             noise = _SPREAD * np.median(np.abs(row - middle))
@@ -420,12 +416,6 @@ class PortMonitor:
             numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
             lines.append(f"{numbers}  {text}")
         return "\n".join(lines)
-
-    def _header(self) -> str:
-        header = self._skin.header
-        if header is None:
-            return "none"
-        return encode_header(header, "none").decode().removeprefix("# skin ").strip()
 
 
 _LEAST = 1.0  # s over which the rate is measured

@@ -293,7 +293,7 @@ def watch_exported(
     source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
-    return watch(model, source, live, say, lambda: source)
+    return Watched(model, source, *used_and_nominal(model, source, live, say))
 
 
 def watch_run(
@@ -343,12 +343,11 @@ def watch_run(
     touch = None if "simulator" in run.stored.device else live.touch
     model = load_model(run, trained, watched, touch=touch, alarm=False)
 
-    def begin() -> Source:
-        source = open_source(device)
-        opened.enter_context(source.skin)
-        return source
-
-    return watch(model, port, live, say, begin)
+    settings = used_and_nominal(model, port, live, say)
+    if port is None:
+        port = open_source(device)
+        opened.enter_context(port.skin)
+    return Watched(model, port, *settings)
 
 
 def engine_settings(
@@ -389,21 +388,16 @@ def engine_settings(
     )
 
 
-def watch(
-    model: TrainedModel,
-    port: Source | None,
-    live: LiveSettings,
-    say: Callable[[str], None],
-    begin: Callable[[], Source],
-) -> Watched:
-    """Return a model and a skin with the settings of a live view.
+def used_and_nominal(
+    model: TrainedModel, port: Source | None, live: LiveSettings, say: Callable[[str], None]
+) -> tuple[EngineSettings, EngineSettings]:
+    """Return the settings of an engine: those of a live view, and those that the model brings.
 
     Args:
         model: that predicts.
         port: open source of a skin at a port; None: the skin is simulated or recorded.
         live: settings of the live view.
         say: called with each message for the user.
-        begin: opens the source of a skin that is simulated or recorded.
 
     Raises:
         InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
@@ -419,14 +413,8 @@ def watch(
     else:
         usual = None
     nominal = engine_settings(model, DebounceSettings(above=usual))
-    detection = replace(
-        nominal.detection,
-        threshold=nominal.detection.threshold if live.touch is None else live.touch,
-        drift=live.drift / 600,
-        learned=nominal.detection.learned and live.touch is None,
-    )
-    used = replace(nominal, detection=detection, patience=replace(live.patience, above=above))
-    return Watched(model, port or begin(), used, nominal)
+    used = engine_settings(model, nominal.patience, live.touch, live.drift)
+    return replace(used, patience=replace(live.patience, above=above)), nominal
 
 
 def measured_rate(skin: Skin) -> float:

@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -402,12 +401,6 @@ def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Cali
         shares.append(estimate_force(raw[mine], bench.each[number], calibration) / late_force[mine])
     finite = [ratios[np.isfinite(ratios)] for ratios in shares]
     return np.array([np.median(ratios) for ratios in finite if len(ratios)])
-
-
-def summarise_held_out(outcome: HeldOutErrors) -> dict[str, Any]:
-    """Return the rounded errors on held-out presses, for the calibration file."""
-    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
-    return {"held_out": list(outcome.held_out), "rmse": rmse}
 
 
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:

@@ -42,12 +42,6 @@ class RawRange:
         """Whether the scale can be checked: too large or too small a force would leave the range."""
         return self.most is not None
 
-    def rounded(self, values: np.ndarray) -> np.ndarray:
-        """Return values as the device would send them."""
-        least = -np.inf if self.least is None else self.least
-        most = np.inf if self.most is None else self.most
-        return np.clip(np.round(values) if self.whole else values, least, most)
-
 
 class ChannelHealth:
     """Checks channels frame by frame.

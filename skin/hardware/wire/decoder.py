@@ -10,7 +10,6 @@ import numpy as np
 from skin.device.resampling import After, Frame, FrameError
 from skin.errors import InputError
 from skin.hardware.wire.protocol import (
-    DetectionResult,
     Format,
     FrameFormat,
     Header,
@@ -279,7 +278,7 @@ class Decoder:
         self.frame_format: FrameFormat | None = None
         self.stats.format = self.stats.check = ""
         self._buffer = b""
-        self._found = DetectionResult(None, None, None)
+        self._count_seen: int | None = None
         self._receiving, self._fed_at = 0.0, float("nan")
         self._whole = self._overlong = self._synchronous = False
         self._missing = 0
@@ -317,7 +316,7 @@ class Decoder:
         """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None."""
         if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
             return None
-        return detection_error(self._buffer, self._found, self.sensors)
+        return detection_error(self._buffer, self._count_seen, self.sensors)
 
     @property
     def _enough(self) -> int:
@@ -331,11 +330,10 @@ class Decoder:
         self._fed_at = now
         if b"\n" not in data and b"\0" not in data:
             return False
-        self._found = detect_format(self._buffer, self.sensors, self.format)
-        self.frame_format = self._found.frame_format
+        self.frame_format, self._count_seen, header = detect_format(self._buffer, self.sensors, self.format)
         if self.frame_format is None:
             return False
-        self.header = self._found.header or self.header
+        self.header = header or self.header
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
         self._all_valid = np.ones(self.sensors, dtype=bool)

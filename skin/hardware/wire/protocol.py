@@ -431,23 +431,13 @@ FrameFormat = TextFormat | BinaryFormat
 """A detected format: S ``sensors``, the ``delimiter`` at the end of a frame and the kind of its ``check``."""
 
 
-@dataclass(frozen=True)
-class DetectionResult:
-    """Result of :func:`detect_format`.
+def detect_format(
+    data: bytes, sensors: int | None, format: Format
+) -> tuple[FrameFormat | None, int | None, Header | None]:
+    """Return the format of the first bytes of a connection; None if it is not known yet.
 
-    Attributes:
-        frame_format: the format, or None if it is not known yet.
-        sensors: number of values in readable frames that do not match the layout; or None.
-        header: the last one received.
-    """
-
-    frame_format: FrameFormat | None
-    sensors: int | None
-    header: Header | None
-
-
-def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectionResult:
-    """Detect the format from the first bytes of a connection.
+    Second, the number of values in readable frames that do not match the layout; or None. Third, the last
+    header received.
 
     Args:
         data: from the first byte on; an incomplete piece at the end is ignored.
@@ -462,22 +452,22 @@ def detect_format(data: bytes, sensors: int | None, format: Format) -> Detection
                 counts.append(len(decode_frame(piece).values))
         for count in counts:
             if counts.count(count) >= _FRAMES and sensors in (None, count):
-                return DetectionResult(BinaryFormat(count), None, None)
+                return BinaryFormat(count), None, None
             count_seen = count
     if format == "binary":
-        return DetectionResult(None, count_seen, None)
+        return None, count_seen, None
     return _detect_text(data, sensors, count_seen)
 
 
-def detection_error(data: bytes, result: DetectionResult, sensors: int | None) -> InputError:
+def detection_error(data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
     """Return the error for data in which no format was detected."""
     # The first piece may be half a line.
     run = [line for piece in data.split(b"\n")[1:-1] if (line := _parse_numbers(piece))]
     if _has_constant_time(run := [line for line in run if len(line.fields) > 2]):
         return stopped_clock_error(len(run), run[0].fields[1])
-    if result.sensors is not None and sensors is not None:
+    if count_seen is not None and sensors is not None:
         return InputError(
-            f"the device sends {result.sensors} values per frame, the layout has {sensors} sensors: give its "
+            f"the device sends {count_seen} values per frame, the layout has {sensors} sensors: give its "
             "own layout, as in layout=file layout.path=FILE.csv"
         )
     return InputError(
@@ -512,7 +502,9 @@ def _has_constant_time(run: Sequence[Line]) -> bool:
     return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
 
 
-def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectionResult:
+def _detect_text(
+    data: bytes, sensors: int | None, count_seen: int | None
+) -> tuple[FrameFormat | None, int | None, Header | None]:
     header, run = None, list[Line]()
     for piece in data.split(b"\n")[:-1]:
         line = piece.removesuffix(b"\r")
@@ -527,11 +519,10 @@ def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> De
         run = [*run[1 - _LINES_UNKNOWN :], read]
         expected = sensors or (header.n if header else None)
         if frame_format := _judge(run, expected, learn=sensors is None):
-            detected = replace(frame_format, trailing=ends_with_separator(line))
-            return DetectionResult(detected, None, header)
+            return replace(frame_format, trailing=ends_with_separator(line)), None, header
         if len(run) >= _LINES:
             count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
-    return DetectionResult(None, count_seen, header)
+    return None, count_seen, header
 
 
 def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:

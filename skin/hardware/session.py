@@ -221,8 +221,7 @@ class _Reading:
             raise ValueError(f"{len(row)} values, {self._sensors} sensors")
         if not isfinite(float(t)) or not np.isfinite(row).all() or "_" in text:
             raise ValueError("no number")
-        valid, saturated = (np.zeros(len(row), dtype=bool) for _ in range(2))
-        valid[:] = True
+        valid, saturated = np.ones(len(row), dtype=bool), np.zeros(len(row), dtype=bool)
         valid[self._marked["invalid"]] = False
         saturated[self._marked["saturated"]] = True
         if self._limit is not None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from math import isfinite
 from pathlib import Path
-from queue import Empty, Full, Queue
+from queue import Empty, Queue
 from threading import Event, Lock, Thread
 from time import monotonic
 from typing import Any, Literal, TextIO
@@ -403,11 +403,9 @@ class VerdictStream:
         with self._lock:
             if monotonic() - self._sent < HEARTBEAT:
                 return
-            verdict, reason, alarm = self._state
+            verdict = self._state[0]
             if verdict is not None and monotonic() - self._seen >= HEARTBEAT:
                 self._state = None, "no frames", verdict.dangerous
-            elif verdict is None:
-                self._state = None, reason, alarm
             self._send("heartbeat")
 
     def _send(self, event: str) -> None:
@@ -415,12 +413,7 @@ class VerdictStream:
         message = {"number": self._number, "event": event, **verdict_message(*self._state)}
         line = (json_line(message) + "\n").encode()
         for lines in self._readers:
-            try:
-                lines.put_nowait(line)
-            except Full:
-                with suppress(Empty):
-                    lines.get_nowait()
-                lines.put_nowait(line)
+            _put(lines, line)
 
     def join(self, write: Callable[[bytes], object], left: Callable[[], object]) -> Thread:
         """Write the lines from now on in a thread; call ``left`` when they cannot be written any more."""
@@ -444,10 +437,15 @@ class VerdictStream:
         """End every thread."""
         with self._lock:
             for lines in self._readers:
-                with suppress(Full, Empty):
-                    if lines.full():
-                        lines.get_nowait()
-                    lines.put_nowait(None)
+                _put(lines, None)
+
+
+def _put(lines: Lines, line: bytes | None) -> None:
+    """Put a line into a queue to which no other thread adds; a full one drops its oldest line."""
+    if lines.full():
+        with suppress(Empty):
+            lines.get_nowait()
+    lines.put_nowait(line)
 
 
 @contextmanager

@@ -268,7 +268,6 @@ class Decoder:
         self._latest_bad = FrameError("")
         self.header: Header | None = None
         self._order, self._clock, self._counted = SequenceTracker(), HostClock(), FrameClock()
-        self._all_valid = np.ones(sensors or 0, dtype=bool)
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None

@@ -38,7 +38,6 @@ def main(config: DictConfig) -> None:
         evaluate_held_out,
         fit_calibration,
         print_calibration,
-        summarise_held_out,
     )
     from skin.hardware.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.runs.build import build_device
@@ -63,7 +62,8 @@ def main(config: DictConfig) -> None:
             "body or the clock wrong?"
         )
         sys.exit(1)
-    about = {**calibration.about, **summarise_held_out(outcome)}
+    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
+    about = dict(calibration.about) | {"held_out": list(outcome.held_out), "rmse": rmse}
     about |= {"session": config.session, "presses_file": config.presses}
     channels = device_channels(session, confirmed)
     print(write_calibration(replace(calibration, about=about, channels=channels), config.out))

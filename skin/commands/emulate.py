@@ -7,7 +7,6 @@ Prints the settings that connect to it, then sends gestures until Ctrl-C.
 
 import signal
 from contextlib import suppress
-from types import FrameType
 
 from omegaconf import DictConfig
 
@@ -32,7 +31,7 @@ def main(config: DictConfig) -> None:
     settings = configured(EmulatorSettings, groups["emulate"], "emulate")
     faults = configured(Faults, groups["faults"], "faults")
     device = build_device(config).simulated("only simulated gestures can be emulated")
-    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     port = open_port(config.port, config.link)
     try:
         emulator = Emulator(device, port, settings, faults, config.format == "binary", _notify)
@@ -45,10 +44,6 @@ def main(config: DictConfig) -> None:
         print(f"{emulator.frames} frames")
     finally:
         port.unplug()
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _notify(t: float, text: str) -> None:

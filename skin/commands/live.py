@@ -94,49 +94,40 @@ def show(config: DictConfig, changes: Sequence[str], own_mechanics: bool = False
         changes: settings that replace those of the run, as overrides; ``config`` has their values.
         own_mechanics: the skin at the port is emulated with the simulator of the run.
     """
-    from skin.hardware.live.engine_builder import LiveSettings
-
-    live = LiveSettings.of(plain(config)["live"])
-    try:
-        _watch(config, live, changes, own_mechanics)
-    except KeyboardInterrupt:
-        print("ended", file=sys.stderr)
-
-
-def _watch(config: DictConfig, live: "LiveSettings", changes: Sequence[str], own_mechanics: bool) -> None:
     from rich.console import Console
 
     from skin.core.interrupt import ends_on_signal
+    from skin.core.messages import quiet
+    from skin.hardware.live.engine_builder import LiveSettings, watch_exported, watch_run
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
+    from skin.runs.exported_model import check_overrides
 
-    messages = Console(stderr=True, highlight=False)
-    if str(config.run).endswith(".onnx"):
-        from skin.hardware.live.engine_builder import watch_exported
-        from skin.runs.exported_model import check_overrides
-
+    live = LiveSettings.of(plain(config)["live"])
+    say = Console(stderr=True, highlight=False).print
+    exported = str(config.run).endswith(".onnx")
+    if exported:
         check_overrides(config.run, config, changes)
-        device = plain(config)["device"]
-        watch = partial(watch_exported, config.run, device, live, messages.print)
     else:
-        from skin.core.messages import quiet
-        from skin.hardware.live.engine_builder import watch_run
-
         quiet()
-        watch = partial(watch_run, config, live, messages.print, changes, own_mechanics=own_mechanics)
-    with ExitStack() as open_:
-        open_.enter_context(ends_on_signal())
-        watched = watch(opened=open_)
-        source = watched.source
-        model = watched.model
-        display = Display(
-            DisplayInfo(model.title, source.name, model.positions, model.size, live.top, watched.span)
-        )
-        for text in _views(display, config, live, open_):
-            messages.print(text)
-        before = partial(watched.check, live.selftest, messages.print)
-        session = LiveLoop(source.skin, source.tare, watched.settings.build(), display, before)
-        open_.callback(lambda: messages.print(f"{session.verdicts} verdicts, {session.line}"))
-        session.run(config.seconds)
+    try:
+        with ExitStack() as opened:
+            opened.enter_context(ends_on_signal())
+            if exported:
+                watched = watch_exported(config.run, plain(config)["device"], live, say, opened)
+            else:
+                watched = watch_run(config, live, say, changes, opened, own_mechanics)
+            source, model = watched.source, watched.model
+            display = Display(
+                DisplayInfo(model.title, source.name, model.positions, model.size, live.top, watched.span)
+            )
+            for text in _views(display, config, live, opened):
+                say(text)
+            before = partial(watched.check, live.selftest, say)
+            session = LiveLoop(source.skin, source.tare, watched.settings.build(), display, before)
+            opened.callback(lambda: say(f"{session.verdicts} verdicts, {session.line}"))
+            session.run(config.seconds)
+    except KeyboardInterrupt:
+        print("ended", file=sys.stderr)
 
 
 def _views(display: "Display", config: DictConfig, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:

@@ -26,11 +26,11 @@ def main(config: DictConfig) -> None:
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
     from skin.hardware.recorder import convert_session, record_session
-    from skin.hardware.serial import AbstractWired
+    from skin.hardware.serial import Serial
     from skin.runs.build import build_device
 
     device = build_device(config)
-    if not isinstance(device, AbstractWired):
+    if not isinstance(device, Serial):
         raise InputError("only a skin at a port can be recorded: leave out device=")
     path = Path(config.out).expanduser()
     if not settings["finish"]:

@@ -21,6 +21,7 @@ from skin.core.files import tabular, whole, write
 from skin.core.settings import checked, configured
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
+from skin.hardware.emulator import Converter
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.shapes import Shapes
 
@@ -82,22 +83,6 @@ def _rows(path: Path) -> bytes:
             _log.warning("%s: %d damaged lines skipped, the first is line %d", path, len(damaged), damaged[0])
         rows = [rows[0], *good]
     return b"".join(line + b"\n" for _, line in rows)
-
-
-def save_table(columns: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> Path:
-    """Write a table and its metadata atomically, in the format of :func:`load_table`.
-
-    Raises:
-        InputError: another ending, or the file cannot be written.
-    """
-    path, table = tabular(path, "a session"), pa.table(dict(columns))
-    with whole(path) as partial:
-        if path.suffix == ".parquet":
-            pa.parquet.write_table(table.replace_schema_metadata({_KEY: json.dumps(dict(about))}), partial)
-        else:
-            pa.csv.write_csv(table, partial)
-            write(json.dumps(dict(about)) + "\n", path.with_name(path.name + ".json"))
-    return path
 
 
 def numbers(table: pa.Table, name: str, where: str) -> np.ndarray:
@@ -205,6 +190,7 @@ def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, 
     )
 
 
+@torch.no_grad()
 def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -> np.ndarray:
     """Return the true readings of every sensor per N of each press, (P, S).
 
@@ -223,29 +209,14 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
         )
     if not (radius > 0).all():
         raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
-    return (
-        torch.cat(_press_once(simulator, body, gauge.indenter[rows], place, radius, angle)).double().numpy()
-    )
-
-
-@torch.no_grad()
-def _press_once(
-    simulator: AbstractSimulator,
-    body: AbstractBody,
-    indenter: Sequence[str] | np.ndarray,
-    place: np.ndarray,
-    radius: np.ndarray,
-    angle: np.ndarray,
-) -> list[torch.Tensor]:
-    names = sorted(set(indenter))
-    shapes = Shapes(names, body)
-    kind = np.array([names.index(name) for name in indenter])
+    names, kind = np.unique(gauge.indenter[rows], return_inverse=True)
+    shapes = Shapes(names.tolist(), body)
     # The image has a black border, so its outline is smaller than its texture.
     reach = np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
-    scale = radius / reach[kind]
-    area = float(np.prod(body.cell))
-    rows = (slice(n, n + 1) for n in range(len(kind)))
-    return [simulator(shapes.render(kind[n], angle[n], scale[n], place[n]) / area).readings for n in rows]
+    scale, area = radius / reach[kind], float(np.prod(body.cell))
+    pieces = [slice(number, number + 1) for number in range(len(kind))]
+    images = (shapes.render(kind[n], angle[n], scale[n], place[n]) / area for n in pieces)
+    return torch.cat([simulator(image).readings for image in images]).double().numpy()
 
 
 @checked("session")
@@ -327,37 +298,29 @@ def read_bench_session(
 
 
 def write_bench_session(session: BenchSession, path: str | Path) -> Path:
-    """Write a session with its gauge atomically; readings have single precision.
+    """Write a session with its gauge atomically, as :func:`load_table` reads it; single precision.
 
     Raises:
         InputError: another ending than .csv or .parquet, or the file cannot be written.
     """
-    digits = max(2, len(str(session.raw.shape[1] - 1)))
-    columns = {"time": session.time}
+    path, digits = tabular(path, "a session"), max(2, len(str(session.raw.shape[1] - 1)))
     counts = session.unit == "adc" and np.isfinite(session.raw).all()
-    for number, values in enumerate(session.raw.T):
-        columns[f"raw_{number:0{digits}d}"] = values.astype(np.int32 if counts else np.float32)
-    about = {"unit": session.unit, "bits": session.bits}
-    return save_table(columns | _gauge_columns(session), about, path)
-
-
-def _gauge_columns(session: BenchSession) -> dict[str, np.ndarray]:
-    """Return the gauge's columns at the session's times, masked outside of presses."""
-    if session.gauge is None:
-        return {}
-    gauge = session.gauge
-    force, press = gauge.at(session.time)
-    row = gauge.first[np.maximum(press, 0)]
-    columns = {
-        "force": force,
-        "x_m": gauge.place[row, 0],
-        "y_m": gauge.place[row, 1],
-        "indenter": gauge.indenter[row],
-        "radius_m": gauge.radius[row],
-        "angle": gauge.angle[row],
-        "press": press,
-    }
-    return {name: np.ma.masked_array(values, press < 0) for name, values in columns.items()}
+    raw = session.raw.T.astype(np.int32 if counts else np.float32)
+    columns = {"time": session.time} | {f"raw_{n:0{digits}d}": values for n, values in enumerate(raw)}
+    if (gauge := session.gauge) is not None:
+        force, press = gauge.at(session.time)
+        row = gauge.first[np.maximum(press, 0)]
+        place, shape = gauge.place[row].T, (gauge.indenter[row], gauge.radius[row], gauge.angle[row])
+        values = zip(GAUGE, (force, *place, *shape, press), strict=True)
+        columns |= {name: np.ma.masked_array(column, press < 0) for name, column in values}
+    table, about = pa.table(columns), json.dumps({"unit": session.unit, "bits": session.bits})
+    with whole(path) as partial:
+        if path.suffix == ".parquet":
+            pa.parquet.write_table(table.replace_schema_metadata({_KEY: about}), partial)
+        else:
+            pa.csv.write_csv(table, partial)
+            write(about + "\n", path.with_name(path.name + ".json"))
+    return path
 
 
 _LEAD, _TAIL = 0.2, 1.0  # s around a press that are not idle
@@ -431,21 +394,15 @@ def emulate_session(
     generator: np.random.Generator,
     bits: int | None = None,
 ) -> BenchSession:
-    """Simulate a session of a device under the presses of a gauge, in N, or in counts if ``bits`` is given.
-
-    The middle of the converter is at 0 N and its ends are at twice the device's clip.
-    """
+    """Simulate a session of a device under the presses of a gauge, in N, or in counts of ``bits``."""
     frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
     time = np.arange(frames) / protocol.rate
     true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
     measured = device.imperfection.raw(
         torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
     )[0].numpy()
-    if bits is None:
-        return BenchSession(time, measured.astype(float), "N", gauge)
-    middle = 2 ** (bits - 1)
-    counts = np.clip(np.round(middle + measured * middle / (2 * device.imperfection.clip)), 0, 2**bits - 1)
-    return BenchSession(time, counts, "adc", gauge, bits)
+    values = Converter(bits, device.imperfection.clip)(measured)
+    return BenchSession(time, values, "N" if bits is None else "adc", gauge, bits)
 
 
 def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -278,7 +277,10 @@ def _convert_to_newton(bench: BenchData, channels: list[_Channel], scale: float)
         kind: [n for n, channel in enumerate(channels) if channel.broken == kind]
         for kind in ("dead", "stuck", "saturated")
     }
-    ranges = _find_ranges(sensors, alive)
+    ranges: dict[str, list[float]] = {"dead": [0, alive.count(False)]}
+    for name, values in sensors.items():
+        working = [value for value, live in zip(values, alive, strict=True) if live and value is not None]
+        ranges |= {name: [min(working), max(working)]} if working else {}
     error = 2 * scale * float(np.median([channel.error for channel in channels if channel.gain]))
     ranges["gain"] = [max(ranges["gain"][0] - error, 0.0), ranges["gain"][1] + error]
     about = {"unit": bench.session.unit, "presses": len(bench.gauge), "frames": len(bench.session.time)}
@@ -289,15 +291,6 @@ def _convert_to_newton(bench: BenchData, channels: list[_Channel], scale: float)
 
 def _round(value: float | None, scale: float = 1.0) -> float | None:
     return None if value is None else float(f"{value * scale:.6g}") + 0.0  # no negative 0
-
-
-def _find_ranges(sensors: dict[str, list[float | None]], alive: list[bool]) -> dict[str, list[float]]:
-    """Return the least and the largest of every quantity among sensors that live, and how many do not."""
-    ranges: dict[str, list[float]] = {"dead": [0, alive.count(False)]}
-    for name, values in sensors.items():
-        working = [value for value, live in zip(values, alive, strict=True) if live and value is not None]
-        ranges |= {name: [min(working), max(working)]} if working else {}
-    return ranges
 
 
 @dataclass(frozen=True)
@@ -325,28 +318,23 @@ class HeldOutErrors:
         return self.calibrated < min(self.simulated, self.tared)
 
 
-def hold_out(bench: BenchData, share: float) -> list[int]:
-    """Return the held-out presses: a share of all, each with an earlier press at the same strongest sensor.
-
-    Raises:
-        InputError: no sensor has two presses.
-    """
-    strongest = bench.each.argmax(axis=1)
-    spare = [n for n in range(len(strongest)) if (strongest[:n] == strongest[n]).any()]
-    if not spare:
-        raise InputError("no press can be held out: press near every sensor at least twice")
-    count = min(len(spare), max(1, round(share * len(strongest))))
-    return [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
-
-
 def evaluate_held_out(bench: BenchData, share: float) -> HeldOutErrors:
     """Calibrate without some presses, and compare their simulation with the measured readings.
 
     Args:
         bench: the session.
         share: of the presses that is held out.
+
+    Raises:
+        InputError: no sensor has two presses.
     """
-    held = hold_out(bench, share)
+    strongest = bench.each.argmax(axis=1)
+    # Each has an earlier press at the same strongest sensor.
+    spare = [n for n in range(len(strongest)) if (strongest[:n] == strongest[n]).any()]
+    if not spare:
+        raise InputError("no press can be held out: press near every sensor at least twice")
+    count = min(len(spare), max(1, round(share * len(strongest))))
+    held = [spare[n] for n in np.linspace(0, len(spare) - 1, count).round().astype(int)]
     calibration = fit_calibration(bench, [n for n in range(len(bench.gauge)) if n not in held])
     answers = bench.each[bench.applied[1]]
     responding = answers > _RESPONDING * answers.max(axis=1, keepdims=True)
@@ -415,12 +403,6 @@ def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Cali
     return np.array([np.median(ratios) for ratios in finite if len(ratios)])
 
 
-def summarise_held_out(outcome: HeldOutErrors) -> dict[str, Any]:
-    """Return the rounded errors on held-out presses, for the calibration file."""
-    rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
-    return {"held_out": list(outcome.held_out), "rmse": rmse}
-
-
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     """Print the constants of working sensors, the broken, inverse and weak ones, and held-out errors."""
     table = Table("", "median", "least", "largest", "", box=None, pad_edge=False)
@@ -431,19 +413,19 @@ def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
             middle = f"{np.median(values):.4g}"
             table.add_row(name, middle, f"{low:.4g}", f"{high:.4g}", _UNITS.get(name, "N"))
     Console().print(table)
-    for kind, numbers in calibration.broken.items():
-        if numbers:
-            print(f"{kind}: sensors {', '.join(map(str, numbers))} (from 0)")
-    if len(inverse := np.flatnonzero(calibration.signs < 0)):
-        print(f"inverse, values fall with force: sensors {', '.join(map(str, inverse))}")
-    gains = [gain for gain in calibration.sensors["gain"] if gain is not None]
-    weak = [n for n, gain in enumerate(calibration.sensors["gain"]) if _is_weak(gain, gains)]
-    if weak:
-        print(f"weak, less than {_WEAK:.0%} of the median gain: sensors {', '.join(map(str, weak))}")
+    gains = {n: gain for n, gain in enumerate(calibration.sensors["gain"]) if gain is not None}
+    weak = [n for n, gain in gains.items() if gain < _WEAK * float(np.median(list(gains.values())))]
     broken = {number for group in calibration.broken.values() for number in group}
-    unknown = [n for n, gain in enumerate(calibration.sensors["gain"]) if gain is None and n not in broken]
-    if unknown:
-        print(f"not pressed, or at the limit, so of median gain: sensors {', '.join(map(str, unknown))}")
+    unknown = [n for n in range(len(calibration)) if n not in gains and n not in broken]
+    groups = [(kind, numbers, " (from 0)") for kind, numbers in calibration.broken.items()]
+    groups += [
+        ("inverse, values fall with force", np.flatnonzero(calibration.signs < 0).tolist(), ""),
+        (f"weak, less than {_WEAK:.0%} of the median gain", weak, ""),
+        ("not pressed, or at the limit, so of median gain", unknown, ""),
+    ]
+    for words, numbers, note in groups:
+        if numbers:
+            print(f"{words}: sensors {', '.join(map(str, numbers))}{note}")
     print(
         f"RMSE on {len(outcome.held_out)} held-out presses: simulated {outcome.simulated:.4f} N, with tare "
         f"{outcome.tared:.4f} N, calibrated {outcome.calibrated:.4f} N"
@@ -458,7 +440,3 @@ def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
                 UserWarning,
                 stacklevel=2,
             )
-
-
-def _is_weak(gain: float | None, gains: list[float]) -> bool:
-    return gain is not None and gain < _WEAK * float(np.median(gains))

@@ -193,7 +193,13 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
     if same:
         played = list(islice(emulated_gestures(device, seed), max(numbers) + 1))
         gestures = [played[number] for number in numbers]
-        _check_labels(gestures, numbers, labels)
+        for number, gesture, row in zip(numbers, gestures, labels, strict=True):
+            if any(row.get(name, holds) != holds for name, holds in gesture.labels.items()):
+                raise InputError(
+                    f"gesture {number} of the session is {label_text(row)}, the simulated one is "
+                    f"{label_text(gesture.labels)}: give the emulator's settings and its emulate.seed as "
+                    "compare.seed"
+                )
     else:
         rows = np.array([[row[name] for name in TOUCH.names] for row in labels])
         gestures = gestures_with_labels(device, rows, seed)
@@ -213,25 +219,11 @@ def compare_gestures(device: AbstractSimulated, path: str, seed: int) -> Session
             pairs.append(Pair(take.number, prompt, time, gesture.applied, simulated, measured, valid))
     if not pairs:
         raise InputError(f"{path} has no gesture that any sensor feels: record more, or check the wiring")
-    valid = np.stack([pair.valid for pair in pairs])
-    touches = (
-        _touches(device, np.stack([pair.simulated for pair in pairs]), valid),
-        _touches(device, np.stack([pair.measured for pair in pairs]), valid),
+    simulated, measured, valid = (
+        np.stack([getattr(pair, name) for pair in pairs]) for name in ("simulated", "measured", "valid")
     )
+    touches = _touches(device, simulated, valid), _touches(device, measured, valid)
     return SessionComparison("gestures", same, pairs, touches)
-
-
-def _check_labels(
-    gestures: Sequence[Gesture], numbers: Sequence[int], labels: Sequence[Mapping[str, int]]
-) -> None:
-    """Refuse simulated gestures that are not those of the session."""
-    for number, gesture, row in zip(numbers, gestures, labels, strict=True):
-        if any(row.get(name, holds) != holds for name, holds in gesture.labels.items()):
-            raise InputError(
-                f"gesture {number} of the session is {label_text(row)}, the simulated one is "
-                f"{label_text(gesture.labels)}: give the emulator's settings and its emulate.seed as "
-                "compare.seed"
-            )
 
 
 def _simulate_readings(device: AbstractSimulated, gestures: Sequence[Gesture]) -> np.ndarray:

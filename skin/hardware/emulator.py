@@ -58,8 +58,7 @@ class Gesture:
 class Converter:
     """Converts N to counts.
 
-    The middle of the converter is at 0 N and its ends are at twice the clip, as in
-    skin.hardware.bench.
+    The middle of the converter is at 0 N and its ends are at twice the clip.
 
     Attributes:
         bits: of the converter; None: N are sent.
@@ -451,13 +450,12 @@ class Emulator:
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
         """Send until ``count`` gestures or ``seconds`` of device time are over, or until :meth:`stop`."""
-        self.await_reader()
+        while not self.port.connected() and not self._over.wait(_LOOK):
+            pass
         end = None if seconds is None else round(seconds * self.settings.rate)
         self._start = monotonic()
         self._begin()
-        for values, gesture in self._pieces(count):
-            if gesture is not None:
-                self._announce(gesture[0], gesture[1])
+        for values in self._pieces(count):
             if self._play(values, end):
                 return
 
@@ -465,19 +463,16 @@ class Emulator:
         """Make :meth:`run` return before its next frame; called from another thread."""
         self._over.set()
 
-    def await_reader(self) -> None:
-        """Wait until a reader opens the port."""
-        while not self.port.connected() and not self._over.wait(_LOOK):
-            pass
-
-    def _pieces(self, count: int | None) -> Iterator[tuple[np.ndarray, tuple[int, Gesture] | None]]:
-        """Yield counts at rest, then of each gesture with the gap after it."""
+    def _pieces(self, count: int | None) -> Iterator[np.ndarray]:
+        """Yield counts at rest, then of each gesture with the gap after it, once it is announced."""
         settings, sensors = self.settings, len(self.device.sensors)
-        yield self._convert_to_counts(np.zeros((round(settings.idle * settings.rate), sensors))), None
+        yield self._convert_to_counts(np.zeros((round(settings.idle * settings.rate), sensors)))
         gap = np.zeros((round(settings.gap * settings.rate), sensors))
         for number, gesture in enumerate(islice(emulated_gestures(self.device, settings.seed), count)):
             true = upsample(gesture.force, self.device.model_rate, settings.rate)
-            yield self._convert_to_counts(np.concatenate([true, gap])), (number, gesture)
+            values = self._convert_to_counts(np.concatenate([true, gap]))
+            self._announce(number, gesture)
+            yield values
 
     def _convert_to_counts(self, true: np.ndarray) -> np.ndarray:
         """Return the counts for true readings (F, S), N."""
@@ -550,15 +545,11 @@ class Emulator:
             self._send(encode_header(header, settings.check))
 
     def _announce(self, number: int, gesture: Gesture) -> None:
-        t, frames = self._number / self.settings.rate, len(gesture.force) * self.settings.rate
-        self._on_event(t, f"gesture {number}: {label_text(gesture.labels)}")
+        rate = self.settings.rate
+        self._on_event(self._number / rate, f"gesture {number}: {label_text(gesture.labels)}")
         if self.settings.announce and not self.binary:
-            seq = self._number - self._zero
-            self._send(
-                encode_announcement(
-                    Announcement(number, seq, round(frames / self.device.model_rate), gesture.labels)
-                )
-            )
+            seq, frames = self._number - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
+            self._send(encode_announcement(Announcement(number, seq, frames, gesture.labels)))
 
     def _silence(self) -> None:
         self._on_event(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")

@@ -2,12 +2,12 @@
 
 import logging
 import os
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic, time
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from skin.device.files import write_recording
 from skin.device.resampling import Frame
 from skin.device.touches import concatenate
 from skin.errors import InputError
-from skin.hardware.serial import AbstractWired
+from skin.hardware.serial import Serial
 from skin.hardware.session import StoredSession, encode_event, line_sum, read_session, write_about
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.protocol import Header
@@ -145,6 +145,7 @@ class SessionLog:
 
     Attributes:
         done: numbers of the complete gestures.
+        time: of the last frame, s since the start of the session.
 
     Raises:
         InputError: the file cannot be written, or is not a session of this device, layout, window and rate.
@@ -160,29 +161,24 @@ class SessionLog:
             path.parent.mkdir(parents=True, exist_ok=True)
             begun = _is_begun(path, header)
             if not begun:
-                self._about = dict(about) | {"started_unix": time.time()}
+                self._about = dict(about) | {"started_unix": time()}
                 write_about(self._about, path)
                 files.write(header, path)
         except OSError as error:
             raise files.unwritable(path, error, "out=FILE.csv") from error
         self._lines = LineWriter(path)
+        self.done, self.time = set[int](), -1.0
+        if not begun:
+            return
         try:
-            stored = self._resume(path, about) if begun else None
+            stored = read_session(path)
+            check_session(path, stored.about, about)
+            # An incomplete last line, after a power cut, would damage the next one.
+            self._lines.cut(path.read_bytes().rfind(b"\n") + 1)
         except BaseException:
             self._lines.close()
             raise
-        if stored is not None:
-            self._about = stored.about
-        self.done = set(stored.gestures) if stored else set()
-        self._last = stored.end if stored else -1.0
-
-    def _resume(self, path: Path, about: Mapping[str, Any]) -> StoredSession:
-        """Return the existing session."""
-        stored = read_session(path)
-        check_session(path, stored.about, about)
-        # An incomplete last line, after a power cut, would damage the next one.
-        self._lines.cut(path.read_bytes().rfind(b"\n") + 1)
-        return stored
+        self._about, self.done, self.time = stored.about, set(stored.gestures), stored.end
 
     def mark(self, event: str, **what: Any) -> None:
         """Write an event before the next frame."""
@@ -221,16 +217,11 @@ class SessionLog:
             if channels != self._marked[event]:
                 self.mark(event, channels=channels)
                 self._marked[event] = channels
-        self._last = self._time(frame)
+        self.time = self._time(frame)
         values = ",".join(f"{value:.9g}" for value in frame.values.tolist())
-        line = f"{self._last:.9f},{'' if frame.seq is None else frame.seq},{values}"
+        line = f"{self.time:.9f},{'' if frame.seq is None else frame.seq},{values}"
         self._sums.append(line_sum(line))
         self._lines.add(line)
-
-    @property
-    def time(self) -> float:
-        """Time of the last frame, s since the start of the session."""
-        return self._last
 
     def close(self) -> None:
         """Close the file."""
@@ -239,10 +230,10 @@ class SessionLog:
     def _time(self, frame: Frame) -> float:
         """Return s since the start of the session, by the device's clock within a segment."""
         if frame.segment != self._segment:
-            ago = time.monotonic() - frame.t_host
+            ago = monotonic() - frame.t_host
             self._segment = frame.segment
-            self._anchor = time.time() - ago - self._about["started_unix"] - frame.t
-            self._anchor = max(self._anchor, self._last + 1e-3 - frame.t)
+            self._anchor = time() - ago - self._about["started_unix"] - frame.t
+            self._anchor = max(self._anchor, self.time + 1e-3 - frame.t)
         return frame.t + self._anchor
 
 
@@ -278,7 +269,7 @@ _log = logging.getLogger("skin.hardware.record")
 
 
 def record_session(
-    device: AbstractWired, path: Path, seconds: float | None, free: bool, notify: Callable[[str], None]
+    device: Serial, path: Path, seconds: float | None, free: bool, notify: Callable[[str], None]
 ) -> None:
     """Record frames until all gestures are done, ``seconds`` are over, or the user ends it.
 
@@ -293,48 +284,44 @@ def record_session(
         InputError: another process records to the file, or it cannot be written; its content is kept.
     """
     with locked(path):
-        _record(device, path, seconds, free, notify)
+        skin, listener = device.wire.open(reconnect=True)
+        with skin:
+            first, conversion = device.wire.warm_up(skin, notify)
+            log = SessionLog(path, _about(device, skin.header), len(device.sensors))
+            try:
+                log.conversion(conversion)
+                for frame in first:
+                    log.frame(frame)
+                # In time of the session, because the device's clock restarts with each session.
+                begin = log.time - (first[-1].t - first[0].t)
+                if log.done:
+                    notify(f"{path} has {len(log.done)} gestures: going on")
+                segmenter = device.segmenter(listener, conversion, first, log.done)
+                if free:
+                    segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
+                number = None if free else device.gestures
+                for frame in skin:
+                    gesture, before = segmenter.gesture, len(log.done)
+                    if (done := segmenter.add(frame)) is not None:
+                        log.end(done)
+                    if len(log.done) > before:
+                        notify(f"{len(log.done)} of {number or 'any'} gestures")
+                    if segmenter.gesture is not None and segmenter.gesture is not gesture:
+                        log.begin(segmenter.gesture, frame)
+                    log.frame(frame)
+                    late = seconds is not None and log.time - begin >= seconds
+                    if late or segmenter.over or (number is not None and len(log.done) >= number):
+                        return
+            except (SkinTimeout, SkinDisconnected) as end:
+                notify(str(end))
+            finally:
+                log.close()
 
 
-def _record(
-    device: AbstractWired, path: Path, seconds: float | None, free: bool, notify: Callable[[str], None]
-) -> None:
-    skin, listener = device.wire.open(reconnect=True)
-    with skin:
-        first, conversion = device.wire.warm_up(skin, notify)
-        log = SessionLog(path, _about(device, skin.header), len(device.sensors))
-        try:
-            log.conversion(conversion)
-            for frame in first:
-                log.frame(frame)
-            # In time of the session, because the device's clock restarts with each session.
-            begin = log.time - (first[-1].t - first[0].t)
-            if log.done:
-                notify(f"{path} has {len(log.done)} gestures: going on")
-            segmenter = device.segmenter(listener, conversion, first, log.done)
-            if free:
-                segmenter = ContinuousSegmenter(segmenter.window, max(log.done, default=-1) + 1)
-            number = None if free else device.gestures
-            for frame in skin:
-                gesture, before = segmenter.gesture, len(log.done)
-                if (done := segmenter.add(frame)) is not None:
-                    log.end(done)
-                if len(log.done) > before:
-                    notify(f"{len(log.done)} of {number or 'any'} gestures")
-                if segmenter.gesture is not None and segmenter.gesture is not gesture:
-                    log.begin(segmenter.gesture, frame)
-                log.frame(frame)
-                late = seconds is not None and log.time - begin >= seconds
-                if late or segmenter.over or (number is not None and len(log.done) >= number):
-                    return
-        except (SkinTimeout, SkinDisconnected) as end:
-            notify(str(end))
-        finally:
-            log.close()
-
-
-def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
+def _about(device: Serial, header: Header | None) -> dict[str, Any]:
     """Return the metadata of a session."""
+    # Of every column, where a calibration puts the device's channels into another order.
+    channels = () if device.calibration is None else read_calibration(device.calibration).channels
     return {
         "format": 2,
         "unit": header.unit if header and header.unit else "adc",
@@ -348,16 +335,10 @@ def _about(device: AbstractWired, header: Header | None) -> dict[str, Any]:
         "window": device.window,
         "labels": device.labels,
         "calibration": device.calibration,
-    } | _channels(device.calibration)
+    } | ({"channels": list(channels)} if channels else {})
 
 
-def _channels(calibration: str | None) -> dict[str, Any]:
-    """Return the device's channel of every column, where a calibration puts them into another order."""
-    channels = () if calibration is None else read_calibration(calibration).channels
-    return {"channels": list(channels)} if channels else {}
-
-
-def convert_session(device: AbstractWired, path: Path) -> tuple[Path, int]:
+def convert_session(device: Serial, path: Path) -> tuple[Path, int]:
     """Write the complete gestures of a session as a recording beside it; return its path and their number.
 
     Raises:

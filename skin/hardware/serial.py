@@ -1,8 +1,7 @@
 """Touches from a real or emulated skin, gesture by gesture."""
 
 import sys
-from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
@@ -11,10 +10,10 @@ import numpy as np
 import torch
 from pydantic import PositiveFloat
 
-from skin.body.base import AbstractBody, Sensors
+from skin.body.base import AbstractBody
 from skin.body.layout import AbstractLayout
 from skin.device.base import AbstractDevice, Blank, Split
-from skin.device.resampling import Frame, Resampled, Window
+from skin.device.resampling import Frame, Window
 from skin.device.touches import Recording, Touches
 from skin.errors import InputError
 from skin.hardware.wire.channels import UnitConversion
@@ -29,55 +28,9 @@ from skin.hardware.wire.segmentation import (
     label_plan,
     label_text,
 )
-from skin.hardware.wire.skin import SerialSource, Skin, Source, play
+from skin.hardware.wire.skin import SerialSource, Source, play
 from skin.touch.gesture import GestureSettings, model_window
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
-
-# Devices at a port, and any device as a stream of frames.
-
-
-class AbstractWired(AbstractDevice):
-    """Base class of devices that read a skin at a port, frame by frame.
-
-    Attributes:
-        wire: opens the port.
-        sensors: S sensors, one per value of a frame.
-        window: frames per touch.
-        model_rate: frames per second that touches are resampled to, Hz.
-        labels: source of the labels.
-        gestures: number of touches of ``test``.
-        calibration: calibration file of the device; or None.
-    """
-
-    real = True
-    wire: SerialSource
-    sensors: Sensors
-    window: int
-    model_rate: float
-    labels: str
-    gestures: int
-    calibration: str | None
-
-    @abstractmethod
-    def segmenter(
-        self,
-        listener: AnnouncementListener,
-        conversion: UnitConversion,
-        first: Sequence[Frame],
-        done: Collection[int] = (),
-    ) -> AbstractSegmenter:
-        """Return the segmenter of a stream.
-
-        Args:
-            listener: collects announcements.
-            conversion: of the values to N.
-            first: frames read before.
-            done: numbers of gestures that are already recorded.
-        """
-
-    @abstractmethod
-    def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
-        """Return gestures as a recording."""
 
 
 def open_source(device: AbstractDevice) -> Source:
@@ -86,7 +39,7 @@ def open_source(device: AbstractDevice) -> Source:
     Raises:
         InputError: the stream cannot be opened, or the device has none.
     """
-    if isinstance(device, AbstractWired):
+    if isinstance(device, Serial):
         return device.wire.open_source()
     strips = iter(device.strips())
     first = next(strips)
@@ -97,7 +50,7 @@ _LABELS = ("announced", "prompted", "none")
 
 
 @dataclass(kw_only=True, eq=False)
-class Serial(PortSettings, AbstractWired):
+class Serial(PortSettings, AbstractDevice):
     """Yields gestures on a real or emulated skin; its only split is ``test``.
 
     Readings are in N above the baseline, which is taken from resampled values, because the maximum of noise
@@ -118,6 +71,7 @@ class Serial(PortSettings, AbstractWired):
         InputError: invalid settings, or a device that does not match the model.
     """
 
+    real = True
     body: AbstractBody
     layout: AbstractLayout
     timeout: PositiveFloat = 10.0
@@ -171,7 +125,14 @@ class Serial(PortSettings, AbstractWired):
         first: Sequence[Frame],
         done: Collection[int] = (),
     ) -> AbstractSegmenter:
-        """Return the segmenter that ``labels`` selects."""
+        """Return the segmenter of a stream that ``labels`` selects.
+
+        Args:
+            listener: collects announcements.
+            conversion: of the values to N.
+            first: frames read before.
+            done: numbers of gestures that are already recorded.
+        """
         window = Window(self.window, self.model_rate, len(self.sensors))
         for frame in first:
             window.add(frame)
@@ -193,19 +154,15 @@ class Serial(PortSettings, AbstractWired):
     def to_recording(self, gestures: Sequence[RecordedGesture], conversion: UnitConversion) -> Recording:
         """Return gestures as a recording."""
         windows = [gesture.resampled for gesture in gestures if gesture.resampled is not None]
-        touches = self._touches(windows, conversion)
+        values, received, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
+        readings, valid = conversion(values, received)
+        force, mask, limited = map(torch.from_numpy, (readings, valid, valid & saturated))
+        touches = Touches(force, mask, self._positions, None, self.model_rate, saturated=limited)
         if gestures and gestures[0].labels is not None:
             rows = [list(map(float, gesture.labels.values())) for gesture in gestures if gesture.labels]
             touches = replace(touches, labels=torch.tensor(rows))
         about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
-
-    def _touches(self, windows: Sequence[Resampled], conversion: UnitConversion) -> Touches:
-        """Return windows in the device's unit as touches."""
-        values, received, saturated = map(np.stack, zip(*(window[:3] for window in windows), strict=True))
-        readings, valid = conversion(values, received)
-        force, mask, limited = map(torch.from_numpy, (readings, valid, valid & saturated))
-        return Touches(force, mask, self._positions, None, self.model_rate, saturated=limited)
 
     def _record(self) -> Recording:
         """Read gestures until there are enough, the skin stops sending, or the user ends it."""
@@ -215,29 +172,23 @@ class Serial(PortSettings, AbstractWired):
             first, conversion = self.wire.warm_up(skin, _print)
             segmenter = self.segmenter(listener, conversion, first)
             _print(f"waiting for {self.gestures} gestures, labels {self.labels}")
-            for gesture in self._finished_gestures(skin, segmenter):
-                gestures.append(gesture)
-                words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
-                lost = f" ({gesture.lost} frames lost)" * bool(gesture.lost)
-                _print(f"{len(gestures)}/{self.gestures}{words}{lost}")
-                if len(gestures) == self.gestures:
-                    break
+            try:
+                for frame in skin:
+                    gesture = segmenter.add(frame)
+                    if gesture is not None and gesture.broken:
+                        _print(f"gesture {gesture.number} was interrupted: the device restarted")
+                    elif gesture is not None:
+                        gestures.append(gesture)
+                        words = "" if gesture.labels is None else f": {label_text(gesture.labels)}"
+                        lost = f" ({gesture.lost} frames lost)" * bool(gesture.lost)
+                        _print(f"{len(gestures)}/{self.gestures}{words}{lost}")
+                    if segmenter.over or len(gestures) == self.gestures:
+                        break
+            except (SkinTimeout, SkinDisconnected) as end:
+                _print(str(end))
         if not gestures:
             raise InputError("no gesture was read: does the emulator announce, is the skin touched?")
         return self.to_recording(gestures, conversion)
-
-    def _finished_gestures(self, skin: Skin, segmenter: AbstractSegmenter) -> Iterator[RecordedGesture]:
-        try:
-            for frame in skin:
-                gesture = segmenter.add(frame)
-                if gesture is not None and gesture.broken:
-                    _print(f"gesture {gesture.number} was interrupted: the device restarted")
-                elif gesture is not None:
-                    yield gesture
-                if segmenter.over:
-                    return
-        except (SkinTimeout, SkinDisconnected) as end:
-            _print(str(end))
 
 
 def _print(text: str) -> None:

@@ -25,7 +25,7 @@ from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import json_line
 from skin.core.safe_loading import parse_json, read_file, regular, sha256
-from skin.device.resampling import Frame, Resampled, Window
+from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.segmentation import RecordedGesture
@@ -221,8 +221,7 @@ class _Reading:
             raise ValueError(f"{len(row)} values, {self._sensors} sensors")
         if not isfinite(float(t)) or not np.isfinite(row).all() or "_" in text:
             raise ValueError("no number")
-        valid, saturated = (np.zeros(len(row), dtype=bool) for _ in range(2))
-        valid[:] = True
+        valid, saturated = np.ones(len(row), dtype=bool), np.zeros(len(row), dtype=bool)
         valid[self._marked["invalid"]] = False
         saturated[self._marked["saturated"]] = True
         if self._limit is not None:
@@ -299,30 +298,17 @@ class _Reading:
         for event, channels in self._marked.items():
             self._marked[event] = self._channels(content.get(event, channels))
 
-    def _window(self, gesture: RecordedGesture) -> Resampled:
-        about = self.stored.about
-        window = Window(about.get("window", 30), about.get("rate", 10.0), self._sensors)
-        falling = self._conversion is not None and (self._conversion[1].scale < 0).any()
-        polarity = np.sign(self._conversion[1].scale) if self._conversion and falling else None
-        for frame in (*self._before, *gesture.frames):
-            window.add(frame._replace(polarity=polarity))
-        self._before.extend(gesture.frames)
-        return window.since(gesture.begin)
-
-    def _drop_changed(self, gesture: RecordedGesture, sums: str) -> None:
-        """Drop frames that look whole but are not those that were recorded; they count as lost."""
-        written = {sums[start : start + _DIGITS] for start in range(0, len(sums), _DIGITS)}
-        frames = [frame for frame in gesture.frames if self._sums[id(frame)] in written]
-        self._spoilt += len(gesture.frames) - len(frames)
-        gesture.frames[:] = frames
-
     def _end(self, number: int, lost: int, frames: str | None) -> None:
         gesture, self._gesture = self._gesture, None
         # Another number: the line of an end or a beginning is damaged.
         if gesture is None or gesture.number != number or self._conversion is None:
             return
         if frames is not None:  # older sessions have none
-            self._drop_changed(gesture, frames)
+            # Frames that look whole but are not those that were recorded count as lost.
+            written = {frames[start : start + _DIGITS] for start in range(0, len(frames), _DIGITS)}
+            same = [frame for frame in gesture.frames if self._sums[id(frame)] in written]
+            self._spoilt += len(gesture.frames) - len(same)
+            gesture.frames[:] = same
         inside = [
             frame.t
             for frame in gesture.frames
@@ -334,9 +320,15 @@ class _Reading:
             self.stored.left_out[number] = "the device's clock stood still, all its frames have the same time"
         else:
             gesture.lost = lost + self._spoilt
-            gesture.resampled = self._window(gesture)
+            about, conversion = self.stored.about, self._conversion[1]
+            window = Window(about.get("window", 30), about.get("rate", 10.0), self._sensors)
+            polarity = np.sign(conversion.scale) if (conversion.scale < 0).any() else None
+            for frame in (*self._before, *gesture.frames):
+                window.add(frame._replace(polarity=polarity))
+            self._before.extend(gesture.frames)
+            gesture.resampled = window.since(gesture.begin)
             self.stored.left_out.pop(number, None)
-            self.stored.gestures[number] = gesture, self._conversion[1]
+            self.stored.gestures[number] = gesture, conversion
 
 
 def line_sum(text: str) -> str:

@@ -116,10 +116,6 @@ class Responses:
     error: np.ndarray
     responding: np.ndarray
 
-    def predicted(self, per_newton: np.ndarray) -> np.ndarray:
-        """Return true readings (F, S), N, of presses that give ``per_newton`` (P, S) per N."""
-        return self.force[:, None] * per_newton[self.press]
-
 
 @dataclass(frozen=True)
 class Match:
@@ -176,7 +172,7 @@ def match_channels(responses: Responses, per_newton: np.ndarray) -> Match:
         responses: of the session.
         per_newton: (P, S), true readings per N of every press.
     """
-    prediction = responses.predicted(per_newton)
+    prediction = responses.force[:, None] * per_newton[responses.press]  # N, (F, S)
     largest = np.abs(prediction).max(axis=0)
     reached = largest > _TINY * largest.max(initial=0.0)
     shape = prediction / np.where(reached, largest, 1.0)
@@ -383,7 +379,14 @@ def wired_bench(
     """
     rows = session.gauge if rows is None else rows
     if session.raw.shape[1] == len(device.sensors):
-        session = replace(session, raw=_order_channels(session.raw, confirmed))
+        sensors, channels = session.raw.shape[1], confirmed.order(session.raw.shape[1])
+        if sorted(channels) != list(range(sensors)):
+            raise InputError(f"calibrate.channels must hold each of 0 to {sensors - 1} once, got {channels}")
+        if wrong := [number for number in confirmed.broken if not 0 <= number < sensors]:
+            raise InputError(f"calibrate.broken takes sensors from 0 to {sensors - 1}, got {wrong[0]}")
+        ordered = session.raw[:, channels].astype(float)
+        ordered[:, list(confirmed.broken)] = np.nan
+        session = replace(session, raw=ordered)
     if rows is None:
         return build_bench_data(device, session, rows)
     gauge = turn_gauge(rows, confirmed.places, device.size)
@@ -398,19 +401,6 @@ def wired_bench(
     if explained and (not clear or any(entry is straight for entry in best)):
         return bench
     raise InputError(_phrase_refusal(straight, best[0], clear, confirmed, responses.responding))
-
-
-def _order_channels(raw: np.ndarray, confirmed: Confirmed) -> np.ndarray:
-    """Return raw values in the order of the sensors; broken ones are NaN."""
-    sensors = raw.shape[1]
-    channels = confirmed.order(sensors)
-    if sorted(channels) != list(range(sensors)):
-        raise InputError(f"calibrate.channels must hold each of 0 to {sensors - 1} once, got {channels}")
-    if wrong := [number for number in confirmed.broken if not 0 <= number < sensors]:
-        raise InputError(f"calibrate.broken takes sensors from 0 to {sensors - 1}, got {wrong[0]}")
-    ordered = raw[:, channels].astype(float)
-    ordered[:, list(confirmed.broken)] = np.nan
-    return ordered
 
 
 def _compare_turns(
@@ -441,7 +431,11 @@ def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explana
     # Among equal places a channel stays at its own.
     _, sensors = linear_sum_assignment(cost - 1e-6 * np.eye(len(cost)))
     settled = responding & (cost[channels, sensors] <= _FITS)
-    sensors = _keep_unsettled(sensors, settled)
+    # Unsettled channels stay at their own sensors, where these are free.
+    sensors = np.where(settled, sensors, -1)
+    for channel in np.flatnonzero(~settled):
+        sensors[channel] = -1 if channel in sensors else channel
+    sensors[sensors < 0] = np.setdiff1d(channels, sensors)
     straight, permuted = (np.where(responding, cost[channels, place], 0.0) for place in (channels, sensors))
     factor, least = _CLEARER
     moved = np.flatnonzero(settled & (sensors != channels))
@@ -453,15 +447,6 @@ def _explain(match: Match, responding: np.ndarray, turn: Turn) -> tuple[_Explana
     # Of two silent channels, nothing says which is where.
     seconds.append(int((~settled & (sensors != channels)).sum()) <= 1)
     return _Explanation(turn, channels, straight), _Explanation(turn, sensors, permuted, all(seconds))
-
-
-def _keep_unsettled(sensors: np.ndarray, settled: np.ndarray) -> np.ndarray:
-    """Return an assignment whose unsettled channels stay at their own sensors, where these are free."""
-    sensors = np.where(settled, sensors, -1)
-    for channel in np.flatnonzero(~settled):
-        sensors[channel] = -1 if channel in sensors else channel
-    sensors[sensors < 0] = np.setdiff1d(np.arange(len(sensors)), sensors)
-    return sensors
 
 
 def _phrase_refusal(
@@ -483,8 +468,16 @@ def _phrase_refusal(
             "channel", "responds", "its sensor"
         )  # fmt: skip
         trouble = f"{noun} {list_numbers(sorted(order[wrong]))} {verb}, but not to the presses near {place}"
+    if not clear and 2 * len(wrong) > responding.sum():
+        return (
+            f"{trouble}: neither another order of the channels nor other axes explain the session; check the "
+            "wiring, the layout, the places of the presses and the clock (calibrate.delay)"
+        )
     if not clear:
-        return f"{trouble}: {_phrase_advice(wrong, order, responding)}"
+        return (
+            f"{trouble}: check the wiring, and the position of the sensor in the layout; "
+            f"to leave it out, add 'calibrate.broken=[{','.join(map(str, wrong))}]'"
+        )
     sentences = [f"{trouble}: the session fits if {_phrase_explanation(clear[0], confirmed, order)}"]
     # A turn that is made up for by another order says nothing new.
     others = [entry for entry in clear[1:] if entry.turn == "as_given" or not len(entry.moved)]
@@ -509,20 +502,6 @@ def _is_conclusive(explanation: _Explanation, straight: _Explanation | None, res
     if explanation.turn == "as_given":
         return True
     return int((straight.residual > _CLEARER[0] * explanation.residual + _CLEARER[1]).sum()) >= _FEWEST
-
-
-def _phrase_advice(wrong: np.ndarray, order: np.ndarray, responding: np.ndarray) -> str:
-    """Return what to check where no order of channels and no turn of the places explains a session."""
-    if 2 * len(wrong) > responding.sum():
-        return (
-            "neither another order of the channels nor other axes explain the session; check the wiring, the "
-            "layout, the places of the presses and the clock (calibrate.delay)"
-        )
-    numbers = ",".join(str(number) for number in wrong)
-    return (
-        "check the wiring, and the position of the sensor in the layout; "
-        f"to leave it out, add 'calibrate.broken=[{numbers}]'"
-    )
 
 
 def _phrase_explanation(explanation: _Explanation, confirmed: Confirmed, order: np.ndarray) -> str:

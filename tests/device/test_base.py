@@ -16,7 +16,7 @@ from skin.evaluation.operating_point import OperatingPoint, threshold_gestures
 from skin.evaluation.report import touch_sets
 from skin.evaluation.settings import Evaluation
 from skin.evaluation.streams import evaluate_windows
-from skin.hardware.serial import AbstractWired, open_source
+from skin.hardware.serial import Serial, open_source
 from skin.runs.build import build_device
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -72,7 +72,7 @@ def test_fixed_touches_stay_the_same(device):
 
 def test_only_a_simulated_device_says_that_it_is_one(device):
     assert device.simulation is (device if isinstance(device, Simulated) else None)
-    assert not isinstance(device, AbstractWired)
+    assert not isinstance(device, Serial)
     assert len(device.recording("holdout", complete=False)) == 5
 
 

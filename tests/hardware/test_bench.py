@@ -7,8 +7,8 @@ import pytest
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.errors import InputError
+from skin.hardware import bench
 from skin.hardware.bench import BenchSession
-from skin.hardware.calibration import bench
 from skin.mechanics.simulator.naive import Naive
 
 BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])

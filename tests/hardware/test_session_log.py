@@ -138,7 +138,7 @@ def test_another_layout_is_refused(tmp_path):
 
 
 def test_calibration_reads_it_too(tmp_path):
-    from skin.hardware.calibration import bench
+    from skin.hardware import bench
 
     recorded(tmp_path / "x.csv", 0, 1).close()
     found = bench.read_bench_session(tmp_path / "x.csv", "disc", 0.01)

@@ -267,10 +267,8 @@ class Engine:
         self._held = held_frames(detection.longest, rate, frames)
         self._shown = longest_shown(self._held, ceil(RELEASE * rate - 1e-9), frames)
         self._above = 0.5 if self._patience.above is None else self._patience.above
-        responds = None if presses is None else presses >= detection.threshold
-        self._responds = np.eye(sensors, dtype=bool) if responds is None else responds
+        self._responds = np.eye(sensors, dtype=bool) if presses is None else presses >= detection.threshold
         self._clock, self._freshness = StreamClock(), _Freshness(sensors)
-        self._segment: int | None = None
         self._latest: tuple[Frame, float] | None = None
         self._tick = -1
         self._decided = True
@@ -320,7 +318,7 @@ class Engine:
             # What came last before the interruption would be forgotten undecided.
             due += self._decide(conversion, last=True)
             self.window.clear()
-        self._segment, self._latest, self._decided = frame.segment, (frame, time), False
+        self._latest, self._decided = (frame, time), False
         self.window.add(frame._replace(t=time, segment=0))
         self._freshness.add(frame, time, conversion)
         tick = floor((time + _ROUNDING) * DECISIONS)
@@ -332,7 +330,8 @@ class Engine:
     def _interrupted(self, frame: Frame, time: float) -> bool:
         if self._latest is None:
             return False
-        return frame.segment != self._segment or time - self._latest[1] > max(_GAP, 3 * self.window.period)
+        latest, before = self._latest
+        return frame.segment != latest.segment or time - before > max(_GAP, 3 * self.window.period)
 
     def _decide(self, conversion: UnitConversion | None, last: bool = False) -> list[_Decision]:
         """Return the decision on the window that ends with the latest frame; none without a conversion."""

@@ -17,7 +17,7 @@ from skin.core.settings import configured
 from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT
-from skin.hardware.live.engine import DebounceSettings, Detection, Engine, EngineSettings, sensor_list
+from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings, sensor_list
 from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
@@ -71,7 +71,11 @@ class SelfTest:
         # A place without a valid sensor is shown as unknown, which hides nothing, unless there are many.
         valid = ~conversion.broken[self._sensors]
         missed = np.unique(self._sensors[expected & ~raised & valid])
-        say(self._report(raised, expected, device))
+        text = f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm, "
+        text += f"{expected.sum()} with nominal settings"
+        if not raised.all():
+            text += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
+        say(text if device.known else f"{text}; the device declares no range, so its scale is not checked")
         few = raised[valid].sum() < _SHARE * expected[valid].sum()
         if not expected.any() or len(missed) or few or conversion.broken.mean() > _MASKED:
             raise InputError(self._refusal(raised, expected, missed, conversion, device))
@@ -100,17 +104,12 @@ class SelfTest:
             frames = list(_frames(number, rise, STRENGTH * self.presses[sensor], conversion, device))
             settling = round(_REST * _RATE)
             engine.push(frames[:settling], None)  # nothing to decide yet
-            raised.append(_alarms(engine, frames[settling:], conversion))
+            pieces = (frames[first : first + _PIECE] for first in range(settling, len(frames), _PIECE))
+            # The frames behind the alarm are left out.
+            raised.append(
+                any(verdict.dangerous for piece in pieces for verdict in engine.push(piece, conversion))
+            )
         return np.array(raised)
-
-    def _report(self, raised: np.ndarray, expected: np.ndarray, device: RawRange) -> str:
-        text = (
-            f"self-test: {raised.sum()} of {len(raised)} dangerous presses raise the alarm, "
-            f"{expected.sum()} with nominal settings"
-        )
-        if not raised.all():
-            text += f"; not on {sensor_list(np.unique(self._sensors[~raised]).tolist())}"
-        return text if device.known else f"{text}; the device declares no range, so its scale is not checked"
 
     def _refusal(
         self,
@@ -160,12 +159,6 @@ def nominal_conversion(sensors: int) -> UnitConversion:
     return UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
 
 
-def _alarms(engine: Engine, frames: Sequence[Frame], conversion: UnitConversion) -> bool:
-    """Return whether frames raise the alarm; those behind it are left out."""
-    pieces = (frames[first : first + _PIECE] for first in range(0, len(frames), _PIECE))
-    return any(verdict.dangerous for piece in pieces for verdict in engine.push(piece, conversion))
-
-
 def _frames(
     number: int, rise: float, press: np.ndarray, conversion: UnitConversion, device: RawRange
 ) -> Iterator[Frame]:
@@ -174,7 +167,10 @@ def _frames(
     time = np.arange(0.0, corners[-1], 1 / _RATE)
     load = np.interp(time, corners, [0, 1, 1, 0])
     with np.errstate(all="ignore"):  # any scale is tried
-        values = device.rounded(np.nan_to_num(load[:, None] * press / conversion.scale + conversion.zero))
+        values = np.nan_to_num(load[:, None] * press / conversion.scale + conversion.zero)
+        values = np.round(values) if device.whole else values
+        if (device.least, device.most) != (None, None):
+            values = np.clip(values, device.least, device.most)
     low, high = (
         np.inf * sign if limit is None else limit for sign, limit in zip((-1, 1), device.limits, strict=True)
     )
@@ -300,7 +296,7 @@ def watch_exported(
     source = SerialSource(PortSettings.select(device), len(model.positions), model.rate).open_source()
     opened.enter_context(source.skin)
     say(f"loaded {model.title} from {path}, exported by version {model.metadata.version}")
-    return watch(model, source, live, say, lambda: source)
+    return Watched(model, source, *used_and_nominal(model, source, live, say))
 
 
 def watch_run(
@@ -350,12 +346,11 @@ def watch_run(
     touch = None if "simulator" in run.stored.device else live.touch
     model = load_model(run, trained, watched, touch=touch, alarm=False)
 
-    def begin() -> Source:
-        source = open_source(device)
-        opened.enter_context(source.skin)
-        return source
-
-    return watch(model, port, live, say, begin)
+    settings = used_and_nominal(model, port, live, say)
+    if port is None:
+        port = open_source(device)
+        opened.enter_context(port.skin)
+    return Watched(model, port, *settings)
 
 
 def engine_settings(
@@ -396,21 +391,16 @@ def engine_settings(
     )
 
 
-def watch(
-    model: TrainedModel,
-    port: Source | None,
-    live: LiveSettings,
-    say: Callable[[str], None],
-    begin: Callable[[], Source],
-) -> Watched:
-    """Return a model and a skin with the settings of a live view.
+def used_and_nominal(
+    model: TrainedModel, port: Source | None, live: LiveSettings, say: Callable[[str], None]
+) -> tuple[EngineSettings, EngineSettings]:
+    """Return the settings of an engine: those of a live view, and those that the model brings.
 
     Args:
         model: that predicts.
         port: open source of a skin at a port; None: the skin is simulated or recorded.
         live: settings of the live view.
         say: called with each message for the user.
-        begin: opens the source of a skin that is simulated or recorded.
 
     Raises:
         InputError: no contact threshold is known, or no threshold raises an alarm as seldom as wanted.
@@ -426,14 +416,8 @@ def watch(
     else:
         usual = None
     nominal = engine_settings(model, DebounceSettings(above=usual))
-    detection = replace(
-        nominal.detection,
-        threshold=nominal.detection.threshold if live.touch is None else live.touch,
-        drift=live.drift / 600,
-        learned=nominal.detection.learned and live.touch is None,
-    )
-    used = replace(nominal, detection=detection, patience=replace(live.patience, above=above))
-    return Watched(model, port or begin(), used, nominal)
+    used = engine_settings(model, nominal.patience, live.touch, live.drift)
+    return replace(used, patience=replace(live.patience, above=above)), nominal
 
 
 def measured_rate(skin: Skin) -> float:

@@ -4,13 +4,13 @@ import logging
 import socket
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from math import isfinite
 from pathlib import Path
-from queue import Empty, Full, Queue
+from queue import Empty, Queue
 from threading import Event, Lock, Thread
 from time import monotonic
 from typing import Any, Literal, TextIO
@@ -258,17 +258,14 @@ class LiveLoop:
                 return
             else:
                 self._take(frames + self._waiting())
-            self._update_status()
+            if (now := monotonic()) - self._updated_at >= _STATUS:
+                self._updated_at = now
+                self._display.set_status(self.line)
 
     def _wait(self, reason: str) -> None:
         """Show why no frames come, once they are overdue: those of a bridge come in bursts."""
         if monotonic() - self._heard_at >= STALE or self._skin.away:
             self._display.set_verdict(None, reason, self._engine.alarm)
-
-    @property
-    def p99(self) -> float:
-        """Seconds from a frame to the verdict on it that 99 of 100 verdicts do not exceed."""
-        return float(np.percentile(self._delays, 99)) if self._delays else float("nan")
 
     def _waiting(self) -> list[Frame]:
         """Return the other frames that have arrived."""
@@ -296,10 +293,7 @@ class LiveLoop:
             self._before = None
         for frame in frames:
             self._display.add_frame(frame, conversion)
-        self._show(self._engine.push(frames, conversion))
-
-    def _show(self, verdicts: Sequence[Verdict]) -> None:
-        """Show the verdicts that were due; none while the readings are frozen."""
+        verdicts = self._engine.push(frames, conversion)
         if self._engine.frozen:
             self._display.set_verdict(None, FROZEN_READINGS, self._engine.alarm)
             return
@@ -309,23 +303,11 @@ class LiveLoop:
         if verdicts:
             self._delays.append(monotonic() - verdicts[-1].t_host)
 
-    def _update_status(self) -> None:
-        now = monotonic()
-        if now - self._updated_at >= _STATUS:
-            self._updated_at = now
-            self._display.set_status(self.line)
-
-    @property
-    def _rate(self) -> str:
-        """Text with the rate of the device, and what it misses."""
-        rate, model = self._skin.stats.rate_hz, self._engine.window.rate
-        slow = f" (short taps read low below {_ENOUGH * model:g} Hz)"
-        return f"{rate:.1f} Hz" + slow * (0 < rate < 0.95 * _ENOUGH * model)
-
     @property
     def line(self) -> str:
         """Text with rate, lost frames, broken sensors and delay."""
-        stats = self._skin.stats
+        stats, enough = self._skin.stats, _ENOUGH * self._engine.window.rate
+        slow = f" (short taps read low below {enough:g} Hz)" * (0 < stats.rate_hz < 0.95 * enough)
         counts = stats.list_counts(
             bad_frames="bad", lost="lost", dropped="dropped", resets="restarts", reconnects="reconnected"
         )
@@ -335,11 +317,11 @@ class LiveLoop:
         parts = [
             self._tare.status if self._tare.conversion is not None else "",
             self._tare.warning,
-            self._rate,
+            f"{stats.rate_hz:.1f} Hz{slow}",
             *counts,
             *faulty[:3],
             f"and {len(faulty) - 3} more" if len(faulty) > 3 else "",
-            f"frame to verdict {1e3 * self.p99:.1f} ms (p99)" if self._delays else "",
+            f"frame to verdict {1e3 * np.percentile(self._delays, 99):.1f} ms (p99)" if self._delays else "",
             stats.trouble,
         ]
         return ", ".join(part for part in parts if part)
@@ -421,11 +403,9 @@ class VerdictStream:
         with self._lock:
             if monotonic() - self._sent < HEARTBEAT:
                 return
-            verdict, reason, alarm = self._state
+            verdict = self._state[0]
             if verdict is not None and monotonic() - self._seen >= HEARTBEAT:
                 self._state = None, "no frames", verdict.dangerous
-            elif verdict is None:
-                self._state = None, reason, alarm
             self._send("heartbeat")
 
     def _send(self, event: str) -> None:
@@ -433,12 +413,7 @@ class VerdictStream:
         message = {"number": self._number, "event": event, **verdict_message(*self._state)}
         line = (json_line(message) + "\n").encode()
         for lines in self._readers:
-            try:
-                lines.put_nowait(line)
-            except Full:
-                with suppress(Empty):
-                    lines.get_nowait()
-                lines.put_nowait(line)
+            _put(lines, line)
 
     def join(self, write: Callable[[bytes], object], left: Callable[[], object]) -> Thread:
         """Write the lines from now on in a thread; call ``left`` when they cannot be written any more."""
@@ -462,10 +437,15 @@ class VerdictStream:
         """End every thread."""
         with self._lock:
             for lines in self._readers:
-                with suppress(Full, Empty):
-                    if lines.full():
-                        lines.get_nowait()
-                    lines.put_nowait(None)
+                _put(lines, None)
+
+
+def _put(lines: Lines, line: bytes | None) -> None:
+    """Put a line into a queue to which no other thread adds; a full one drops its oldest line."""
+    if lines.full():
+        with suppress(Empty):
+            lines.get_nowait()
+    lines.put_nowait(line)
 
 
 @contextmanager
@@ -490,7 +470,13 @@ def stream_verdicts(display: Display, where: Literal["stdout"] | int) -> Iterato
             stream.close()
             thread.join(1)
         else:
-            with _server(where) as listening:
+            try:
+                listening = socket.create_server((_HOST, where))
+            except (OSError, OverflowError) as error:
+                raise InputError(
+                    f"no verdicts on port {where}: {error}; give live.verdicts=0, or another"
+                ) from error
+            with listening:
                 clients = Thread(
                     target=_accept, args=(listening, stream, over), name="skin-clients", daemon=True
                 )
@@ -509,13 +495,6 @@ def _print(line: bytes) -> None:
 def _beat(stream: VerdictStream, over: Event) -> None:
     while not over.wait(HEARTBEAT / 5):
         stream.beat()
-
-
-def _server(port: int) -> socket.socket:
-    try:
-        return socket.create_server((_HOST, port))
-    except (OSError, OverflowError) as error:
-        raise InputError(f"no verdicts on port {port}: {error}; give live.verdicts=0, or another") from error
 
 
 def _accept(listening: socket.socket, stream: VerdictStream, over: Event) -> None:

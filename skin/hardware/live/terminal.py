@@ -17,7 +17,6 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial import ConvexHull, Delaunay
 
-from skin.hardware.live.engine import Verdict
 from skin.hardware.live.loop import Display, DisplayState
 from skin.hardware.wire.segmentation import typed_lines
 from skin.learning.representation import centres, weights
@@ -47,16 +46,13 @@ class SkinPicture:
 
     def _weights(self) -> np.ndarray:
         """Return the weights (P, S) of the known sensors."""
-        points, matrix = (
-            self._points[self._known],
-            np.zeros((len(self._targets), len(self._known)), np.float32),
-        )
-        if len(points):
-            flat = len(points) < _FEWEST or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2
-            if flat:
+        points = self._points[self._known]
+        matrix = np.zeros((len(self._targets), len(self._known)), np.float32)
+        if len(points) < _FEWEST or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2:
+            if len(points):
                 matrix[:, self._known] = weights(points, self._targets, "nearest")
-            else:
-                matrix[:, self._known] = weights(points, _inside(points, self._targets), "linear")
+        else:
+            matrix[:, self._known] = weights(points, _inside(points, self._targets), "linear")
         return matrix
 
     def __call__(self, values: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
@@ -110,7 +106,16 @@ def show_in_terminal(display: Display, console: Console) -> Iterator[None]:
         # In the background the program reads no keys; it must not be stopped.
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
     Thread(target=_read_keys, args=(display,), name="skin-keys", daemon=True).start()
-    live = Live(get_renderable=_Screen(display), console=console, refresh_per_second=_HERTZ, transient=True)
+    info, seen = display.info, 0  # frames
+    picture = SkinPicture(info.positions, info.size, _PIXELS, info.top)
+
+    def render() -> RenderableType:
+        nonlocal seen
+        state = display.state(seen)
+        seen = state.number
+        return screen(display, state, picture)
+
+    live = Live(get_renderable=render, console=console, refresh_per_second=_HERTZ, transient=True)
     with live if console.is_terminal else _printed(display, console):
         try:
             yield
@@ -158,20 +163,6 @@ def _sentence(state: DisplayState) -> str:
     return "; ".join(text for text in (alarm + words, verdict.reason) if text)
 
 
-class _Screen:
-    """Renders the display at each call."""
-
-    def __init__(self, display: Display) -> None:
-        info = display.info
-        self._display, self._number = display, 0
-        self._picture = SkinPicture(info.positions, info.size, _PIXELS, info.top)
-
-    def __call__(self) -> RenderableType:
-        state = self._display.state(self._number)
-        self._number = state.number
-        return screen(self._display, state, self._picture)
-
-
 def screen(display: Display, state: DisplayState, picture: SkinPicture) -> RenderableType:
     """Return the skin beside the verdict, with the status of the stream below."""
     info, beside = display.info, Table.grid(padding=(0, 3))
@@ -202,7 +193,11 @@ def _verdict(state: DisplayState) -> RenderableType:
     notes += [verdict.reason] * bool(verdict.unknown) + ["the touch has ended"] * (verdict.contact is None)
     notes += [f"{count} sensors at their limit"] if (count := int(state.saturated.sum())) else []
     notes += ["frames are missing"] * verdict.gap
-    return Group(head, Text(), _bars(verdict), Text("\n".join(notes), "yellow"))
+    bars = Table.grid(padding=(0, 1))
+    for word, chance in verdict.words():
+        filled = round(_BAR * chance)
+        bars.add_row(word, "█" * filled + "░" * (_BAR - filled), f"{100 * chance:.0f} %")
+    return Group(head, Text(), bars, Text("\n".join(notes), "yellow"))
 
 
 def contact_text(contact: float | None) -> str:
@@ -216,11 +211,3 @@ def contact_text(contact: float | None) -> str:
     began = datetime.now() - timedelta(seconds=contact)
     hint = "; if nothing touches the skin, take a new tare" if contact >= _LONG else ""
     return f"contact since {began:%H:%M:%S} ({contact:.0f} s){hint}"
-
-
-def _bars(verdict: Verdict) -> Table:
-    table = Table.grid(padding=(0, 1))
-    for word, chance in verdict.words():
-        filled = round(_BAR * chance)
-        table.add_row(word, "█" * filled + "░" * (_BAR - filled), f"{100 * chance:.0f} %")
-    return table

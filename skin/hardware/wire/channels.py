@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -42,12 +42,6 @@ class RawRange:
         """Whether the scale can be checked: too large or too small a force would leave the range."""
         return self.most is not None
 
-    def rounded(self, values: np.ndarray) -> np.ndarray:
-        """Return values as the device would send them."""
-        least = -np.inf if self.least is None else self.least
-        most = np.inf if self.most is None else self.most
-        return np.clip(np.round(values) if self.whole else values, least, most)
-
 
 class ChannelHealth:
     """Checks channels frame by frame.
@@ -66,15 +60,13 @@ class ChannelHealth:
 
     Attributes:
         limits: as given; a new value applies from the next frame on.
-        largest: largest count of the converter, whose smallest is 0; None: unknown.
+        largest: largest count of the converter, whose smallest is 0; infinite: unknown.
     """
 
     def __init__(self, limits: Limits = (None, None)) -> None:
-        self.limits = limits
-        self.largest: float | None = None
+        self.limits, self.largest = limits, inf
         self._last: np.ndarray | None = None
-        self._begin_time = True
-        self._ever, self._smallest = np.zeros(0, dtype=bool), np.zeros(0)
+        self._begin_time, self._worst = True, np.zeros(0, dtype=int)
 
     def restart(self) -> None:
         """Reset the times after a restart of the device; the known range of each channel is kept."""
@@ -88,7 +80,10 @@ class ChannelHealth:
             t: s, rising.
         """
         if self._last is None or len(values) != len(self._last):
-            self._last = self._begin(values)
+            self._last, self._begin_time = values, True
+            self._least, self._most = np.array(values, dtype=float), np.array(values, dtype=float)
+            self._smallest = np.full(len(values), np.inf)
+            self._ever = np.zeros(len(values), dtype=bool)
         if self._begin_time:
             self._changed_at, self._lively_since, self._begin_time = np.full(len(values), t), t, False
         step = np.abs(values - self._last)
@@ -102,42 +97,23 @@ class ChannelHealth:
         silent = t - self._changed_at
         if 2 * np.count_nonzero(silent < _LIVELY) <= len(values):
             self._lively_since = t
-        self._silent = (silent >= _SILENT) & (t - self._lively_since >= _SILENT)
+        dull = (silent >= _SILENT) & (t - self._lively_since >= _SILENT)
         low, high = self.limits
         at_limit = (values >= (np.inf if high is None else high)) | (
             values <= (-np.inf if low is None else low)
         )
         loaded = self._ever & (self._most - self._least >= _FAR * self._smallest)
-        self._saturated = at_limit | (self._silent & loaded & (values >= self._most))
-        self._silent &= ~self._saturated
-        self._impossible = self._outside(values)
-        self._saturated &= ~self._impossible
-        return ~self._silent & ~self._impossible, self._saturated
-
-    def _outside(self, values: np.ndarray) -> np.ndarray:
-        """Return which values the converter cannot give."""
-        if self.largest is None:
-            return np.zeros(len(values), dtype=bool)
-        return (values > self.largest) | (values < -_BELOW * self.largest)
+        impossible = (values > self.largest) | (values < -_BELOW * self.largest)
+        saturated = at_limit | (dull & loaded & (values >= self._most))
+        dull &= ~saturated
+        saturated &= ~impossible
+        worst = np.where(dull & ~self._ever, 3, np.where(dull, 2, saturated))
+        self._worst = np.where(impossible, 4, worst)
+        return ~dull & ~impossible, saturated
 
     def states(self) -> tuple[ChannelState, ...]:
         """Return the state of each channel at the last frame; empty before the first."""
-        if self._last is None:
-            return ()
-        dead = self._silent & ~self._ever
-        kinds: list[ChannelState] = ["ok", "saturated", "stuck", "dead", "impossible"]
-        worst = np.where(dead, 3, np.where(self._silent, 2, np.where(self._saturated, 1, 0)))
-        worst = np.where(self._impossible, 4, worst)
-        return tuple(kinds[number] for number in worst)
-
-    def _begin(self, values: np.ndarray) -> np.ndarray:
-        self._begin_time = True
-        self._least, self._most = np.array(values, dtype=float), np.array(values, dtype=float)
-        self._smallest = np.full(len(values), np.inf)
-        self._ever = np.zeros(len(values), dtype=bool)
-        self._saturated, self._silent = self._ever.copy(), self._ever.copy()
-        self._impossible = self._ever.copy()
-        return values
+        return tuple(get_args(ChannelState)[number] for number in self._worst)
 
 
 _LARGEST = 1e9  # N: more would overflow in a network or in JSON
@@ -376,28 +352,23 @@ class Tare:
             if frame.t_host > self._deadline:
                 self._deadline, self.status = None, ""
                 return
-        if not self._conversion_known(frame.t_host):
+        self._first = frame.t_host if self._first is None else self._first
+        header = self._header()
+        try:
+            plain = self._conversion(None, header)
+        except InputError:
+            # The header may arrive a little late.
+            if header is not None or frame.t_host - self._first > _HEADER:
+                raise
+            self.status = "waiting for the header of the device"
             return
         if not self._seconds:
-            self.conversion, self.status = self._conversion(None, self._header()), ""
+            self.conversion, self.status = plain, ""
         elif touched and not self._forced:
             self._quiet.clear()
             self.status = "the new baseline waits: something touches the skin"
         else:
             self._collect(frame)
-
-    def _conversion_known(self, now: float) -> bool:
-        """Return whether unit and scale are known; the header may arrive a little late."""
-        self._first = now if self._first is None else self._first
-        header = self._header()
-        try:
-            self._conversion(None, header)
-        except InputError:
-            if header is not None or now - self._first > _HEADER:
-                raise
-            self.status = "waiting for the header of the device"
-            return False
-        return True
 
     def _collect(self, frame: Frame) -> None:
         """Take the baseline from the latest frames if they are long enough and quiet."""
@@ -451,18 +422,15 @@ class Tare:
         noise = steps.std(axis=0) / np.sqrt(2) * np.abs(fresh.scale)
         changing = (steps != 0).mean(axis=0)
         self.conversion = replace(fresh, noise=noise, changing=changing)
-        self.warning = self._lacks(untared, changing)
-        self.count, self.status, self._deadline, self._forced = self.count + 1, "", None, False
-        self._quiet.clear()
-
-    def _lacks(self, untared: np.ndarray, changing: np.ndarray) -> str:
-        passed = self._quiet[-1].t - self._quiet[0].t
-        expected = changing.sum() * (len(self._quiet) - 1) * FROZEN / passed
-        silent = f"this device shows no noise: readings that freeze for {FROZEN:g} s cannot be seen"
-        texts = (
+        lacks = (
             [f"{_channels(untared)} at the limit or without a value: no baseline"] if untared.any() else []
         )
-        return "; ".join([*texts, silent] if expected < EXPECTED else texts)
+        passed = self._quiet[-1].t - self._quiet[0].t
+        if changing.sum() * (len(self._quiet) - 1) * FROZEN / passed < EXPECTED:
+            lacks.append(f"this device shows no noise: readings that freeze for {FROZEN:g} s cannot be seen")
+        self.warning = "; ".join(lacks)
+        self.count, self.status, self._deadline, self._forced = self.count + 1, "", None, False
+        self._quiet.clear()
 
 
 def _channels(which: np.ndarray) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from skin.device.resampling import After, Frame, FrameError
 from skin.errors import InputError
 from skin.hardware.wire.protocol import (
-    DetectionResult,
     Format,
     FrameFormat,
     Header,
@@ -263,10 +262,12 @@ class Decoder:
         polarity: Sequence[int] = (),
     ) -> None:
         self.sensors, self.format = sensors, format
-        self.stats, self.quality = Stats(), _Quality()
+        self.stats = Stats()
+        self._compared_at: float | None = None
+        self._good = self._bad = 0
+        self._latest_bad = FrameError("")
         self.header: Header | None = None
         self._order, self._clock, self._counted = SequenceTracker(), HostClock(), FrameClock()
-        self._all_valid = np.ones(sensors or 0, dtype=bool)
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
@@ -274,8 +275,9 @@ class Decoder:
 
     def _begin(self) -> None:
         self.frame_format: FrameFormat | None = None
+        self.stats.format = self.stats.check = ""
         self._buffer = b""
-        self._found = DetectionResult(None, None, None)
+        self._count_seen: int | None = None
         self._receiving, self._fed_at = 0.0, float("nan")
         self._whole = self._overlong = self._synchronous = False
         self._missing = 0
@@ -306,14 +308,14 @@ class Decoder:
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
         if len(self._buffer) > _LONGEST:
             self._buffer, self._overlong = b"", True
-        self.quality.count(now, self.stats.frames - good, self.stats.bad_frames - bad)
+        self._compare(now, self.stats.frames - good, self.stats.bad_frames - bad)
         return frames
 
     def error(self) -> InputError | None:
         """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None."""
         if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
             return None
-        return detection_error(self._buffer, self._found, self.sensors)
+        return detection_error(self._buffer, self._count_seen, self.sensors)
 
     @property
     def _enough(self) -> int:
@@ -327,12 +329,12 @@ class Decoder:
         self._fed_at = now
         if b"\n" not in data and b"\0" not in data:
             return False
-        self._found = detect_format(self._buffer, self.sensors, self.format)
-        self.frame_format = self._found.frame_format
+        self.frame_format, self._count_seen, header = detect_format(self._buffer, self.sensors, self.format)
         if self.frame_format is None:
             return False
-        self.header = self._found.header or self.header
+        self.header = header or self.header
         self.sensors = self.frame_format.sensors
+        self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         if len(self._latest) != self.sensors:
@@ -347,29 +349,20 @@ class Decoder:
                 self._overlong = False
                 raise FrameError("long")
             raw = self.frame_format.read(piece)
-            if raw is None:
-                self._comment(piece)
+            if isinstance(raw, bytes):
+                self.header = parse_header(raw) or self.header
                 return None
             if first and self.frame_format.check != "crc16":
                 raise FrameError("structure")
             return self._place_frame(raw, now)
         except FrameError as bad:
-            self._count_bad(bad)
+            if self._synchronous or self._missing:
+                self._synchronous, self._latest_bad = False, bad
+                self._missing += 1
+                self.stats.bad[bad.reason] += 1
+            else:
+                self.stats.skipped += 1
             return None
-
-    def _comment(self, piece: bytes) -> None:
-        assert self.frame_format is not None
-        if text := self.frame_format.comment(piece):
-            self.header = parse_header(text) or self.header
-
-    def _count_bad(self, bad: FrameError) -> None:
-        if not self._synchronous and not self._missing:
-            self.stats.skipped += 1
-            return
-        self._synchronous = False
-        self._missing += 1
-        self.stats.bad[bad.reason] += 1
-        self.quality.note(bad)
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
         t_us = raw.t_us
@@ -383,58 +376,37 @@ class Decoder:
         stats.lost += lost
         stats.gaps += after == "gap"
         stats.resets += after == "reset"
-        stats.weak += self.frame_format is not None and self.frame_format.check != "crc16"
+        stats.weak += stats.check != "crc16"
         self._synchronous, self._missing = True, 0
         if after and after != "gap":
             self._clock.restart()
         if self._channels is not None:
             raw = raw._replace(values=raw.values[self._channels])
-        values, valid = (raw.values, self._all_valid) if raw.finite else self._mask_missing(raw)
+        values, valid = raw.values, self._all_valid
+        if not raw.finite:
+            valid = np.isfinite(values)
+            stats.invalid += len(valid) - int(np.count_nonzero(valid))
+            values = np.where(valid, values, self._latest)
         self._latest = values
         frame = Frame(raw.seq, t, self._clock(t, now), values, valid, segment, lost, after)
-        return frame if self._polarity is None else self._apply_polarity(frame, self._polarity)
-
-    def _apply_polarity(self, frame: Frame, polarity: np.ndarray) -> Frame:
-        """Return a frame with its polarity; channels whose values fall with force end at 0 counts."""
-        at_limit = (polarity < 0) & (frame.values <= 0)
+        if self._polarity is None:
+            return frame
+        # Channels whose values fall with force end at 0 counts.
         counted = self.header is not None and self.header.bits is not None
-        return frame._replace(polarity=polarity, saturated=at_limit if counted else None)
+        at_limit = (self._polarity < 0) & (values <= 0)
+        return frame._replace(polarity=self._polarity, saturated=at_limit if counted else None)
 
-    def _mask_missing(self, raw: RawFrame) -> tuple[np.ndarray, np.ndarray]:
-        """Return values without NaN, (S,), and which of them the device sent, (S,), bool."""
-        valid = np.isfinite(raw.values)
-        self.stats.invalid += len(valid) - int(np.count_nonzero(valid))
-        return np.where(valid, raw.values, self._latest), valid
-
-
-class _Quality:
-    """Compares good with bad frames over two seconds at a time.
-
-    Attributes:
-        trouble: a message; empty while most frames are good.
-    """
-
-    def __init__(self) -> None:
-        self.trouble = ""
-        self._since: float | None = None
-        self._good = self._bad = 0
-        self._latest = FrameError("")
-
-    def note(self, bad: FrameError) -> None:
-        """Remember the latest bad frame."""
-        self._latest = bad
-
-    def count(self, now: float, good: int, bad: int) -> None:
-        """Add the numbers of frames received by ``now``, s."""
-        self._since = now if self._since is None else self._since
+    def _compare(self, now: float, good: int, bad: int) -> None:
+        """Compare the good frames received by ``now``, s, with the bad ones, over two seconds at a time."""
+        self._compared_at = now if self._compared_at is None else self._compared_at
         self._good += good
         self._bad += bad
-        if now - self._since >= _SPAN:
-            self.trouble = self._sentence() if self._bad > max(self._good, _FEW) else ""
-            self._since, self._good, self._bad = now, 0, 0
-
-    def _sentence(self) -> str:
-        share = f"{self._bad} of {self._bad + self._good} frames in {_SPAN:g} s were bad"
-        if self._latest.reason == "fields":
-            return f"{share}: the device sends {self._latest.found} values per frame now"
-        return f"{share} ({self._latest.reason}): wrong baud rate or format?"
+        if now - self._compared_at < _SPAN:
+            return
+        trouble = ""
+        if self._bad > max(self._good, _FEW):
+            share = f"{self._bad} of {self._bad + self._good} frames in {_SPAN:g} s were bad"
+            trouble = f"{share} ({self._latest_bad.reason}): wrong baud rate or format?"
+            if self._latest_bad.reason == "fields":
+                trouble = f"{share}: the device sends {self._latest_bad.found} values per frame now"
+        self.stats.trouble, self._compared_at, self._good, self._bad = trouble, now, 0, 0

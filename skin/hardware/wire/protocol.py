@@ -333,8 +333,7 @@ class Announcement:
 def encode_announcement(announcement: Announcement) -> bytes:
     """Return ``# gesture number=0 seq=300 frames=300 big=1 ...*HHHH``, LF at its end."""
     pairs = {name: getattr(announcement, name) for name in _KNOWN} | dict(announcement.labels)
-    body = ("# gesture " + " ".join(f"{name}={value}" for name, value in pairs.items())).encode()
-    return body + b"*%04X\n" % crc16(body)
+    return _checked("# gesture " + " ".join(f"{name}={value}" for name, value in pairs.items()), "crc16")
 
 
 def parse_announcement(line: bytes) -> Announcement | None:
@@ -388,11 +387,11 @@ class TextFormat:
     name: ClassVar[str] = "text"
     delimiter: ClassVar[bytes] = b"\n"
 
-    def read(self, piece: bytes) -> RawFrame | None:
-        """Return the frame in a line."""
+    def read(self, piece: bytes) -> RawFrame | bytes:
+        """Return the frame in a line, or the line where it is empty or a comment; else raise FrameError."""
         line = piece.removesuffix(b"\r")
         if not line or line.startswith(b"#"):
-            return None
+            return line
         fields, check, finite = parse_line(line)
         if check != self.check:
             raise FrameError("checksum")
@@ -407,10 +406,6 @@ class TextFormat:
             raise FrameError("number")
         return RawFrame(int(seq), t_us, np.array(fields[2:]), finite)
 
-    def comment(self, piece: bytes) -> bytes | None:
-        """Return the comment line; None if it is not a comment."""
-        return piece.removesuffix(b"\r") if piece.startswith(b"#") else None
-
 
 @dataclass(frozen=True)
 class BinaryFormat:
@@ -421,41 +416,28 @@ class BinaryFormat:
     delimiter: ClassVar[bytes] = b"\0"
     check: ClassVar[Check] = "crc16"
 
-    def read(self, piece: bytes) -> RawFrame | None:
-        """Return the frame between two zeros."""
-        if not piece or self.comment(piece) is not None:
-            return None
+    def read(self, piece: bytes) -> RawFrame | bytes:
+        """Return the frame between two zeros, or the text of a comment; else raise FrameError."""
+        comment = decode_comment(piece) if piece else b""
+        if comment is not None:
+            return comment
         frame = decode_frame(piece)
         if len(frame.values) != self.sensors:
             raise FrameError("fields", len(frame.values))
         return frame
-
-    def comment(self, piece: bytes) -> bytes | None:
-        """Return the text of a comment; None if it is not a comment."""
-        return decode_comment(piece)
 
 
 FrameFormat = TextFormat | BinaryFormat
 """A detected format: S ``sensors``, the ``delimiter`` at the end of a frame and the kind of its ``check``."""
 
 
-@dataclass(frozen=True)
-class DetectionResult:
-    """Result of :func:`detect_format`.
+def detect_format(
+    data: bytes, sensors: int | None, format: Format
+) -> tuple[FrameFormat | None, int | None, Header | None]:
+    """Return the format of the first bytes of a connection; None if it is not known yet.
 
-    Attributes:
-        frame_format: the format, or None if it is not known yet.
-        sensors: number of values in readable frames that do not match the layout; or None.
-        header: the last one received.
-    """
-
-    frame_format: FrameFormat | None
-    sensors: int | None
-    header: Header | None
-
-
-def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectionResult:
-    """Detect the format from the first bytes of a connection.
+    Second, the number of values in readable frames that do not match the layout; or None. Third, the last
+    header received.
 
     Args:
         data: from the first byte on; an incomplete piece at the end is ignored.
@@ -464,23 +446,28 @@ def detect_format(data: bytes, sensors: int | None, format: Format) -> Detection
     """
     count_seen = None
     if format != "text":
-        counts = _binary_counts(data)
+        counts = list[int]()
+        for piece in data.split(b"\0")[:-1]:
+            with suppress(FrameError):
+                counts.append(len(decode_frame(piece).values))
         for count in counts:
             if counts.count(count) >= _FRAMES and sensors in (None, count):
-                return DetectionResult(BinaryFormat(count), None, None)
+                return BinaryFormat(count), None, None
             count_seen = count
     if format == "binary":
-        return DetectionResult(None, count_seen, None)
+        return None, count_seen, None
     return _detect_text(data, sensors, count_seen)
 
 
-def detection_error(data: bytes, result: DetectionResult, sensors: int | None) -> InputError:
+def detection_error(data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
     """Return the error for data in which no format was detected."""
-    if _has_constant_time(run := _lines(data)):
+    # The first piece may be half a line.
+    run = [line for piece in data.split(b"\n")[1:-1] if (line := _parse_numbers(piece))]
+    if _has_constant_time(run := [line for line in run if len(line.fields) > 2]):
         return stopped_clock_error(len(run), run[0].fields[1])
-    if result.sensors is not None and sensors is not None:
+    if count_seen is not None and sensors is not None:
         return InputError(
-            f"the device sends {result.sensors} values per frame, the layout has {sensors} sensors: give its "
+            f"the device sends {count_seen} values per frame, the layout has {sensors} sensors: give its "
             "own layout, as in layout=file layout.path=FILE.csv"
         )
     return InputError(
@@ -497,9 +484,13 @@ def stopped_clock_error(frames: int, t_us: float) -> InputError:
     )
 
 
-def _is_numeric(line: Line) -> bool:
-    """Return whether more than half of the fields are numbers; only such lines show a format."""
-    return line.finite or 2 * sum(map(isfinite, line.fields)) > len(line.fields)
+def _parse_numbers(line: bytes) -> Line | None:
+    """Return a line if more than half of its fields are numbers; only such lines show a format."""
+    try:
+        read = parse_line(line.removesuffix(b"\r"))
+    except FrameError:
+        return None
+    return read if 2 * sum(map(isfinite, read.fields)) > len(read.fields) else None
 
 
 def _has_constant_time(run: Sequence[Line]) -> bool:
@@ -511,48 +502,27 @@ def _has_constant_time(run: Sequence[Line]) -> bool:
     return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
 
 
-def _lines(data: bytes) -> list[Line]:
-    """Return the lines of numbers; the first piece may be half a line."""
-    lines = []
-    for piece in data.split(b"\n")[1:-1]:
-        with suppress(FrameError):
-            lines.append(parse_line(piece.removesuffix(b"\r")))
-    return [line for line in lines if _is_numeric(line)]
-
-
-def _binary_counts(data: bytes) -> list[int]:
-    counts = []
-    for piece in data.split(b"\0")[:-1]:
-        with suppress(FrameError):
-            counts.append(len(decode_frame(piece).values))
-    return counts
-
-
-def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectionResult:
+def _detect_text(
+    data: bytes, sensors: int | None, count_seen: int | None
+) -> tuple[FrameFormat | None, int | None, Header | None]:
     header, run = None, list[Line]()
     for piece in data.split(b"\n")[:-1]:
         line = piece.removesuffix(b"\r")
         if line.startswith(b"#"):
             header = parse_header(line) or header
             continue
-        try:
-            read = parse_line(line)
-        except FrameError:
-            run = []
-            continue
-        if not _is_numeric(read):
+        if (read := _parse_numbers(line)) is None:
             run = []
             continue
         if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
             run = []
-        run = [*run[1 - _LINES_UNKNOWN :], read] if read.fields else []
+        run = [*run[1 - _LINES_UNKNOWN :], read]
         expected = sensors or (header.n if header else None)
         if frame_format := _judge(run, expected, learn=sensors is None):
-            detected = replace(frame_format, trailing=ends_with_separator(line))
-            return DetectionResult(detected, None, header)
+            return replace(frame_format, trailing=ends_with_separator(line)), None, header
         if len(run) >= _LINES:
             count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
-    return DetectionResult(None, count_seen, header)
+    return None, count_seen, header
 
 
 def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:

@@ -4,13 +4,11 @@ import errno
 import logging
 import os
 import socket
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import count
 from math import inf
-from threading import Condition, Event, Thread
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 from urllib.parse import urlsplit
@@ -151,20 +149,15 @@ def check_port(port: str) -> None:
         InputError: there is no such device, or nothing on this machine listens at the address.
     """
     if port.startswith("socket://"):
-        _check_address(*_address(port), port)
-    elif os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
+        try:
+            *kind, _, address = socket.getaddrinfo(*_address(port), type=socket.SOCK_STREAM)[0]
+            with socket.socket(*kind) as probe:
+                probe.bind(address)  # an address of this machine that could be taken
+        except OSError:
+            return  # something listens, or it is another machine
+        raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
+    if os.name == "posix" and "/" in port and "://" not in port and not os.path.exists(port):
         raise InputError(f"no port {port}: {_existing()}")
-
-
-def _check_address(host: str, number: int, port: str) -> None:
-    """Refuse an address of this machine at which nothing listens: one that could be taken."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.bind(address)
-    except OSError:
-        return  # something listens, or it is another machine
-    raise InputError(f"cannot reach {port}: nothing listens there; start what sends the frames first")
 
 
 class _Serial:
@@ -261,51 +254,43 @@ _WEAK = {
 }
 
 
-class Feed(Protocol):
-    """A sequence of frames.
+class WireFeed:
+    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
+
+    Args:
+        opener: opens the stream of bytes.
+        decoder: turns them into frames.
+        limits: smallest and largest value of a channel.
+        silence: s without a byte after which the stream counts as gone.
 
     Attributes:
         patient: the feed can wait, so no frame needs to be dropped.
     """
 
-    patient: bool
-
-    def poll(self) -> list[Frame]:
-        """Return the frames of about 0.1 s; OSError once it is unplugged, EOFError at its end."""
-
-    def states(self) -> tuple[ChannelState, ...]:
-        """Return the state of each channel."""
-
-    def close(self) -> None:
-        """Close the feed."""
-
-
-class WireFeed:
-    """Frames decoded from bytes, with checked channels; logs bad frames once a second.
-
-    Args:
-        stream: of bytes.
-        decoder: turns them into frames.
-        limits: smallest and largest value of a channel.
-        silence: s without a byte after which the stream counts as gone.
-    """
-
     patient = False
 
     def __init__(
-        self,
-        stream: ByteStream,
-        decoder: Decoder,
-        limits: Limits | None,
-        silence: float = inf,
-        health: ChannelHealth | None = None,
+        self, opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float = inf
     ) -> None:
-        self._stream, self._decoder, self._limits = stream, decoder, limits
-        self._health = health or ChannelHealth()
-        self._told = False
-        self._said = Counter(decoder.stats.bad)
-        self._said_at = self._heard_at = monotonic()
-        self._silence = silence
+        self._opener, self._decoder, self._limits, self._silence = opener, decoder, limits, silence
+        self._health = ChannelHealth(limits or (None, None))
+        self._stream = opener()
+        self._begin()
+
+    def open(self) -> None:
+        """Open the stream again after a disconnection.
+
+        The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
+        """
+        self._stream = self._opener()
+        self._decoder.restart()
+        self._health.restart()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._warned = False
+        self._reported = Counter(self._decoder.stats.bad)
+        self._reported_at = self._heard_at = monotonic()
         self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
 
     def poll(self) -> list[Frame]:
@@ -323,11 +308,21 @@ class WireFeed:
         frames = self._decoder.feed(data, now) if data else []
         if frames:
             self._prepare()
-            self._check_clock(frames, now)
+            if frames[-1].t != self._clock:
+                self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
+            self._clock_frames += len(frames)
+            least, few = _STILL
+            if now - self._clock_since >= least and self._clock_frames >= few:
+                raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
         elif data and (error := self._decoder.error()):
             raise error
-        if now - self._said_at >= 1:
-            self._say(now)
+        stats = self._decoder.stats
+        if now - self._reported_at >= 1:
+            fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
+            if fresh:
+                reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
+                trouble = f"; {stats.trouble}" if stats.trouble else ""
+                _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, trouble)
         return [self._judge(frame) for frame in frames]
 
     def states(self) -> tuple[ChannelState, ...]:
@@ -340,25 +335,13 @@ class WireFeed:
 
     def _prepare(self) -> None:
         """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
-        frame_format, header = self._decoder.frame_format, self._decoder.header
-        if not self._told and frame_format is not None and frame_format.check in _WEAK:
-            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[frame_format.check])
-        self._told = True
+        check, header = self._decoder.stats.check, self._decoder.header
+        if not self._warned and check in _WEAK:
+            _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[check])
+        self._warned = True
         if header is not None and header.bits:
             self._health.largest = 2**header.bits - 1
-        if self._limits is not None:
-            self._health.limits = self._limits
-        elif header is not None and header.bits:
-            self._health.limits = (None, 2**header.bits - 1)
-
-    def _check_clock(self, frames: list[Frame], now: float) -> None:
-        """Raise InputError if frames arrive but the device's clock stands still."""
-        if frames[-1].t != self._clock:
-            self._clock, self._clock_since, self._clock_frames = frames[-1].t, now, 0
-        self._clock_frames += len(frames)
-        least, few = _STILL
-        if now - self._clock_since >= least and self._clock_frames >= few:
-            raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
+            self._health.limits = self._limits or (None, self._health.largest)
 
     def _judge(self, frame: Frame) -> Frame:
         if frame.after not in ("", "gap"):
@@ -367,14 +350,6 @@ class WireFeed:
         if frame.saturated is not None:
             saturated = saturated | frame.saturated
         return frame._replace(valid=valid & frame.valid, saturated=saturated & frame.valid)
-
-    def _say(self, now: float) -> None:
-        fresh = self._decoder.stats.bad - self._said
-        self._said, self._said_at = Counter(self._decoder.stats.bad), now
-        if fresh:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in fresh.most_common())
-            trouble = self._decoder.quality.trouble
-            _log.warning("%d bad frames (%s)%s", fresh.total(), reasons, f"; {trouble}" if trouble else "")
 
 
 class PlaybackFeed:
@@ -420,129 +395,7 @@ class PlaybackFeed:
         """Return nothing: the frames of a file already have masks of valid values."""
         return ()
 
-    def close(self) -> None:
-        """Do nothing."""
+    def open(self) -> None:
+        """Do nothing, as :meth:`close`."""
 
-
-_PAUSE = 0.002  # s between two reads of the port: fewer and larger pieces cost a tenth of the time
-_RATE = 256  # frames over which the rate is taken
-_WAKE = 0.2  # s: longer waits for a lock would block Ctrl-C on Windows
-
-
-class Reader:
-    """Reads frames until it is closed. A full queue drops its oldest frame; the next one counts it as lost.
-
-    Args:
-        connect: opens the feed; called again after each disconnection.
-        queue: largest number of frames in the queue.
-        reconnect: try to open the feed again after a disconnection.
-        backoff: s before the first attempt, and the longest between two; it doubles until frames arrive.
-
-    Attributes:
-        dropped: number of frames dropped from a full queue.
-        reconnects: number of reconnections.
-        away: the feed is disconnected and being reopened.
-        error: why the thread ended; EOFError at the end of a recording.
-    """
-
-    def __init__(
-        self,
-        connect: Callable[[], Feed],
-        queue: int,
-        reconnect: bool = False,
-        backoff: tuple[float, float] = (1.0, 10.0),
-    ) -> None:
-        self._connect, self._reconnect, self._backoff = connect, reconnect, backoff
-        self._wait = backoff[0]
-        self.dropped = self.reconnects = 0
-        self.away = False
-        self.error: Exception | None = None
-        self._frames: deque[Frame] = deque()
-        self._most = queue
-        self._times: deque[float] = deque(maxlen=_RATE)
-        self._stop, self._fresh = Event(), Condition()
-        self.feed = connect()
-        self._thread = Thread(target=self._run, name="skin-reader", daemon=True)
-        self._thread.start()
-
-    @property
-    def rate(self) -> float:
-        """Frames per second over the last frames of a segment, by the device's clock, Hz; 0 if unknown."""
-        with self._fresh:
-            times = self._times
-            passed = times[-1] - times[0] if len(times) > 1 else 0.0
-            return (len(times) - 1) / passed if passed > 0 else 0.0
-
-    def take(self, count: int, timeout: float) -> Iterator[Frame]:
-        """Yield frames as they arrive: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
-        deadline = monotonic() + timeout
-        for _ in range(count):
-            with self._fresh:
-                while not self._frames:
-                    left = deadline - monotonic()
-                    if self.error is not None or left <= 0:
-                        return
-                    self._fresh.wait(min(left, _WAKE))
-                frame = self._frames.popleft()
-                self._fresh.notify_all()
-            yield frame
-
-    def close(self) -> None:
-        """End the thread, then close the source."""
-        self._stop.set()
-        with self._fresh:
-            self._fresh.notify_all()
-        self._thread.join(timeout=5)
-        with suppress(OSError):
-            self.feed.close()
-
-    def _run(self) -> None:
-        try:
-            while not self._stop.is_set():
-                self._step()
-        except Exception as error:
-            with self._fresh:
-                self.error = error
-                self._fresh.notify_all()
-
-    def _step(self) -> None:
-        try:
-            frames = self.feed.poll()
-        except OSError as error:
-            with suppress(OSError):
-                self.feed.close()
-            if not self._reconnect:
-                raise SkinDisconnected(f"the skin was unplugged: {error}") from error
-            _log.warning("the skin was unplugged (%s); trying again", error)
-            self._reopen()
-            return
-        if frames:
-            self._wait = self._backoff[0]
-            self._push(frames)
-            if not self.feed.patient:
-                self._stop.wait(_PAUSE)
-
-    def _reopen(self) -> None:
-        self.away = True
-        while not self._stop.wait(self._wait):
-            self._wait = min(2 * self._wait, self._backoff[1])
-            with suppress(OSError, InputError):
-                self.feed = self._connect()
-                self.reconnects += 1
-                self.away = False
-                return
-
-    def _push(self, frames: list[Frame]) -> None:
-        with self._fresh:
-            for frame in frames:
-                if frame.after not in ("", "gap"):
-                    self._times.clear()
-                self._times.append(frame.t)
-                while self.feed.patient and len(self._frames) >= self._most and not self._stop.is_set():
-                    self._fresh.wait(_WAKE)
-                self._frames.append(frame)
-                if len(self._frames) > self._most:
-                    dropped = self._frames.popleft()
-                    self._frames[0] = self._frames[0].behind(dropped)
-                    self.dropped += 1
-                self._fresh.notify_all()
+    close = open

@@ -3,14 +3,16 @@
 torch is not imported.
 """
 
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count
 from math import inf
+from threading import Condition, Event, Thread
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +21,6 @@ from skin.device.resampling import Frame, check_rate
 from skin.errors import InputError
 from skin.hardware.wire.channels import (
     PATIENCE,
-    ChannelHealth,
     ChannelState,
     Limits,
     RawRange,
@@ -34,10 +35,8 @@ from skin.hardware.wire.decoder import Decoder, Stats
 from skin.hardware.wire.protocol import Header, encode_header
 from skin.hardware.wire.reader import (
     ByteStream,
-    Feed,
     PlaybackFeed,
     PortSettings,
-    Reader,
     SkinDisconnected,
     SkinTimeout,
     WireFeed,
@@ -46,24 +45,55 @@ from skin.hardware.wire.reader import (
 from skin.hardware.wire.segmentation import AnnouncementListener
 
 if TYPE_CHECKING:
+    from skin.device.base import AbstractDevice
     from skin.device.touches import Touches
+
+
+_log = logging.getLogger("skin.hardware.wire")
+_PAUSE = 0.002  # s between two reads of the port: fewer and larger pieces cost a tenth of the time
+_RATE = 256  # frames over which the rate is taken
+_WAKE = 0.2  # s: longer waits for a lock would block Ctrl-C on Windows
 
 
 class Skin:
     """Frames from an open skin; iterate over it, or :meth:`read` a block.
 
-    Values are in the device's unit; ``frame.values - skin.baseline`` is the change due to touch.
+    Values are in the device's unit; ``frame.values - skin.baseline`` is the change due to touch. A thread
+    reads them until the skin is closed. A full queue drops its oldest frame; the next one counts it as lost.
+
+    Args:
+        feed: open.
+        decoder: of the feed; None: it needs none.
+        settings: timeout and backoff.
+        baseline: from an earlier tare.
+        queue: largest number of frames in the queue.
+        reconnect: try to open the feed again after a disconnection.
 
     Attributes:
         baseline: (S,), values of the untouched skin, in the device's unit; None before the first tare.
+        away: the skin is unplugged and being reopened.
     """
 
     def __init__(
-        self, reader: Reader, decoder: Decoder | None, timeout: float, baseline: np.ndarray | None = None
+        self,
+        feed: WireFeed | PlaybackFeed,
+        decoder: Decoder | None,
+        settings: PortSettings,
+        baseline: np.ndarray | None,
+        queue: int,
+        reconnect: bool = False,
     ) -> None:
-        self._reader, self._decoder, self._timeout = reader, decoder, timeout
+        self._feed, self._decoder = feed, decoder
+        self._stats = Stats() if decoder is None else decoder.stats
+        self._timeout, self._backoff, self._wait = settings.timeout, settings.backoff, settings.backoff[0]
         self.baseline = baseline
-        self._taken = 0
+        self._most, self._reconnect, self.away = queue, reconnect, False
+        self._error: Exception | None = None  # why the thread ended; EOFError at the end of a recording
+        self._frames: deque[Frame] = deque()
+        self._times: deque[float] = deque(maxlen=_RATE)
+        self._stop, self._fresh = Event(), Condition()
+        self._thread = Thread(target=self._run, name="skin-reader", daemon=True)
+        self._thread.start()
 
     def __enter__(self) -> "Skin":
         return self
@@ -73,7 +103,12 @@ class Skin:
 
     def close(self) -> None:
         """End the thread and close the port."""
-        self._reader.close()
+        self._stop.set()
+        with self._fresh:
+            self._fresh.notify_all()
+        self._thread.join(timeout=5)
+        with suppress(OSError):
+            self._feed.close()
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames as they arrive, to the end of a recording.
@@ -83,16 +118,13 @@ class Skin:
             SkinDisconnected: it was unplugged, and ``reconnect`` is not set.
         """
         while True:
-            back = self._reader.reconnects
-            frame = next(self._reader.take(1, self._timeout), None)
+            back = self._stats.reconnects
+            frame = next(self._take(1, self._timeout), None)
             if frame is not None:
-                self._taken += 1
                 yield frame
-            elif isinstance(self._reader.error, EOFError):
+            elif isinstance(self._error, EOFError):
                 return
-            elif self._reader.error is not None or (
-                not self._reader.away and self._reader.reconnects == back
-            ):
+            elif self._error is not None or (not self.away and self._stats.reconnects == back):
                 self._explain(1, self._timeout, [])
 
     def read(self, count: int, timeout: float | None = None) -> list[Frame]:
@@ -108,8 +140,7 @@ class Skin:
             InputError: nothing can be read: another format, baud rate or number of sensors.
         """
         timeout = self._timeout if timeout is None else timeout
-        frames = list(self._reader.take(count, timeout))
-        self._taken += len(frames)
+        frames = list(self._take(count, timeout))
         if len(frames) < count:
             self._explain(count, timeout, frames)
         return frames
@@ -146,37 +177,29 @@ class Skin:
         return self._decoder.header if self._decoder else None
 
     @property
-    def away(self) -> bool:
-        """Whether the skin is unplugged and being reopened."""
-        return self._reader.away
-
-    @property
     def channels(self) -> tuple[ChannelState, ...]:
         """State of each channel at the last frame; empty if channels are not checked."""
-        return self._reader.feed.states()
+        return self._feed.states()
 
     @property
     def stats(self) -> Stats:
         """Statistics of what was received so far."""
-        reader, decoder = self._reader, self._decoder
-        if decoder is None:
-            stats = Stats(frames=self._taken)
-        else:
-            stats = replace(decoder.stats, bad=Counter(decoder.stats.bad), trouble=decoder.quality.trouble)
-            if (frame_format := decoder.frame_format) is not None:
-                stats.format, stats.check = frame_format.name, frame_format.check
-        stats.dropped, stats.reconnects, stats.rate_hz = reader.dropped, reader.reconnects, reader.rate
-        return stats
+        with self._fresh:
+            times = self._times
+            passed = times[-1] - times[0] if len(times) > 1 else 0.0
+            # By the device's clock, over the last frames of a segment.
+            rate = (len(times) - 1) / passed if passed > 0 else 0.0
+        return replace(self._stats, bad=Counter(self._stats.bad), rate_hz=rate)
 
     def _explain(self, count: int, timeout: float, frames: list[Frame]) -> None:
         """Raise the error that explains why ``count`` frames are not available."""
-        error, stats = self._reader.error, self.stats
+        error, stats = self._error, self._stats
         if isinstance(error, SkinDisconnected | EOFError):
             raise SkinDisconnected(str(error), frames) from error
         if error is not None:
             raise error
         message = f"{len(frames)} of {count} frames arrived within {timeout:g} s"
-        if self._reader.away:
+        if self.away:
             raise SkinTimeout(f"{message}: the skin is unplugged; trying again", frames)
         if not stats.bytes and not stats.frames:
             raise SkinTimeout(f"{message}: port open, nothing received; is the device sending?", frames)
@@ -185,16 +208,75 @@ class Skin:
             raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)
         raise SkinTimeout(f"{message}: {stats.trouble or 'the device stopped sending'}", frames)
 
+    def _take(self, count: int, timeout: float) -> Iterator[Frame]:
+        """Yield frames as they arrive: ``count``, or fewer if ``timeout`` s pass or the thread ends."""
+        deadline = monotonic() + timeout
+        for _ in range(count):
+            with self._fresh:
+                while not self._frames:
+                    left = deadline - monotonic()
+                    if self._error is not None or left <= 0:
+                        return
+                    self._fresh.wait(min(left, _WAKE))
+                frame = self._frames.popleft()
+                self._fresh.notify_all()
+            self._stats.frames += self._decoder is None
+            yield frame
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._step()
+        except Exception as error:
+            with self._fresh:
+                self._error = error
+                self._fresh.notify_all()
+
+    def _step(self) -> None:
+        try:
+            frames = self._feed.poll()
+        except OSError as error:
+            with suppress(OSError):
+                self._feed.close()
+            if not self._reconnect:
+                raise SkinDisconnected(f"the skin was unplugged: {error}") from error
+            _log.warning("the skin was unplugged (%s); trying again", error)
+            self._reopen()
+            return
+        if frames:
+            self._wait = self._backoff[0]
+            self._push(frames)
+            if not self._feed.patient:
+                self._stop.wait(_PAUSE)
+
+    def _reopen(self) -> None:
+        """Open the feed again; the wait between two attempts doubles until frames arrive."""
+        self.away = True
+        while self.away and not self._stop.wait(self._wait):
+            self._wait = min(2 * self._wait, self._backoff[1])
+            with suppress(OSError, InputError):
+                self._feed.open()
+                self._stats.reconnects += 1
+                self.away = False
+
+    def _push(self, frames: list[Frame]) -> None:
+        with self._fresh:
+            for frame in frames:
+                if frame.after not in ("", "gap"):
+                    self._times.clear()
+                self._times.append(frame.t)
+                while self._feed.patient and len(self._frames) >= self._most and not self._stop.is_set():
+                    self._fresh.wait(_WAKE)
+                self._frames.append(frame)
+                if len(self._frames) > self._most:
+                    dropped = self._frames.popleft()
+                    self._frames[0] = self._frames[0].behind(dropped)
+                    self._stats.dropped += 1
+                self._fresh.notify_all()
+
 
 _KEPT = 10_000  # frames for the statistics of channels
 _SPREAD = 1.4826  # median absolute deviation -> standard deviation of normal noise
-
-
-class Playable(Protocol):
-    """A device that can be played, such as :class:`skin.device.simulated.Simulated`."""
-
-    def strips(self) -> "Iterable[Touches]":
-        """Yield touches in N in their order, each of which is a piece of a stream."""
 
 
 def open_skin(
@@ -202,7 +284,7 @@ def open_skin(
     layout: Sized | None = None,
     *,
     opener: Callable[[], ByteStream] | None = None,
-    device: Playable | None = None,
+    device: "AbstractDevice | None" = None,
     baseline: np.ndarray | None = None,
     channels: Sequence[int] = (),
     polarity: Sequence[int] = (),
@@ -239,54 +321,34 @@ def open_skin(
     if opener is None and address == "simulated":
         if device is None:
             raise InputError("simulated needs a device: open_skin('simulated', device=build_device(config))")
-        return play(device.strips(), about.timeout, baseline, queue, realtime)
+        return play(device.strips(), baseline, queue, realtime, about)
     if opener is None and address.endswith((".parquet", ".csv")):
-        return play([_read_touches(address, sensors)], about.timeout, baseline, queue, realtime)
+        return play([_read_touches(address, sensors)], baseline, queue, realtime, about)
     decoder = Decoder(sensors, about.format, channels, polarity)
     watched = reconnect and address.startswith("socket://")
     opener = opener or partial(open_stream, address, about.baudrate)
-    connect = _listen(opener, decoder, about.limits, (about.silence if watched else None) or inf)
     try:
-        reader = Reader(connect, queue, reconnect, about.backoff)
+        feed = WireFeed(opener, decoder, about.limits, (about.silence if watched else None) or inf)
     except OSError as error:
         raise InputError(f"cannot open {address}: {error}") from error
-    return Skin(reader, decoder, about.timeout, baseline)
+    return Skin(feed, decoder, about, baseline, queue, reconnect)
 
 
 def play(
     strips: "Iterable[Touches]",
-    timeout: float = 5.0,
     baseline: np.ndarray | None = None,
     queue: int = 4096,
     realtime: bool = True,
+    settings: PortSettings | None = None,
 ) -> Skin:
     """Return touches in N, all with one rate, as the frames of an open skin.
 
     Args:
         strips: the touches; each is a segment.
-        timeout, baseline, queue, realtime: as in :func:`open_skin`.
+        baseline, queue, realtime: as in :func:`open_skin`.
+        settings: with the timeout.
     """
-    feed = PlaybackFeed(strips, realtime)
-    return Skin(Reader(lambda: feed, queue), None, timeout, baseline)
-
-
-def _listen(
-    opener: Callable[[], ByteStream], decoder: Decoder, limits: Limits | None, silence: float
-) -> Callable[[], Feed]:
-    """Return a function that connects; from the second call on it restarts the decoder.
-
-    The known ranges of channels are kept: a cable may be unplugged under a press that saturates channels.
-    """
-    connections, health = count(), ChannelHealth()
-
-    def connect() -> Feed:
-        stream = opener()
-        if next(connections):
-            decoder.restart()
-            health.restart()
-        return WireFeed(stream, decoder, limits, silence, health)
-
-    return connect
+    return Skin(PlaybackFeed(strips, realtime), None, settings or PortSettings(), baseline, queue)
 
 
 def _read_touches(path: str, sensors: int | None) -> "Touches":
@@ -344,7 +406,9 @@ class PortMonitor:
         states = self._skin.channels or ("ok",) * values.shape[1]
         # Of a channel that is never valid, the values that it repeats.
         rows = [row[mask] if mask.any() else row for row, mask in zip(values.T, valid.T, strict=True)]
-        lines = [f"header: {self._header()}", "channel     least    median   largest     noise"]
+        header = self._skin.header
+        words = "none" if header is None else encode_header(header, "none").decode()[len("# skin ") :].strip()
+        lines = [f"header: {words}", "channel     least    median   largest     noise"]
         for channel, (row, state, share) in enumerate(zip(rows, states, valid.mean(axis=0), strict=True)):
             middle = np.median(row)
             noise = _SPREAD * np.median(np.abs(row - middle))
@@ -352,12 +416,6 @@ class PortMonitor:
             numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
             lines.append(f"{numbers}  {text}")
         return "\n".join(lines)
-
-    def _header(self) -> str:
-        header = self._skin.header
-        if header is None:
-            return "none"
-        return encode_header(header, "none").decode().removeprefix("# skin ").strip()
 
 
 _LEAST = 1.0  # s over which the rate is measured

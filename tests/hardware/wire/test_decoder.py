@@ -168,10 +168,10 @@ def test_more_than_half_bad_over_two_seconds_is_trouble_until_it_is_not():
     decoder.feed(b"".join(good[:3]), now=0.0)
     for step in range(21):
         decoder.feed(b"\xf3\x81\n\x99\n" + good[3 + step], now=0.1 * (1 + step))
-    assert "wrong baud rate or format?" in decoder.quality.trouble
+    assert "wrong baud rate or format?" in decoder.stats.trouble
     for step in range(21):
         decoder.feed(good[24 + step], now=2.2 + 0.1 * step)
-    assert decoder.quality.trouble == ""
+    assert decoder.stats.trouble == ""
 
 
 def test_a_device_that_sends_another_number_of_values_later_is_told_with_it():
@@ -179,7 +179,7 @@ def test_a_device_that_sends_another_number_of_values_later_is_told_with_it():
     decoder.feed(b"".join(lines(3)), now=0.0)
     for step in range(25):
         assert decoder.feed(lines(1, sensors=3, first=3 + step)[0], now=0.1 * step) == []
-    assert "sends 3 values per frame now" in decoder.quality.trouble
+    assert "sends 3 values per frame now" in decoder.stats.trouble
 
 
 def test_after_a_restart_the_number_of_sensors_is_demanded_again():

@@ -231,7 +231,7 @@ def test_while_it_is_away_it_is_tried_again_and_said(plug, new_plug):
         skin.read(3, timeout=PATIENT)
         ports.append("/dev/nothing")
         plug.unplug()
-        wait_for(lambda: skin._reader.away)
+        wait_for(lambda: skin.away)
         with pytest.raises(SkinTimeout, match="unplugged; trying again"):
             skin.read(1, timeout=0.1)
         other = new_plug()

@@ -153,7 +153,7 @@ with open_skin(port, range(4), reconnect=True, silence=float(sys.argv[1]), backo
     first.sendall(frames)
     skin.read(4, 30)
     ip("down")
-    while not skin._reader.away:
+    while not skin.away:
         time.sleep(0.01)
     time.sleep(0.5)
     ip("up")
@@ -198,7 +198,7 @@ def test_a_clock_that_stops_is_said(plug, kind, monkeypatch):
     with open_skin(plug.port, LAYOUT) as skin:
         plug.send(*(encode([5, 6, 7, 8], number, 10 * number) for number in range(5)))
         start, number = monotonic(), 5
-        while skin._reader.error is None:
+        while skin._error is None:
             assert monotonic() - start < PATIENT
             plug.send(still(encode, 1, number))
             number += 1

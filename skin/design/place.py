@@ -24,7 +24,7 @@ from skin.core.settings import checked
 from skin.design.drawing import placement
 from skin.design.placement import PlacementProblem, Zones, keep_out
 from skin.device.base import AbstractSimulated
-from skin.device.true_sensors import build_model
+from skin.device.simulated import build_model
 from skin.errors import InputError
 from skin.plot.figures import save_figure
 from skin.runs.build import build_device

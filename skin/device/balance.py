@@ -10,8 +10,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.device.base import AbstractDevice
-from skin.device.stream import only_touches
-from skin.device.touches import Recording
+from skin.device.touches import Recording, only_touches
 from skin.errors import InputError
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import OPPOSITE

@@ -18,7 +18,7 @@ from skin.touch.labels import Task
 
 if TYPE_CHECKING:
     from skin.device.imperfection import Constants, Imperfection
-    from skin.device.stream import TouchStream
+    from skin.device.touches import TouchStream
     from skin.mechanics.simulator.base import AbstractSimulator
     from skin.touch.sampler import TouchSampler
 

@@ -1,32 +1,28 @@
 """The Corpus of Social Touch: people's touches on a grid of 8 x 8 taxels."""
 
-import hashlib
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import torch
-from rich.console import Console
-from rich.progress import wrap_file
+from annotated_types import Ge, Le
+from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody, Sensors
 from skin.body.layout import AbstractLayout, tile_centres
-from skin.core.array_cache import folder
-from skin.core.files import whole
 from skin.core.rng import Stream, generator
-from skin.core.safe_loading import load_npz
+from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.touch.labels import Task
 
 # Captures of CoST.csv: read in bounded memory, checked, resampled.
-
 
 SOURCE = "https://doi.org/10.4121/uuid:5ef62345-3b3e-479c-8e1d-c922748c9b29"
 ROWS, CAPTURES = 1_496_855, 7805
@@ -81,6 +77,7 @@ def read_captures(path: Path, window: int) -> Captures:
     Raises:
         InputError: the file is not in the corpus's format; the message has the number of the line.
     """
+    _check_header(path)
     parts: list[Captures] = []
     begun = np.empty((0, len(COLUMNS)), np.int32)
     line = 2
@@ -101,7 +98,6 @@ def read_captures(path: Path, window: int) -> Captures:
 
 def _blocks(path: Path) -> Iterator[np.ndarray]:
     """Yield the rows of a file, (R, 68), int32, block by block."""
-    _check_header(path)
     settings = {
         "read_options": pa.csv.ReadOptions(
             column_names=COLUMNS, skip_rows=1, block_size=_BLOCK, use_threads=False
@@ -110,27 +106,13 @@ def _blocks(path: Path) -> Iterator[np.ndarray]:
             column_types=dict.fromkeys(COLUMNS, pa.int32()), null_values=[]
         ),
     }
-    console = Console(stderr=True)
     try:
-        with (
-            path.open("rb") as raw,
-            wrap_file(
-                raw,
-                path.stat().st_size,
-                description=f"reading {path.name}",
-                console=console,
-                transient=True,
-                disable=not console.is_terminal,
-            ) as file,
-            pa.csv.open_csv(file, **settings) as batches,
-        ):
+        with path.open("rb") as file, pa.csv.open_csv(file, **settings) as batches:
             for batch in batches:
                 if batch.num_rows:
                     yield np.column_stack([column.to_numpy() for column in batch.columns])
     except pa.ArrowException as error:
         raise format_error(path, _explain_error(error)) from error
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
 
 
 def _explain_error(error: Exception) -> str:
@@ -145,8 +127,13 @@ def _explain_error(error: Exception) -> str:
 
 
 def _check_header(path: Path) -> None:
-    with path.open("rb") as file:
-        text = file.readline(1 << 16).decode("utf-8-sig", errors="replace")
+    try:
+        with path.open("rb") as file:
+            text = file.readline(1 << 16).decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(
+            f"cannot read {path}: {error.strerror}: download CoST.csv from {SOURCE} and add device.path=FILE"
+        ) from error
     # The published names have a leading blank.
     names = [name.strip() for name in text.split(",")]
     if len(names) != len(COLUMNS):
@@ -204,65 +191,6 @@ def _resample(path: Path, rows: np.ndarray, window: int, line: int) -> Captures:
     return Captures(smooth, subject, variant, gesture, lengths.astype(np.int32))
 
 
-# Captures of CoST.csv, cached on disk.
-
-
-# Raise it when the meaning of a stored file changes.
-_FORMAT = 1
-
-
-def cached_captures(path: Path, window: int) -> Captures:
-    """Return the captures of a file from the cache, or read the file and cache them.
-
-    The cache's key is the file's content, so a changed file is read again. If the cache folder cannot be
-    written to, a warning is issued.
-
-    Args:
-        path: of CoST.csv.
-        window: frames per capture.
-
-    Raises:
-        InputError: no such file, or not in the corpus's format.
-    """
-    if not path.is_file():
-        raise InputError(f"no file {path}: download CoST.csv from {SOURCE} and add device.path=FILE")
-    try:
-        with path.open("rb") as file:
-            content = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    key = hashlib.sha256(f"{_FORMAT} {window} {content}".encode()).hexdigest()
-    stored = folder(None) / f"cost-{key}.npz"
-    cached = _load(stored, window)
-    if cached is not None:
-        return cached
-    captures = read_captures(path, window)
-    try:
-        _save(stored, captures)
-    except InputError as error:
-        warnings.warn(f"captures cannot be kept in {stored.parent}: {error}", RuntimeWarning, stacklevel=2)
-    return captures
-
-
-def _load(path: Path, window: int) -> Captures | None:
-    """Return the captures in a cache file, or None if it is missing or invalid."""
-    try:
-        stored = load_npz(path)
-        captures = Captures(**{field.name: stored[field.name] for field in fields(Captures)})
-    except Exception:  # A broken archive may raise anything; the file is then read again.
-        return None
-    sound = captures.counts.shape[1:] == (window, CHANNELS) and captures.counts.dtype == np.float32
-    others = [values for name, values in vars(captures).items() if name != "counts"]
-    sound = sound and all(array.shape == (len(captures),) and array.dtype.kind == "i" for array in others)
-    return captures if sound else None
-
-
-def _save(path: Path, captures: Captures) -> None:
-    """Write a cache file atomically: other processes may read or write it at the same time."""
-    with whole(path) as partial:
-        np.savez(partial, **vars(captures))
-
-
 GESTURES = (
     "grab",
     "hit",
@@ -284,10 +212,12 @@ VARIANTS = ("gentle", "normal", "rough")
 
 _REPORT = ("grab", "hit")
 _EDGE = 8
+_Channel = Annotated[int, Ge(1), Le(_EDGE**2)]
 _RATE = 135.0
 _SHARES = {"test": 0.2, "validation": 0.1, "holdout": 0.1}
 
 
+@checked("device")
 @dataclass(kw_only=True, eq=False)
 class Cost(AbstractDevice):
     """Yields the captures of the user's ``CoST.csv``, split by subject: no subject is in two splits.
@@ -332,17 +262,21 @@ class Cost(AbstractDevice):
     path: str | None = None
     gestures: str | Sequence[str] = "report"
     variants: bool | None = None
-    taxels: int | Sequence[int] = _EDGE**2
+    taxels: _Channel | Sequence[_Channel] = _EDGE**2
     taxel_seed: int = 0
-    window: int = 30
-    full_scale: float = 10.0
-    pitch: float = 0.02
+    window: Annotated[int, Ge(2)] = 30
+    full_scale: PositiveFloat = 10.0
+    pitch: PositiveFloat = 0.02
     split_seed: int = 0
     test_subjects: int | Sequence[int] | None = None
     strict: bool = True
 
     def __post_init__(self) -> None:
-        self._check()
+        if self.path is None:
+            raise InputError(
+                f"device=cost needs the file CoST.csv, which is not shipped: download it from {SOURCE} and "
+                "add device.path=FILE"
+            )
         names = _names(self.gestures)
         variants = self.gestures == "report" if self.variants is None else self.variants
         pairs = [f"{name}_{variant}" for name in names for variant in VARIANTS]
@@ -354,28 +288,14 @@ class Cost(AbstractDevice):
         places = tile_centres(_EDGE, _EDGE)[self._channels] * self.size
         flat = np.column_stack([places, np.zeros(len(places))])
         self.sensors = Sensors(flat, (self.pitch, self.pitch))
-        self._read(names)
+        self._read(Path(self.path).expanduser(), names)
         number = np.array([names.index(GESTURES[gesture - 1]) for gesture in self._captures.gesture])
         self._class = number * len(VARIANTS) + self._captures.variant - 1 if variants else number
         self.rate = float(_RATE * (self.window - 1) / (np.median(self._captures.frames) - 1))
         self.subjects = self._divide(np.unique(self._captures.subject))
 
-    def _check(self) -> None:
-        """Check the settings before a large file is read."""
-        if self.path is None:
-            raise InputError(
-                f"device=cost needs the file CoST.csv, which is not shipped: download it from {SOURCE} and "
-                "add device.path=FILE"
-            )
-        if type(self.window) is not int or self.window < 2:
-            raise InputError(f"device.window must be a whole number of at least 2, got {self.window}")
-        for name in ("full_scale", "pitch"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"device.{name} must be above 0, got {getattr(self, name)}")
-
-    def _read(self, names: tuple[str, ...]) -> None:
-        path = Path(str(self.path)).expanduser()
-        captures = cached_captures(path, self.window)
+    def _read(self, path: Path, names: tuple[str, ...]) -> None:
+        captures = read_captures(path, self.window)
         rows = int(captures.frames.sum(dtype=np.int64))
         if self.strict and (rows, len(captures)) != (ROWS, CAPTURES):
             raise format_error(
@@ -439,7 +359,7 @@ def _names(gestures: str | Sequence[str]) -> tuple[str, ...]:
 def _numbers(value: int | Sequence[int], name: str) -> list[int]:
     """Return one number or several as a list without repetition."""
     numbers = [value] if isinstance(value, int) else list(value)
-    if not numbers or len(set(numbers)) != len(numbers) or any(type(number) is not int for number in numbers):
+    if not numbers or len(set(numbers)) != len(numbers):
         raise InputError(f"device.{name} must be different whole numbers, got {value}: as in [1,8]")
     return numbers
 
@@ -450,18 +370,12 @@ def _channels(taxels: int | Sequence[int], seed: int) -> np.ndarray:
     A number of taxels is selected by farthest-point sampling, with a random first one and random choice among
     equals.
     """
-    count = _EDGE**2
-    if isinstance(taxels, int):
-        if not 1 <= taxels <= count or isinstance(taxels, bool):
-            raise InputError(f"device.taxels must be 1 to {count} or a list of channels, got {taxels}")
-        order = generator(Stream.POSITION, seed).permutation(count)
-        places = tile_centres(_EDGE, _EDGE)[order]
-        chosen = [0]
-        while len(chosen) < taxels:
-            apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
-            chosen.append(int(apart.argmax()))
-        return np.sort(order[chosen])
-    numbers = np.array(_numbers(taxels, "taxels"))
-    if numbers.min() < 1 or numbers.max() > count:
-        raise InputError(f"device.taxels names channels 1 to {count}, got {list(taxels)}: as in [1,8,57,64]")
-    return np.sort(numbers) - 1
+    if not isinstance(taxels, int):
+        return np.sort(_numbers(taxels, "taxels")) - 1
+    order = generator(Stream.POSITION, seed).permutation(_EDGE**2)
+    places = tile_centres(_EDGE, _EDGE)[order]
+    chosen = [0]
+    while len(chosen) < taxels:
+        apart = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
+        chosen.append(int(apart.argmax()))
+    return np.sort(order[chosen])

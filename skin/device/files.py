@@ -49,8 +49,9 @@ _Extent = Annotated[float, Gt(0), Lt(1e9)]
 
 @dataclass(frozen=True)
 class _Description:
-    """Required keys, which older recordings have too, and ``first``."""
+    """The entries of a description; only a table in CSV has checksums beside it."""
 
+    format: int
     units: dict
     gestures: _Count
     frames: _Count
@@ -62,9 +63,11 @@ class _Description:
     labelled: bool
     force: bool
     displacement: bool
+    saturated: bool
     parameters: Annotated[list[str], ONCE]
     metadata: dict
-    first: Annotated[int, Ge(0), Le(2**31 - 1)] = 0  # older recordings do not say
+    first: Annotated[int, Ge(0), Le(2**31 - 1)]
+    sha256: Any = None
 
 
 def check_metadata(about: Any, where: str) -> Task:
@@ -78,12 +81,7 @@ def check_metadata(about: Any, where: str) -> Task:
         InputError: a key is missing or has a wrong type; the message names it.
         ValueError: invalid labels.
     """
-    fields = about
-    if isinstance(about, Mapping):
-        if unknown := set(about) - set(_Description.__annotations__) - {"format", "saturated", "sha256"}:
-            raise ValueError(f"its description has unknown entries: {', '.join(sorted(unknown))}")
-        fields = {name: value for name, value in about.items() if name in _Description.__annotations__}
-    check_settings(_Description, fields, f"{where}: description", whole=True)
+    check_settings(_Description, about, f"{where}: description", whole=True)
     check_settings(Task, about["task"], f"{where}: task", whole=True)
     return Task(**about["task"] | {"names": tuple(about["task"]["names"])})
 
@@ -140,11 +138,11 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
     task, sensors = about["task"], len(about["positions"])
     columns = {"simulation": pa.int32(), "frame": pa.int32()}
     if about["labelled"]:
-        cosines = 2 if task.get("direction") else 0  # older recordings do not say
+        cosines = 2 if task.get("direction") else 0
         kinds = [pa.int8()] * (len(task["names"]) - cosines) + [pa.float32()] * cosines
         columns |= dict(zip(task["names"], kinds, strict=True))
     names = numbered("reading", sensors) + ["force"] * about["force"]
-    limits = numbered("saturated", sensors) if about.get("saturated") else []  # older recordings do not say
+    limits = numbered("saturated", sensors) if about["saturated"] else []
     if about["displacement"]:
         names += numbered("D_s", sensors) + numbered("D_t", sensors)
     names += [f"gesture_{name}" for name in about["parameters"]]
@@ -307,8 +305,9 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         raise ValueError(f"it has the units {about['units']}, needed are {UNITS}: convert it before")
     batch, time, sensors = about["gestures"], about["frames"], len(about["positions"])
     rows = np.stack([table[name].to_numpy() for name in ("simulation", "frame")], axis=1)
-    first = about.get("first", 0)  # older recordings do not say
-    whole = np.stack([np.repeat(np.arange(batch) + first, time), np.tile(np.arange(time), batch)], axis=1)
+    whole = np.stack(
+        [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)], axis=1
+    )
     if len(wrong := np.flatnonzero((rows != whole).any(axis=1))):
         raise ValueError(
             f"row {wrong[0] + 1}: simulation and frame are {rows[wrong[0]].tolist()}, expected "
@@ -328,7 +327,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         torch.tensor(about["positions"], dtype=torch.float32),
         torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
         about["rate"],
-        saturated=columns("saturated") > 0.5 if about.get("saturated") else None,
+        saturated=columns("saturated") > 0.5 if about["saturated"] else None,
     )
     return Recording(
         touches,
@@ -471,7 +470,7 @@ class DataSet:
         for number, (count, first) in enumerate(zip(self.counts, self.manifest.firsts, strict=True)):
             with _advise_repair():
                 about = read_description(self.path(number))
-            expected = about["gestures"], about.get("first"), about["metadata"].get("config_hash")
+            expected = about["gestures"], about["first"], about["metadata"].get("config_hash")
             if expected != (count, first, self.manifest.config_hash):
                 raise InputError(f"{self.path(number)} is not the shard that {MANIFEST} describes: {_AGAIN}")
 

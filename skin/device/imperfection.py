@@ -1,17 +1,16 @@
 """Imperfections of a real device: lag, gain, clip, noise, offset, rounding, dead sensors, tare."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, NonNegativeInt
 from scipy.special import ndtri
 from torch import Tensor
 
-from skin.core.settings import RISING, check_settings
+from skin.core.settings import RISING, checked
 from skin.device.calibration import Calibration, read_calibration
 from skin.device.resampling import resample
 from skin.errors import InputError
@@ -91,7 +90,7 @@ class ImperfectionSettings:
     offset: Annotated[float, Ge(0)] = 0.1
     noise: Spread = 0.05
     clip: Annotated[float, Gt(0)] = 10.0
-    dead: int | Sequence[int] = 0
+    dead: NonNegativeInt | Annotated[tuple[NonNegativeInt, NonNegativeInt], RISING] = 0
     tare: bool = False
     stuck: Annotated[int, Ge(0)] = 0
     saturated: Annotated[int, Ge(0)] = 0
@@ -102,6 +101,7 @@ class ImperfectionSettings:
     rate: Annotated[float, Gt(0)] = 10.0
 
 
+@checked("device")
 @dataclass(kw_only=True)
 class Imperfection(ImperfectionSettings):
     """A device's imperfections, in the report's order (2.1.4): clip the force, then add noise and offset.
@@ -119,21 +119,10 @@ class Imperfection(ImperfectionSettings):
 
     calibration: Calibration | None = None
 
-    def __post_init__(self) -> None:
-        least, most = self.dead_range
-        if not 0 <= least <= most:
-            raise InputError(
-                f"device.dead must be a number from 0 up or a range [least, most], got {self.dead}: as in "
-                "device.dead=3 or device.dead=[0,5]"
-            )
-        check_settings(ImperfectionSettings, _settings(self), "device")
-
     @property
     def dead_range(self) -> tuple[int, int]:
-        """Least and most sensors that are dead in a device; (0, -1) where that is no range."""
-        ends = self.dead if isinstance(self.dead, (list, tuple)) else (self.dead, self.dead)
-        whole = len(ends) == 2 and all(isinstance(number, int) for number in ends)
-        return (ends[0], ends[1]) if whole else (0, -1)
+        """Least and most sensors that are dead in a device."""
+        return (self.dead, self.dead) if isinstance(self.dead, int) else (self.dead[0], self.dead[1])
 
     @classmethod
     def of(cls, settings: ImperfectionSettings, calibration: str | None) -> "Imperfection":

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody, require_memory
 from skin.body.layout import AbstractLayout
+from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Blank, Split, split_rows, split_shards
 from skin.device.files import DataSet, read_recording
 from skin.device.touches import Part, Recording, Touches, concatenate
@@ -21,6 +22,7 @@ _SAME_PLACE = 1e-6  # m: the file's positions are float32
 _BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated
 
 
+@checked("device")
 class Recorded(AbstractDevice):
     """Yields the touches of a recording or a data set, split 80/10/10 by gesture.
 
@@ -56,8 +58,6 @@ class Recorded(AbstractDevice):
             raise InputError(
                 "device=recording needs a file or a data set: add device.path=x.parquet or =FOLDER"
             )
-        if test not in ("holdout", "all"):
-            raise InputError(f"device.test must be holdout or all, got {test}")
         self.path, self.split_seed, self._test = path, split_seed, test
         folder = Path(path).expanduser()
         self._whole = folder.suffix != "" and not folder.is_dir()

@@ -1,7 +1,7 @@
 """A simulated skin: sampled gestures, a simulator, and device imperfections."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import count
 from typing import Annotated, Any
@@ -15,23 +15,67 @@ from skin import __version__
 from skin.body.base import AbstractBody, Sensors
 from skin.body.layout import AbstractLayout
 from skin.core.rng import Stream, generator
-from skin.core.settings import check_settings
+from skin.core.settings import checked
 from skin.device.balance import summarise
 from skin.device.base import AbstractSimulated, Split, grouped, joined, split_rows, split_slices
 from skin.device.imperfection import Imperfection, ImperfectionSettings, draw_constants, idle_excess, measure
 from skin.device.resampling import check_rate
-from skin.device.stream import TouchStream, draw_timeline, only_touches
-from skin.device.touches import Part, Recording, Touches
-from skin.device.true_sensors import build_model, cover_surface, misplace, refuse_relaxation
+from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
 from skin.errors import InputError
 from skin.mechanics.contact.base import AbstractContact
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.geometry import sensor_geometry
+from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
 from skin.touch.sampler import TouchSampler, balanced
+
+# The true sensors of a simulated device and its model of them.
+
+_ROUNDING = 1e-9  # m
+
+
+def misplace(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
+    """Return sensors beside their places.
+
+    Args:
+        sensors: as touches report them.
+        size: extent (x, y) of the sheet, m, on which they stay.
+        error: standard deviation along x and along y, m.
+        seed: of the device.
+    """
+    moves = generator(Stream.POSITION, seed).standard_normal((len(sensors), 2))
+    positions = sensors.positions.copy()
+    positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
+    return replace(sensors, positions=positions)
+
+
+def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
+    """Return a sensor at each cell of a body whose footprint lies wholly on it.
+
+    Their footprints are the areas over which a pressure can be dangerous anywhere.
+    """
+    margins = [max(extent, cell) / 2 for extent, cell in zip(footprint, body.cell, strict=True)]
+    cells = [(np.arange(count) + 0.5) * cell for count, cell in zip(body.cells, body.cell, strict=True)]
+    x, y = (
+        centres[(centres >= margin - _ROUNDING) & (centres <= size - margin + _ROUNDING)]
+        for centres, size, margin in zip(cells, body.size, margins, strict=True)
+    )
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return Sensors(np.column_stack([places, np.zeros(len(places))]), footprint)
+
+
+def build_model(
+    simulator: Callable[[AbstractBody, Sensors], AbstractSimulator],
+    body: AbstractBody,
+    sensors: Sensors,
+    rate: float,
+) -> AbstractSimulator:
+    """Return the simulator of a body with sensors; in time, at ``rate`` in Hz, where a material relaxes."""
+    return Relaxing(simulator, body, sensors, rate) if relaxes(body) else simulator(body, sensors)
+
 
 # Metadata of simulated recordings.
 
@@ -69,6 +113,7 @@ _FEW = 10  # gestures
 _DISC = 0.03  # share of the sheet under a press: small, and larger than any footprint
 
 
+@checked("device")
 @dataclass(kw_only=True, eq=False)
 class Simulated(ImperfectionSettings, AbstractSimulated):
     """Yields simulated gestures, measured by a device with imperfections.
@@ -118,7 +163,13 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     position_error: Annotated[float, Ge(0)] = 0.0
 
     def __post_init__(self) -> None:
-        self._refuse()
+        if self.stream and self.direction:
+            raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
+        if self.stream and relaxes(self.body):
+            raise InputError(
+                "a skin that relaxes is simulated touch by touch from rest, where it stays, got "
+                "data.stream=true: leave that out, or the materials' relaxation"
+            )
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         self.true_sensors = misplace(self.sensors, self.size, self.position_error, self.seed)
@@ -133,15 +184,6 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         drawn = generator(Stream.CONSTANTS, self.seed)
         self.constants = draw_constants(self.imperfection, len(self.sensors), self.model_rate, drawn)
         self._kept: dict[str, Recording] = {}
-
-    def _refuse(self) -> None:
-        """Check the settings, and combinations that are not possible."""
-        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        check_settings(type(self), settings, "device")
-        if self.stream and self.direction:
-            raise InputError("data.direction=true needs whole gestures: leave out data.stream=true")
-        if self.stream:
-            refuse_relaxation(self.body, "data.stream=true")
 
     def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
         contact, settings = self.contact(body, model), GestureSettings.of(self.touch)

@@ -17,10 +17,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from skin.body.base import GEOMETRY, AbstractBody, Arm, Layer, Sensors, Sheet
-from skin.body.layout import AbstractLayout, Footprint, Grid, Hexagonal, Random, Scattered, place_sensors
+from skin.body.layout import AbstractLayout, Footprint, Grid, Hexagonal, Listed, Random, Scattered
 from skin.body.material import Material
 from skin.core.rng import Stream, generator
-from skin.core.settings import RISING, check_settings, checked, configured
+from skin.core.settings import RISING, checked, configured
 from skin.device.base import AbstractDevice, Blank, Split, in_threads, split_slices
 from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.simulated import Simulated
@@ -178,20 +178,6 @@ class SkinDistribution:
         return Sheet(sides, (across, along), layers)
 
 
-@dataclass(frozen=True)
-class _Places(AbstractLayout):
-    """Sensors at given places (S, 2), m."""
-
-    places: np.ndarray
-    footprint: Footprint
-    depth: float
-
-    def sensors(self, body: AbstractBody) -> Sensors:
-        """Return them in their order."""
-        x, y = self.places.T
-        return place_sensors(body, x, y, self.depth, self.footprint)
-
-
 def _logarithmic(limits: tuple[float, float], generator: np.random.Generator) -> float:
     return math.exp(generator.uniform(*np.log(limits)))
 
@@ -221,19 +207,24 @@ def _layout(
     if kind == "spread":
         places = _spread(count, size, generator)
         apart = np.abs(places[:, None] - places).max(axis=2)[~np.eye(count, dtype=bool)]
-        return _Places(places, (min(side, float(apart.min())),) * 2, depth)
+        return _listed(places, (min(side, float(apart.min())),) * 2, depth)
     if kind in ("random", "clustered"):
         # Random places fill less than half of the surface.
         footprint = (min(side, 0.6 * math.sqrt(math.prod(size) / count)),) * 2
         if kind == "random":
             return Random(count, seed, footprint, depth)
-        return _Places(_clustered(count, size, footprint[0], generator), footprint, depth)
+        return _listed(_clustered(count, size, footprint[0], generator), footprint, depth)
     footprint = (min(side, pitch / 2),) * 2
     if kind == "grid":
         return Grid(rows, columns, footprint, depth=depth)
     if kind == "hexagonal":
         return Hexagonal(rows, columns, footprint, depth)
     return Scattered(rows, columns, 0.25, seed, footprint, depth=depth)
+
+
+def _listed(places: np.ndarray, footprint: Footprint, depth: float) -> Listed:
+    """Return sensors at places (S, 2), m, in one depth, m."""
+    return Listed(np.column_stack([places, np.full(len(places), depth)]).tolist(), footprint)
 
 
 def _clustered(
@@ -278,6 +269,7 @@ _TRAINING, _TEST = 0, 1
 _NUMBERS = {"train": 0, "validation": 1, "holdout": 2, "test": 3}
 
 
+@checked("device")
 @dataclass(kw_only=True, eq=False)
 class Skins(ImperfectionSettings, AbstractDevice):
     """Yields gestures on skins that differ in body, layout and mechanics, each measured by another device.
@@ -316,8 +308,6 @@ class Skins(ImperfectionSettings, AbstractDevice):
     data_seed: int = 0
 
     def __post_init__(self) -> None:
-        settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        check_settings(type(self), settings, "device")
         self.distribution = configured(SkinDistribution, self.skins, "device.skins")
         self.task, self.size, self.sensors = TOUCH, self.body.size, self.layout.sensors(self.body)
         self.window = GestureSettings.of(self.touch).frames.window

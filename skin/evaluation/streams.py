@@ -253,7 +253,7 @@ def _listen(
         chances = learner.probabilities(touches)
         for name, gate in all_gates.items():
             heard[name].append(point.alarm(chances[:, dangerous]) & gate(touches, chances))
-    gesture = stream.timeline.window_content(starts, device.window).gesture
+    gesture = stream.timeline.window_content(starts, device.window)[0]
     truth = stream.timeline.movie.labels[:, TOUCH_OR_NOT.names.index("dangerous")] > 0.5
     hours = stride / rate / 3600
     return {name: count_alarms(torch.cat(parts), gesture, truth, hours) for name, parts in heard.items()}

@@ -16,13 +16,12 @@ from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
 from skin.learning.classifier import Batch
-from skin.learning.representation import AbstractRepresentation, Frames
+from skin.learning.representation import AbstractRepresentation, Frames, idle_level
 from skin.touch.labels import Task
 
 # Data augmentation: changes of a touch that keep its labels.
 
 
-_IDLE = 8
 _MARGIN = 2  # frames that a touch may last beyond what stands out
 
 
@@ -76,8 +75,7 @@ class Augmentation:
     def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
         """Draw the shift of each touch, (B,), frames, such that none is cut."""
         raw = touches.readings * touches.valid
-        idle = raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
-        force = (raw - idle).clamp(min=0).sum(dim=2)
+        force = (raw - idle_level(raw)).clamp(min=0).sum(dim=2)
         touched = (force > 0.12 * force.amax(dim=1, keepdim=True)).int()
         first = touched.argmax(dim=1) - _MARGIN
         last = raw.shape[1] - touched.flip(1).argmax(dim=1) - 1 + _MARGIN

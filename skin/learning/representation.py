@@ -110,10 +110,9 @@ class Readings(AbstractRepresentation):
 _IDLE = 8  # frames
 
 
-def _excess(raw: Tensor, valid: Tensor) -> Tensor:
-    """Return readings (B, T, S), 0 where invalid, above the mean of each sensor's lowest frames."""
-    idle = raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
-    return (raw - idle) * valid
+def idle_level(raw: Tensor) -> Tensor:
+    """Return the mean of each sensor's lowest frames, (B, 1, S), N, of readings (B, T, S)."""
+    return raw.topk(min(_IDLE, raw.shape[1]), dim=1, largest=False).values.mean(dim=1, keepdim=True)
 
 
 class Features(AbstractRepresentation):
@@ -154,7 +153,7 @@ class Features(AbstractRepresentation):
         """
         values = channels(readings, valid, 1.0, self.mask)
         raw = values[..., 0]
-        excess = _excess(raw, valid)
+        excess = (raw - idle_level(raw)) * valid
         views = [excess / self.scale, torch.asinh(excess / self.finest) / 2, *values.unbind(-1)[1:]]
         touches = Touches(readings, valid, self.positions, None, 1.0)
         summary = torch.cat([values.to(raw) for _, values in feature_blocks(touches)], dim=1)
@@ -441,7 +440,7 @@ class Sites(AbstractRepresentation):
     def _scaled(self, touches: Touches, geometry: Tensor) -> Tensor:
         """Return readings above idle on three scales, and whether they are at their limit, (B, T, S, 4)."""
         raw = torch.where(touches.valid, touches.readings, touches.readings.new_zeros(()))
-        excess = _excess(raw, touches.valid)
+        excess = (raw - idle_level(raw)) * touches.valid
         direct = geometry[..., _DIRECT].clamp(min=_LEAST)[:, None]
         limited = (
             touches.valid & touches.saturated

@@ -178,25 +178,6 @@ def test_a_number_of_taxels_is_spread_evenly(corpus):
     assert np.array_equal(views[0], cost(corpus, taxels=12).sensors.positions)
 
 
-def test_what_was_read_is_kept_until_the_file_changes(report, tmp_path, monkeypatch):
-    monkeypatch.setenv("SKIN_CACHE", str(tmp_path / "cache"))
-    path = tmp_path / "CoST.csv"
-    path.write_bytes(report.read_bytes())
-    first = cost(path).touches("train").readings
-    (kept,) = (tmp_path / "cache").iterdir()
-    with np.load(kept) as file:
-        np.savez(kept, **{**file, "counts": file["counts"] / 2})
-    assert torch.allclose(cost(path).touches("train").readings, first / 2)
-    kept.write_bytes(b"broken")
-    assert torch.equal(cost(path).touches("train").readings, first)
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(changed(2, 4, "1000")(lines)))  # and no end of the last line
-    device = cost(path)
-    mine = next(split for split in SPLITS if 1 in device.subjects[split])
-    assert (device.touches(mine).readings[:, 0, 0] == 1000 / 1023 * 10).sum() == 1
-    assert len(list((tmp_path / "cache").iterdir())) == 2
-
-
 def changed(line: int, column: int, value: str):
     """Return a change of one number in a file's lines, counted from 1 with the header."""
 
@@ -269,13 +250,13 @@ def test_a_part_of_the_corpus_must_be_asked_for(report, tmp_path):
         ({"gestures": "kick"}, "device.gestures must be report, all or some of grab, hit.*got kick"),
         ({"gestures": ["tap"]}, "a single class: add device.variants=true"),
         ({"gestures": ["tap", "poke"]}, "has no capture of tap, poke"),
-        ({"taxels": 65}, "device.taxels must be 1 to 64"),
-        ({"taxels": [0, 1]}, "device.taxels names channels 1 to 64"),
+        ({"taxels": 65}, "device.taxels=65 must be less than or equal to 64"),
+        ({"taxels": [0, 1]}, "device.taxels=.* must be greater than or equal to 1"),
         ({"taxels": [1, 1]}, "device.taxels must be different whole numbers"),
         ({"test_subjects": 4}, r"device.test_subjects names \[4\].*has the subjects \[1, 2, 3, 5"),
         ({"test_subjects": list(SUBJECTS[:6])}, "leave none to train on"),
-        ({"window": 1}, "device.window must be a whole number of at least 2"),
-        ({"full_scale": 0.0}, "device.full_scale must be above 0"),
+        ({"window": 1}, "device.window=1 must be greater than or equal to 2"),
+        ({"full_scale": 0.0}, "device.full_scale=0.0 must be greater than 0"),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused(report, settings, message):

@@ -110,7 +110,7 @@ def test_bad_settings_are_refused():
     with pytest.raises(InputError, match=r"device.dead=25 of 25 sensors leaves none alive"):
         Imperfection(dead=25).constants(25, generator())
     for dead in (-1, 2.5, [3], [4, 2], [0, 1.5], "two"):
-        with pytest.raises(InputError, match=r"device.dead must be a number from 0 up or a range"):
+        with pytest.raises(InputError, match=r"device.dead=.* (must be|has too few) "):
             Imperfection(dead=dead)
 
 

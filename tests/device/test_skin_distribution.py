@@ -18,7 +18,7 @@ def distribution():
     return SkinDistribution(**settings)
 
 
-def testskin_distributions_lie_in_their_ranges(distribution):
+def test_skin_distributions_lie_in_their_ranges(distribution):
     kinds, bodies = set(), set()
     for number in range(60):
         skin = distribution.draw(generator(Stream.SKIN, 0, 0, number))
@@ -34,7 +34,7 @@ def testskin_distributions_lie_in_their_ranges(distribution):
         apart = np.abs(sensors.positions[:, None, :2] - sensors.positions[None, :, :2])
         meet = (apart < np.array(sensors.footprint) - 1e-6).all(axis=2)
         assert meet.sum() == len(sensors), type(skin.layout)
-    assert kinds == {"Grid", "Scattered", "Hexagonal", "Random", "_Places"}
+    assert kinds == {"Grid", "Scattered", "Hexagonal", "Random", "Listed"}
     assert bodies == {Sheet, Arm}
 
 

@@ -9,7 +9,7 @@ import torch
 from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.core.rng import Stream, generator
-from skin.device.stream import draw_timeline
+from skin.device.touches import draw_timeline
 from skin.mechanics.contact.prescribed import Prescribed
 from skin.touch.sampler import TouchSampler
 

@@ -8,7 +8,7 @@ from skin.body.base import Sheet
 from skin.body.layout import Scattered
 from skin.device.files import read_recording, write_recording
 from skin.device.simulated import Simulated
-from skin.device.stream import Timeline
+from skin.device.touches import Timeline
 from skin.errors import InputError
 from skin.mechanics.simulator.naive import Naive
 from skin.touch.gesture import GestureSettings

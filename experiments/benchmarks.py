@@ -27,7 +27,6 @@ import psutil
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 from skin.body.layout.random import Random
 from skin.core.files import CONF, ROOT, results, write
@@ -42,7 +41,7 @@ from skin.hardware.wire.protocol import encode_line
 from skin.learning.data import TouchData
 from skin.learning.learner.network import Network
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.configuration import validate_config
+from skin.runs.configuration import Config, validate_config
 from skin.runs.model_of_run import RunModel, window_classifier
 
 Figures = dict[str, float]
@@ -145,7 +144,7 @@ def run_alone(function: str, arguments: Sequence[object], checkout: Path = ROOT)
     return json.loads(done.stdout)
 
 
-def training_config(*overrides: str) -> DictConfig:
+def training_config(*overrides: str) -> Config:
     """Return the configuration of a training with overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return validate_config(compose("train", list(overrides)))
@@ -258,7 +257,7 @@ def measure_training(row: str, repeats: int) -> dict[str, float]:
     settings, share = ["simulator=fem"], 1.0
     if row == "any_skin":
         settings = ["simulator=solid", f"device.count={_SKINS}", f"data.gestures={_SKIN_GESTURES}"]
-        share = training_config("experiment=any_skin").data.gestures / _SKIN_GESTURES
+        share = training_config("experiment=any_skin").device["gestures"] / _SKIN_GESTURES
     config = training_config(f"experiment={row}", *settings, f"trainer.max_epochs={repeats + 1}")
     learner = build_learner(config)
     assert isinstance(learner, Network)

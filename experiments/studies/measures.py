@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 from annotated_types import Ge, Gt, MinLen
 
 from skin.errors import InputError
-from skin.evaluation.settings import StreamSettings
+from skin.evaluation.settings import StreamSettings, check_evaluation
 
 if TYPE_CHECKING:
     import numpy as np
     from mlflow.entities import Run
-    from omegaconf import DictConfig
 
     from experiments.studies.pages import Page
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learning.learner.base import AbstractLearner
+    from skin.runs.configuration import Config
     from skin.runs.model_of_run import RunModel
     from skin.runs.store import Store
 
@@ -41,7 +41,7 @@ class Finished:
 
     store: "Store"
     run: "Run"
-    stored: "DictConfig"
+    stored: "Config"
     trained: "RunModel"
 
 
@@ -55,7 +55,7 @@ class Subject:
         finished: the run; None where a study has none.
     """
 
-    config: "DictConfig"
+    config: "Config"
     device: "AbstractDevice"
     finished: Finished | None = None
 
@@ -89,7 +89,7 @@ class Subject:
 
         run = self.of.trained.run
         point = self.of.trained.point if run is None else alarm_point(run, self.learner, self.config)
-        return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
+        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ class TouchAlarms:
         from skin.touch.labels import TOUCH
         from skin.touch.sampler import balanced
 
-        trained, settings = subject.of.trained, subject.config.evaluation
+        trained, settings = subject.of.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
         patience = DebounceSettings().alarm
         aligned = device.rate <= device.model_rate

@@ -7,13 +7,12 @@ judges many windows of a touch, depends on the rate of the device, too (:func:`a
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from skin.core import array_cache
 from skin.device import imperfection
@@ -29,9 +28,9 @@ from skin.evaluation.operating_point import (
     choose_for_touches,
     choose_operating_point,
 )
-from skin.evaluation.settings import Evaluation
+from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.runs.build import build_device
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 from skin.runs.finished_run import FinishedRun
 from skin.runs.overrides import profile_settings
 
@@ -42,7 +41,7 @@ _SOURCES = (operating_point, decisions, device_sampling, imperfection)
 def alarm_point(
     run: FinishedRun,
     learner: Predictor,
-    config: DictConfig,
+    config: Config,
     one_skin: bool = False,
     device: AbstractDevice | None = None,
 ) -> OperatingPoint | None:
@@ -62,12 +61,12 @@ def alarm_point(
     Raises:
         InputError: the stored operating point cannot be read; see also :func:`threshold_device`.
     """
+    settings, stored = check_evaluation(config.evaluation), run.stored
     all_skins = "skins" in config.device and not one_skin
-    same_profile = config.evaluation.profile == OmegaConf.select(run.stored, "evaluation.profile")
-    if all_skins or ("skins" not in run.stored.device and same_profile):
-        return stored_point(run, learner, config.evaluation)
-    device = device or threshold_device(run.stored, config)
-    return choose_operating_point(learner, device, config.evaluation)
+    same_profile = settings.profile == (stored.evaluation and stored.evaluation.profile)
+    if all_skins or ("skins" not in stored.device and same_profile):
+        return stored_point(run, learner, settings)
+    return choose_operating_point(learner, device or threshold_device(stored, config), settings)
 
 
 def stored_point(run: FinishedRun, learner: Predictor, settings: Evaluation) -> OperatingPoint | None:
@@ -101,7 +100,7 @@ def stored_point(run: FinishedRun, learner: Predictor, settings: Evaluation) -> 
     return point
 
 
-def threshold_device(stored: DictConfig, config: DictConfig) -> AbstractSimulated:
+def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
     """Return the device whose fresh gestures determine the threshold of the alarm.
 
     It is the device of the training on the skin of ``config``. If ``evaluation.profile`` is set, every
@@ -114,21 +113,20 @@ def threshold_device(stored: DictConfig, config: DictConfig) -> AbstractSimulate
     Raises:
         InputError: the training has no simulated touches, or there is no such profile.
     """
-    whole, skin, profile = plain(stored), plain(config), config.evaluation.profile
-    if "simulator" not in whole["device"]:
+    profile, settings = check_evaluation(config.evaluation).profile, stored.device
+    if "simulator" not in settings:
         raise InputError(
             f"evaluation.profile={profile} chooses the alarm's threshold on simulated touches, and this run "
             "was trained on others: leave it out"
         )
-    for group in ("body", "layout", "simulator"):
-        whole[group] = whole["device"][group] = skin[group]
+    skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
+    settings = settings | skin
     if profile is not None:
-        whole["device"] |= profile_settings(profile)
+        settings |= profile_settings(profile)
         # Drawn skins draw a device for every gesture without being told.
-        every = {} if "skins" in whole["device"] else {"randomise": True, "calibration": None}
-        fixed = {name: value for name, value in whole["device"].items() if name != "randomise"}
-        whole["device"] = fixed | every
-    device = build_device(OmegaConf.create(whole)).reference
+        every = {} if "skins" in settings else {"randomise": True, "calibration": None}
+        settings = {name: value for name, value in settings.items() if name != "randomise"} | every
+    device = build_device(replace(stored, **skin, device=settings)).reference
     assert device is not None
     return device
 
@@ -136,7 +134,7 @@ def threshold_device(stored: DictConfig, config: DictConfig) -> AbstractSimulate
 def alarm_point_for_touches(
     run: FinishedRun,
     learner: Predictor,
-    config: DictConfig,
+    config: Config,
     watching: Watching,
     say: Callable[[str], None],
 ) -> OperatingPoint:
@@ -152,7 +150,7 @@ def alarm_point_for_touches(
     Raises:
         InputError: there is no such profile, or the calibration cannot be read.
     """
-    settings = config.evaluation
+    settings = check_evaluation(config.evaluation)
     if "simulator" not in run.stored.device:
         point = stored_point(run, learner, settings)
         assert point is not None  # it has the label
@@ -181,15 +179,14 @@ def alarm_point_for_touches(
 
 
 def _content(
-    run: FinishedRun, config: DictConfig, watching: Watching, device: AbstractSimulated
+    run: FinishedRun, config: Config, watching: Watching, device: AbstractSimulated
 ) -> dict[str, Any]:
     """Return what a threshold depends on."""
-    skin = {group: plain(config)[group] for group in ("body", "layout", "simulator", "touch")}
     imperfections = {name: str(value) for name, value in vars(device.imperfection).items()}
     return {
         "run": run.identity,
-        "device": plain(run.stored)["device"],
-        "skin": skin,
+        "device": run.stored.device,
+        "skin": {group: getattr(config, group) for group in ("body", "layout", "simulator", "touch")},
         "positions": device.sensors.positions.round(9).tolist(),
         "imperfections": imperfections,
         "watching": asdict(watching),

@@ -18,7 +18,7 @@ from skin.core.files import BUNDLED, MANIFEST, ROOT, candidates
 
 from skin.core import interrupt  # noqa: F401  # isort: skip
 import socket
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import isnan
 from typing import cast
 from urllib.parse import urlsplit
@@ -155,35 +155,38 @@ class Data:
 class Tracking:
     """Where runs are logged, and whether finished ones are skipped (``conf/train.yaml``)."""
 
-    uri: str | None
-    artifacts: str | None
-    experiment: str
-    resume: bool
-    threads: int | None
+    uri: str | None = None
+    artifacts: str | None = None
+    experiment: str = "skin"
+    resume: bool = True
+    threads: int | None = None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    """Top-level keys of a configuration; groups without a type here are checked by their class."""
+    """A checked configuration in plain containers. What it does not set is None, a group that it lacks empty.
+
+    Groups without a type here are checked by their class.
+    """
 
     row: str | None = None
-    seed: int | None = None
-    epochs: dict[str, int] | None = None
-    touch: dict[str, Any] | None = None
-    body: dict[str, Any] | None = None
-    layout: dict[str, Any] | None = None
-    simulator: dict[str, Any] | None = None
-    device: dict[str, Any] | None = None
-    representation: dict[str, Any] | None = None
-    model: dict[str, Any] | None = None
-    fusion: dict[str, Any] | None = None
-    learner: dict[str, Any] | None = None
+    seed: int = 0
+    epochs: dict[str, int] = field(default_factory=dict)
+    touch: dict[str, Any] = field(default_factory=dict)
+    body: dict[str, Any] = field(default_factory=dict)
+    layout: dict[str, Any] = field(default_factory=dict)
+    simulator: dict[str, Any] = field(default_factory=dict)
+    device: dict[str, Any] = field(default_factory=dict)
+    representation: dict[str, Any] = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
+    fusion: dict[str, Any] = field(default_factory=dict)
+    learner: dict[str, Any] = field(default_factory=dict)
     data: Data | None = None
-    optimizer: dict[str, Any] | None = None
-    trainer: dict[str, Any] | None = None
+    optimizer: dict[str, Any] = field(default_factory=dict)
+    trainer: dict[str, Any] = field(default_factory=dict)
     evaluation: Evaluation | None = None
-    tracking: Tracking | None = None
-    contact: dict[str, Any] | None = None
+    tracking: Tracking = field(default_factory=Tracking)
+    contact: dict[str, Any] = field(default_factory=dict)
     shard: str | None = None
     # What a command other than training adds.
     run: str | None = None
@@ -191,33 +194,33 @@ class Config:
     licence: str | None = None
     trust: bool = False
     n: int | None = None
-    out: str | None = field(default=None)
+    out: str | None = None
     view: str | None = None
     labels: list[str] | None = None
     shape: str | None = None
     index: int | None = None
     session: str | None = None
     presses: str | None = None
-    calibrate: dict[str, Any] | None = None
+    calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
     link: str | None = None
     seconds: float | None = None
     web: bool | None = None
     demo: bool | None = None
-    live: dict[str, Any] | None = None
-    export: dict[str, Any] | None = None
+    live: dict[str, Any] = field(default_factory=dict)
+    export: dict[str, Any] = field(default_factory=dict)
     gestures: int | None = None
     format: str | None = None
-    emulate: dict[str, Any] | None = None
-    faults: dict[str, Any] | None = None
-    record: dict[str, Any] | None = None
-    compare: dict[str, Any] | None = None
-    study: dict[str, Any] | None = None
+    emulate: dict[str, Any] = field(default_factory=dict)
+    faults: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+    compare: dict[str, Any] = field(default_factory=dict)
+    study: dict[str, Any] = field(default_factory=dict)
     smoke: bool | None = None
-    table: dict[str, Any] | None = None
-    results: dict[str, Any] | None = None
-    design: dict[str, Any] | None = None
-    adapt: dict[str, Any] | None = None
+    table: dict[str, Any] = field(default_factory=dict)
+    results: dict[str, Any] = field(default_factory=dict)
+    design: dict[str, Any] = field(default_factory=dict)
+    adapt: dict[str, Any] = field(default_factory=dict)
 
 
 def is_server(uri: str | None) -> bool:
@@ -251,22 +254,23 @@ def check_server(uri: str | None) -> None:
         )
 
 
-def validate_config(config: DictConfig) -> DictConfig:
-    """Return a configuration that fits the schema, read-only.
+def validate_config(config: Any) -> Config:
+    """Return a configuration that fits the schema, with every interpolation resolved.
+
+    Args:
+        config: as Hydra composes it, or in plain containers.
 
     Raises:
-        InputError: a key or a value does not fit.
+        InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
         whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+        # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
+        for name, reason in _not_numbers(OmegaConf.to_container(whole)):
+            raise InputError(f"{name} is {reason}: give a number")
+        return cast(Config, OmegaConf.to_object(whole))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
-    assert isinstance(whole, DictConfig)
-    # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
-    for name, reason in _not_numbers(OmegaConf.to_container(whole)):
-        raise InputError(f"{name} is {reason}: give a number")
-    OmegaConf.set_readonly(whole, True)
-    return whole
 
 
 def refuse_null_groups(config: DictConfig) -> None:
@@ -296,24 +300,15 @@ def _not_numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
             yield from _not_numbers(entry, f"{name}.{key}" if name else str(key))
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """Return a configuration with every interpolation resolved, as plain containers.
-
-    Raises:
-        InputError: an interpolation cannot be resolved.
-    """
-    try:
-        return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    except OmegaConfBaseException as error:
-        raise InputError(one_line(error)) from error
+def settings_of(config: Config) -> dict[str, Any]:
+    """Return what a configuration sets, in plain containers."""
+    return {key: value for key, value in asdict(config).items() if value not in (None, {})}
 
 
-def fingerprint(config: DictConfig) -> str:
+def fingerprint(config: Config) -> str:
     """Return a hash of everything that results depend on: configuration, files it names, version."""
     # Unset keys belong to other commands; a new command must not change the fingerprint of finished runs.
-    groups = plain(config).items()
-    content = {key: value for key, value in groups if key not in _STEERING and value is not None}
-    return config_hash(content)
+    return config_hash({key: value for key, value in settings_of(config).items() if key not in _STEERING})
 
 
 def overrides() -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from hydra.errors import InstantiationException
 from numpy.typing import ArrayLike
-from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from skin import __version__
@@ -26,7 +25,7 @@ from skin.evaluation.operating_point import LABEL, ContactThreshold, OperatingPo
 from skin.learning.learner.base import AbstractLearner
 from skin.runs.alarm_threshold import alarm_point, alarm_point_for_touches
 from skin.runs.build import build_data, build_device, build_learner, build_skin
-from skin.runs.configuration import Tracking, plain, validate_config
+from skin.runs.configuration import Config, Tracking
 from skin.runs.exported.model import ExportedModel, ModelMetadata
 from skin.runs.finished_run import FinishedRun, find_run
 from skin.runs.overrides import with_skin
@@ -66,7 +65,7 @@ class RunModel(TrainedModel):
         point: OperatingPoint | None = None,
         touch: float | None = None,
         run: FinishedRun | None = None,
-        watched: DictConfig | None = None,
+        watched: Config | None = None,
     ) -> None:
         self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, watched
         self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
@@ -258,18 +257,17 @@ def load_run(
         if body is not None or layout is not None:
             raise InputError(f"{name} is a network for one skin: leave out body and layout")
         return ExportedModel(name)
-    run = find_run(Store.existing(Tracking(uri, None, "skin", True, None)), name, trust)
+    run = find_run(Store.existing(Tracking(uri)), name, trust)
     try:
-        whole = with_skin(plain(run.stored), body, layout)
-        return load_model(run, validate_config(OmegaConf.create(whole)))
+        return load_model(run, with_skin(run.stored, body, layout))
     except InstantiationException as error:
         raise to_input_error(error) or error from error
 
 
 def load_model(
     run: FinishedRun,
-    config: DictConfig | None = None,
-    watched: DictConfig | None = None,
+    config: Config | None = None,
+    watched: Config | None = None,
     device: AbstractDevice | None = None,
     touch: float | None = None,
     one_skin: bool = False,
@@ -289,7 +287,7 @@ def load_model(
     Raises:
         InputError: its weights do not fit the configuration.
     """
-    config = validate_config(run.stored) if config is None else config
+    config = config or run.stored
     if device is None:
         _warn_of_unknown_skin(run.stored, config)
     with run.described():
@@ -301,11 +299,11 @@ def load_model(
     return RunModel(device, learner, data.example, point, touch, run, watched or config)
 
 
-def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:
+def _warn_of_unknown_skin(stored: Config, config: Config) -> None:
     """Warn where a run that was trained on drawn skins is used on one that they do not include."""
-    if (ranges := OmegaConf.select(stored, "device.skins")) is None:
+    if (ranges := stored.device.get("skins")) is None:
         return
-    distribution, skin = configured(SkinDistribution, plain(ranges), "device.skins"), build_skin(config)
+    distribution, skin = configured(SkinDistribution, ranges, "device.skins"), build_skin(config)
     if outside := distribution.outside(skin.body, skin.sensors):
         warnings.warn(
             f"this skin is unlike those that the run was trained on: {', '.join(outside)}; its verdicts may "
@@ -315,14 +313,14 @@ def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:
         )
 
 
-def equation10_warning(stored: DictConfig, device: AbstractDevice | None = None) -> str | None:
+def equation10_warning(stored: Config, device: AbstractDevice | None = None) -> str | None:
     """Return a warning if a run trained with equation 10 is used on a real skin; else None.
 
     Args:
         stored: the run's configuration.
         device: the watched device; None: a real skin.
     """
-    reading = OmegaConf.select(stored, "device.simulator.reading")
+    reading = (stored.device.get("simulator") or {}).get("reading")
     if reading != "equation10" or (device is not None and not device.real):
         return None
     return (

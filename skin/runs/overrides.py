@@ -1,7 +1,7 @@
 """The configuration of a finished run with the overrides of a command line, or a skin built in Python."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -16,7 +16,7 @@ from skin.body.layout.base import AbstractLayout, Listed
 from skin.core.files import CONF
 from skin.core.settings import check_groups
 from skin.errors import InputError
-from skin.runs.configuration import plain, validate_config
+from skin.runs.configuration import Config, validate_config
 
 # Groups that the weights of a run depend on.
 _FIXED = (
@@ -32,7 +32,7 @@ _FIXED = (
 )
 
 
-def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
+def apply_overrides(stored: Config, composed: DictConfig, overrides: Sequence[str]) -> Config:
     """Return a run's configuration with the overrides of a command line, checked.
 
     An option that the command line chooses may set more than its own group: the file of a skin in
@@ -40,14 +40,13 @@ def apply_overrides(stored: DictConfig, composed: DictConfig, overrides: Sequenc
 
     Args:
         stored: as :attr:`skin.runs.finished_run.FinishedRun.stored` gives it.
-        composed: a new configuration with the overrides.
+        composed: a new configuration with the overrides, as Hydra composes it.
         overrides: of the command line; only these settings are taken from ``composed``.
 
     Raises:
         InputError: an override changes a setting that the weights depend on.
     """
-    whole = OmegaConf.create(_raw(stored))
-    assert isinstance(whole, DictConfig)
+    whole = OmegaConf.create(asdict(stored))
     _follow(whole, composed)
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     keys = [override.key_or_group for override in parsed if not _is_steering(override.key_or_group)]
@@ -135,7 +134,7 @@ def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> No
         if _is_steering(group) or _value(settings, path) != value:
             continue
         if group in _FIXED:
-            if _value(plain(whole), path) != _value(plain(composed), path):
+            if _value(_raw(whole), path) != _value(OmegaConf.to_container(composed, resolve=True), path):
                 raise InputError(
                     f"{'.'.join(path)} in the option {option.name} was fixed when the run was trained: leave "
                     "it out of the file, or train another run"
@@ -180,7 +179,7 @@ def profile_settings(name: str) -> dict[str, Any]:
     names = loader.get_group_options("profile")
     if name not in names:
         raise InputError(f"there is no profile {name}: choose one of {', '.join(names)}")
-    return plain(compose(f"profile/{name}").device)
+    return OmegaConf.to_container(compose(f"profile/{name}").device, resolve=True)  # type: ignore[return-value]
 
 
 def _follow(whole: DictConfig, composed: DictConfig) -> None:
@@ -202,13 +201,11 @@ def _raw(config: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(config, resolve=False)  # type: ignore[return-value]
 
 
-def with_skin(
-    groups: dict[str, Any], body: AbstractBody | str | None, layout: AbstractLayout | str | None
-) -> dict[str, Any]:
-    """Return the settings of a run with another body or layout.
+def with_skin(config: Config, body: AbstractBody | str | None, layout: AbstractLayout | str | None) -> Config:
+    """Return the configuration of a run with another body or layout.
 
     Args:
-        groups: plain settings; interpolations are resolved.
+        config: of the run.
         body: the body, the name of an option (``arm``), or None for that of the settings.
         layout: the layout, the name of an option (``grid``), the path of a CSV file, or None.
 
@@ -216,15 +213,14 @@ def with_skin(
         InputError: there is no such option or file, or a sensor lies outside the body.
     """
     if body is not None:
-        groups = groups | {
-            "body": _default_option("body", body) if isinstance(body, str) else _body_settings(body)
-        }
+        settings = _default_option("body", body) if isinstance(body, str) else _body_settings(body)
+        config = replace(config, body=settings)
     if isinstance(layout, str):
-        groups = groups | {"layout": _layout_settings(layout)}
+        config = replace(config, layout=_layout_settings(layout))
     elif layout is not None:
-        check_groups({"body": groups["body"]})
-        groups = groups | {"layout": _listed_settings(layout, instantiate(groups["body"]))}
-    return groups
+        check_groups({"body": config.body})
+        config = replace(config, layout=_listed_settings(layout, instantiate(config.body)))
+    return config
 
 
 def _body_settings(body: AbstractBody) -> dict[str, Any]:

@@ -8,11 +8,10 @@ import time
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
 from skin.core.files import ROOT
 
 if TYPE_CHECKING:
+    from skin.runs.configuration import Config
     from skin.runs.store import Store
 
 
@@ -55,7 +54,7 @@ class SweepProgress:
         return sum(self._expected) * self._spent / self._done
 
 
-def expected_seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]) -> float | None:
+def expected_seconds(store: "Store", config: "Config", tags: Mapping[str, str]) -> float | None:
     """Return the duration of the last finished run of the same row and simulator, s.
 
     Without one, it is estimated from the published table: seconds per epoch times epochs, plus a third for
@@ -71,7 +70,7 @@ def expected_seconds(store: "Store", config: DictConfig, tags: Mapping[str, str]
     with published.open(newline="") as file:
         for line in csv.DictReader(file):
             if same.items() <= line.items() and line["seconds_per_epoch"]:
-                return 5 + 1.3 * config.trainer.max_epochs * float(line["seconds_per_epoch"])
+                return 5 + 1.3 * config.trainer["max_epochs"] * float(line["seconds_per_epoch"])
     return None
 
 

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from skin.core.messages import to_input_error
 from skin.errors import InputError
-from skin.runs.configuration import check_server, plain, validate_config
+from skin.runs.configuration import Config, check_server, validate_config
 from skin.runs.progress import SweepProgress, expected_seconds, format_duration
 
 if TYPE_CHECKING:
@@ -285,16 +285,14 @@ def _without_hydra(config: DictConfig) -> DictConfig:
     return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
 
 
-def _compose_job(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
+def _compose_job(config: DictConfig, job: Mapping[str, str]) -> Config | None:
     """Return the configuration of a job; None where it will be refused."""
     words = [f"{key}={value}" for key, value in job.items()]
     whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
     try:
-        made = validate_config(_without_hydra(whole))
-        plain(made)
+        return validate_config(_without_hydra(whole))
     except InputError:
         return None
-    return made
 
 
 def _share_cores(launcher: DictConfig) -> None:

@@ -7,7 +7,7 @@ from time import monotonic
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le
-from omegaconf import DictConfig
+from hydra import compose
 
 from skin.core.settings import configured
 from skin.errors import InputError
@@ -18,6 +18,7 @@ from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import Skin
 from skin.hardware.wire.source import SerialSource, Source
+from skin.runs.configuration import Config
 from skin.runs.exported.model import ExportedModel
 from skin.runs.trained_model import TrainedModel
 
@@ -141,7 +142,7 @@ def watch_exported(
 
 
 def watch_run(
-    config: DictConfig,
+    config: Config,
     live: LiveSettings,
     say: Callable[[str], None],
     overrides: Sequence[str],
@@ -170,7 +171,8 @@ def watch_run(
 
     torch.set_num_threads(config.tracking.threads or 1)
     run = FinishedRun.named(config)
-    watched = run.configured(config, overrides)
+    composed = compose("live", [*overrides])
+    watched = run.configured(composed, overrides)
     device = build_device(watched)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.
     port = open_source(device) if device.real else None
@@ -178,7 +180,7 @@ def watch_run(
         opened.enter_context(port.skin)
     # The training data stay those of the run, for any watched device.
     trained = run.configured(
-        config, [word for word in overrides if not word.startswith(("device=", "device."))]
+        composed, [word for word in overrides if not word.startswith(("device=", "device."))]
     )
     say(f"loading {run.title} ({run.identity[:8]})")
     if not own_mechanics and (advice := equation10_warning(run.stored, device)):

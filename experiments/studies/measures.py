@@ -85,7 +85,7 @@ class Subject:
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm on this device."""
         from skin.evaluation.operating_point import OperatingPoint
-        from skin.runs.alarm_threshold import alarm_point
+        from skin.runs.model_of_run import alarm_point
 
         run = self.of.trained.run
         point = self.of.trained.point if run is None else alarm_point(run, self.learner, self.config)

@@ -86,7 +86,8 @@ def main(config: Config) -> None:
 
 def _publish(chosen: PublishedResults, config: Config) -> int:
     """Run the commands of a part; return 1 if one failed."""
-    from skin.runs.progress import SweepProgress, format_duration
+    from skin.core.messages import format_duration
+    from skin.runs.sweep import SweepProgress
 
     full, failed = chosen.budget == "full", []
     lines = list(_lines(chosen, config))

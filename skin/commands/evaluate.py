@@ -17,7 +17,7 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
 
 if TYPE_CHECKING:
-    from skin.runs.progress import Steps
+    from skin.core.messages import Steps
 
 
 # Expected seconds of each step, for the share in the progress.
@@ -31,7 +31,7 @@ _STEPS = {
 @command("evaluate")
 def main(config: Config) -> None:
     """Restore a finished run, evaluate it, and print and log the metrics."""
-    from skin.runs.progress import Steps
+    from skin.core.messages import Steps
 
     with Steps(_STEPS) as steps:
         _evaluate(config, steps)

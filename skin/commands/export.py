@@ -23,9 +23,9 @@ from skin.errors import InputError
 from skin.runs.configuration import Config, overrides
 
 if TYPE_CHECKING:
+    from skin.core.messages import Steps
     from skin.device.touches import Touches
     from skin.runs.model_of_run import RunModel
-    from skin.runs.progress import Steps
 
 _FORMATS = ("onnx", "folder")
 
@@ -65,7 +65,7 @@ def main(config: Config) -> None:
         _export_folder(config)
         return
 
-    from skin.runs.progress import Steps
+    from skin.core.messages import Steps
 
     if config.name is not None or config.licence is not None:
         raise InputError("name and licence are those of a folder: add format=folder, or leave them out")

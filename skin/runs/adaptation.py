@@ -25,6 +25,7 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
 from torch import Tensor, nn
 
+from skin.core.messages import Steps
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured
 from skin.device.base import AbstractDevice, Blank
@@ -36,11 +37,10 @@ from skin.evaluation.report import evaluate, metrics_table
 from skin.evaluation.settings import check_evaluation
 from skin.learning.classifier import TouchClassifier, probabilities
 from skin.learning.data import TouchData
-from skin.runs.alarm_threshold import alarm_point, threshold_device
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config
 from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.progress import Steps
+from skin.runs.model_of_run import alarm_point, threshold_device
 from skin.runs.store import Store, note_reuse
 from skin.runs.train import log_configuration, log_learner, log_report, tags
 from skin.touch.labels import Task

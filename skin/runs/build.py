@@ -1,15 +1,17 @@
-"""Build the objects that a configuration names, group by group."""
+"""Build the objects that a configuration names, group by group, and find the settings of a skin's objects."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from skin.body.base import AbstractBody, check_plausibility, warn_of_surface
-from skin.body.layout.base import AbstractLayout
+from skin.body.layout.base import AbstractLayout, Listed
 from skin.body.sensors import Sensors
+from skin.core.files import CONF
 from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
@@ -98,3 +100,78 @@ def build_learner(config: Config) -> AbstractLearner:
     _check_options(config, "learner")
     learner: AbstractLearner = instantiate(config.learner, seed=config.seed)
     return learner
+
+
+# The settings of a skin that was built in Python.
+
+
+def with_skin(config: Config, body: AbstractBody | str | None, layout: AbstractLayout | str | None) -> Config:
+    """Return the configuration of a run with another body or layout.
+
+    Args:
+        config: of the run.
+        body: the body, the name of an option (``arm``), or None for that of the settings.
+        layout: the layout, the name of an option (``grid``), the path of a CSV file, or None.
+
+    Raises:
+        InputError: there is no such option or file, or a sensor lies outside the body.
+    """
+    if body is not None:
+        settings = _default_option("body", body) if isinstance(body, str) else _body_settings(body)
+        config = replace(config, body=settings)
+    if isinstance(layout, str):
+        config = replace(config, layout=_layout_settings(layout))
+    elif layout is not None:
+        check_groups({"body": config.body})
+        config = replace(config, layout=_listed_settings(layout, instantiate(config.body)))
+    return config
+
+
+def _body_settings(body: AbstractBody) -> dict[str, Any]:
+    """Return the settings of a body: the arguments that it was built from."""
+    if not isinstance(body, AbstractBody):
+        raise InputError(f"body must be a body such as skin.Sheet, or the name of one, got {body!r}")
+    settings = {field.name: getattr(body, field.name) for field in fields(body) if field.init}
+    settings["layers"] = [asdict(layer) for layer in body.layers]
+    for layer in settings["layers"]:
+        layer["material"] = {key: value for key, value in layer["material"].items() if value is not None}
+    plain = {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()}
+    return {"_target_": _class_name(body), "_convert_": "all", **plain}
+
+
+def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, Any]:
+    """Return settings for the sensors that a layout has in a body."""
+    if not isinstance(layout, AbstractLayout):
+        raise InputError(f"layout must be a layout such as skin.Grid, a name or a CSV file, got {layout!r}")
+    sensors = layout.sensors(body)
+    return {
+        "_target_": f"{Listed.__module__}.{Listed.__qualname__}",
+        "_convert_": "all",
+        "positions": sensors.positions.tolist(),
+        "footprint": list(sensors.footprint),
+        "normals": sensors.normals.tolist(),
+    }
+
+
+def _layout_settings(name: str) -> dict[str, Any]:
+    """Return the settings of a layout that is given by its name or by its file."""
+    if name.lower().endswith(".csv"):
+        return _default_option("layout", "file") | {"path": name}
+    return _default_option("layout", name)
+
+
+def _default_option(group: str, name: str) -> dict[str, Any]:
+    """Return the default settings of an option.
+
+    Raises:
+        InputError: there is no such option.
+    """
+    options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    if name not in options:
+        raise InputError(f"there is no {group} {name}: give one of {', '.join(options)}, or build one")
+    settings: Any = OmegaConf.to_container(OmegaConf.load(CONF / group / f"{name}.yaml"))
+    return settings
+
+
+def _class_name(built: object) -> str:
+    return f"{type(built).__module__}.{type(built).__qualname__}"

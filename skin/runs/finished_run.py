@@ -32,8 +32,7 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.learning.data import TouchData
 from skin.learning.learner.base import AbstractLearner
-from skin.runs.configuration import Config, validate_config
-from skin.runs.overrides import apply_overrides
+from skin.runs.configuration import Config, apply_overrides, validate_config
 from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -117,7 +116,7 @@ class FinishedRun:
             ) from error
 
     def configured(self, composed: DictConfig, overrides: Sequence[str]) -> Config:
-        """Return the configuration with overrides, as :func:`skin.runs.overrides.apply_overrides` does."""
+        """Return the configuration with the overrides of a command line."""
         return apply_overrides(self.stored, composed, overrides)
 
     @property

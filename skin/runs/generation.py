@@ -14,13 +14,13 @@ from filelock import FileLock, Timeout
 
 from skin.body.base import require_memory
 from skin.core.files import MANIFEST
+from skin.core.messages import format_duration
 from skin.device.balance import report_balance, summary_line
 from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
 from skin.device.touches import Part
 from skin.errors import InputError
 from skin.runs.configuration import Config, fingerprint, settings_of, source_tags
-from skin.runs.progress import format_duration
 
 _PAUSE = 10.0  # s between two lines of progress
 _BYTES = 40.0  # of memory for each reading of a file: with displacements, and a table of everything

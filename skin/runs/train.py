@@ -38,7 +38,6 @@ from skin.evaluation.settings import check_evaluation
 from skin.learning.learner.base import AbstractLearner
 from skin.learning.learner.network import LAST
 from skin.plot.figures import confusions, save_figure
-from skin.runs.alarm_threshold import threshold_device
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import (
     MACHINE,
@@ -50,6 +49,7 @@ from skin.runs.configuration import (
     source_tags,
 )
 from skin.runs.finished_run import TAG
+from skin.runs.model_of_run import threshold_device
 from skin.runs.store import Store, note_reuse
 from skin.touch.labels import Task
 

@@ -10,10 +10,9 @@ from hydra import compose, initialize_config_dir
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.runs.alarm_threshold import alarm_point, threshold_device
 from skin.runs.configuration import validate_config
 from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.overrides import profile_settings
+from skin.runs.model_of_run import alarm_point, profile_settings, threshold_device
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
 

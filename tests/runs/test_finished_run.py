@@ -16,10 +16,10 @@ from skin.core.files import CONF
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import Evaluation
-from skin.runs.alarm_threshold import stored_point
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config, Tracking, validate_config
 from skin.runs.finished_run import TAG, FinishedRun, find_run
+from skin.runs.model_of_run import stored_point
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.

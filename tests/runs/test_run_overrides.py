@@ -5,8 +5,7 @@ from hydra import compose, initialize_config_dir
 
 from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.configuration import settings_of, validate_config
-from skin.runs.overrides import apply_overrides
+from skin.runs.configuration import apply_overrides, settings_of, validate_config
 
 
 def stored(*overrides):

@@ -11,8 +11,8 @@ from skin.body.layout.grid import Grid
 from skin.body.layout.random import Random
 from skin.body.material import Material, Relaxation
 from skin.body.sheet import Sheet
+from skin.runs.build import with_skin
 from skin.runs.configuration import Config
-from skin.runs.overrides import with_skin
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.01},

@@ -24,8 +24,7 @@ from skin.core.safe_loading import KEY as CHECKSUM
 from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file
 from skin.core.settings import ONCE, check_groups, check_targets, configured
 from skin.errors import InputError
-from skin.runs.configuration import Config, settings_of, validate_config
-from skin.runs.overrides import apply_overrides
+from skin.runs.configuration import Config, apply_overrides, settings_of, validate_config
 from skin.runs.trained_model import TrainedModel
 from skin.touch.labels import Task
 

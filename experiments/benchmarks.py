@@ -25,7 +25,6 @@ import psutil
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 from skin.core.files import CONF, ROOT, results, write
 from skin.core.messages import quiet
@@ -39,7 +38,7 @@ from skin.hardware.wire.protocol import encode_line
 from skin.learning.data import TouchData
 from skin.learning.network import Network
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.configuration import validate_config
+from skin.runs.configuration import Config, validate_config
 from skin.runs.model_of_run import RunModel, window_classifier
 
 Figures = dict[str, float]
@@ -145,7 +144,7 @@ def run_alone(function: str, arguments: Sequence[object], checkout: Path = ROOT)
     return json.loads(done.stdout)
 
 
-def training_config(*overrides: str) -> DictConfig:
+def training_config(*overrides: str) -> Config:
     """Return the configuration of a training with overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return validate_config(compose("train", list(overrides)))

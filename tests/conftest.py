@@ -35,11 +35,11 @@ import pytest
 import torch
 from filelock import FileLock
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 
 from skin.core.files import ROOT
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
+from skin.runs.configuration import Config, validate_config
 from skin.touch.labels import TOUCH
 from tests.starter import copying
 
@@ -156,15 +156,15 @@ def played() -> Iterator[Callable[[Callable[[socket.socket, threading.Event], No
 
 
 @pytest.fixture(scope="session")
-def configured() -> Callable[..., DictConfig]:
-    """Return a function from overrides to the composed configuration."""
+def configured() -> Callable[..., Config]:
+    """Return a function from overrides to the configuration of a training."""
 
     made = {}
 
-    def make(*overrides: str) -> DictConfig:
+    def make(*overrides: str) -> Config:
         if overrides not in made:
             with initialize_config_dir(str(CONF), version_base="1.3"):
-                made[overrides] = compose("train", overrides=list(overrides))
+                made[overrides] = validate_config(compose("train", overrides=list(overrides)))
         return deepcopy(made[overrides])
 
     return make

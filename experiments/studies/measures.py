@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 from annotated_types import Ge, Gt, MinLen
 
 from skin.errors import InputError
-from skin.evaluation.settings import StreamSettings
+from skin.evaluation.settings import StreamSettings, check_evaluation
 
 if TYPE_CHECKING:
     import numpy as np
     from mlflow.entities import Run
-    from omegaconf import DictConfig
 
     from experiments.studies.pages import Page
     from skin.device.base import AbstractDevice
     from skin.evaluation.operating_point import OperatingPoint
     from skin.learning.learner import AbstractLearner
+    from skin.runs.configuration import Config
     from skin.runs.model_of_run import RunModel
 
 _COUNTED = 1_000_003  # seed of the touches that are counted, which chose no threshold
@@ -38,7 +38,7 @@ class Subject:
         model: what the run learned, and the device that it was trained on.
     """
 
-    config: "DictConfig"
+    config: "Config"
     device: "AbstractDevice"
     run: "Run | None" = None
     model: "RunModel | None" = None
@@ -70,11 +70,11 @@ class Subject:
     def point(self) -> "OperatingPoint":
         """Return where the run raises the alarm on this device."""
         from skin.evaluation.operating_point import OperatingPoint
-        from skin.runs.alarm_threshold import alarm_point
+        from skin.runs.model_of_run import alarm_point
 
         run = self.trained.run
         point = self.trained.point if run is None else alarm_point(run, self.learner, self.config)
-        return point or OperatingPoint.default(self.config.evaluation.false_alarm_rate)
+        return point or OperatingPoint.default(check_evaluation(self.config.evaluation).false_alarm_rate)
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ class TouchAlarms:
         from skin.touch.labels import TOUCH
         from skin.touch.sampler import balanced
 
-        trained, settings = subject.trained, subject.config.evaluation
+        trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
         patience = DebounceSettings().alarm
         aligned = device.rate <= device.model_rate

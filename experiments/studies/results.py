@@ -16,13 +16,12 @@ from shlex import join, split
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt
-from omegaconf import DictConfig
 
 from experiments import peers
 from skin.commands._command import command
 from skin.core.settings import check_settings, configured
 from skin.errors import InputError
-from skin.runs.configuration import overrides, plain
+from skin.runs.configuration import Config, overrides
 
 _PEERS = "experiments/peers/conf"
 _FRESH = {"uri": "sqlite:///results/fresh.db", "artifacts": "results/fresh"}  # of tracking
@@ -74,9 +73,9 @@ class PublishedResults:
 
 
 @command("results")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Publish; exit code 1 if a command failed."""
-    settings = plain(config)["results"]
+    settings = config.results
     chosen = configured(PublishedResults, settings, "results")
 
     from skin.core.messages import quiet
@@ -85,9 +84,10 @@ def main(config: DictConfig) -> None:
     sys.exit(_publish(chosen, config))
 
 
-def _publish(chosen: PublishedResults, config: DictConfig) -> int:
+def _publish(chosen: PublishedResults, config: Config) -> int:
     """Run the commands of a part; return 1 if one failed."""
-    from skin.runs.progress import SweepProgress, format_duration
+    from skin.core.messages import format_duration
+    from skin.runs.sweep import SweepProgress
 
     full, failed = chosen.budget == "full", []
     lines = list(_lines(chosen, config))
@@ -119,7 +119,7 @@ def _fails(line: Sequence[str]) -> bool:
         return True
 
 
-def _lines(chosen: PublishedResults, config: DictConfig) -> Iterator[tuple[float, list[str]]]:
+def _lines(chosen: PublishedResults, config: Config) -> Iterator[tuple[float, list[str]]]:
     """Yield hours, and verb and overrides, of each command; the overrides of the command line last."""
     smoke = chosen.budget == "smoke"
     passed = [word for word in overrides() if word.split("=")[0].split(".")[0] not in ("results", "out")]
@@ -153,7 +153,7 @@ def _within(folder: Path, words: Sequence[str]) -> list[str]:
     return [f"out={folder / word[4:]}" if word.startswith("out=") else word for word in words]
 
 
-def _folder(chosen: PublishedResults, config: DictConfig) -> Path:
+def _folder(chosen: PublishedResults, config: Config) -> Path:
     """Return the folder of the published files; smoke budgets are published in a folder in it."""
     from skin.core.files import results
 

@@ -23,14 +23,14 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from experiments import peers
 from skin.commands._command import command
 from skin.core.files import CONF, results
 from skin.core.settings import check_settings, configured
 from skin.errors import InputError
-from skin.runs.configuration import overrides, plain, validate_config
+from skin.runs.configuration import Config, overrides, validate_config
 from skin.runs.sweep import sweep_jobs
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Variant:
 
     name: str
     chosen: Mapping[str, str]
-    configs: dict[str, DictConfig]
+    configs: dict[str, Config]
     trained: bool = True
 
 
@@ -110,7 +110,7 @@ class Study:
     axis: str | None = None
 
 
-def chosen_studies(config: DictConfig) -> list[Study]:
+def chosen_studies(config: Config) -> list[Study]:
     """Return the comparisons that a configuration of ``skin study`` chooses: its study, or parts of it.
 
     A part has the settings of the study, then its own, then those of the command line.
@@ -122,7 +122,7 @@ def chosen_studies(config: DictConfig) -> list[Study]:
     if not option:
         options = ", ".join(sorted(path.stem for path in (CONF / "study").glob("*.yaml")))
         raise InputError(f"which study? choose one of {options}, as in study=graphs")
-    settings = plain(config)["study"]
+    settings = dict(config.study)
     parts, part = settings.pop("parts"), settings.pop("part")
     names = [*parts] if part is None else [part] if isinstance(part, str) else part
     if unknown := [name for name in names if name not in parts]:
@@ -246,7 +246,7 @@ def _key(override: str) -> str:
 
 
 @command("study")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Train or find the runs of a study, measure them, and write and print the results."""
     studies = chosen_studies(config)
     folder = results(config.out) / ("smoke" if config.smoke else "")
@@ -266,7 +266,7 @@ def main(config: DictConfig) -> None:
         sys.exit(1)
 
 
-def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
+def _compare(study: Study, config: Config, folder: Path) -> bool:
     """Measure the runs of a study, publish the results, and return whether a run is missing."""
     from rich.console import Console
     from rich.progress import track
@@ -278,7 +278,7 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
 
     shard = Shard.parse(config.shard) if config.shard is not None else None
     if study.trainings:
-        store, planned = train_study(study, shard, config.smoke)
+        store, planned = train_study(study, shard, bool(config.smoke))
     else:
         store = Store.open(config.tracking)
         planned = find_runs(study, config, store)
@@ -302,7 +302,7 @@ def _compare(study: Study, config: DictConfig, folder: Path) -> bool:
     return any(run.run is None for run in planned)
 
 
-def _publish(study: Study, trials: Sequence["TrialResult"], config: DictConfig, folder: Path) -> None:
+def _publish(study: Study, trials: Sequence["TrialResult"], config: Config, folder: Path) -> None:
     """Write and print the results of a study."""
     from experiments.studies.study_page import draw_report, publish_files, publish_study
 
@@ -310,7 +310,7 @@ def _publish(study: Study, trials: Sequence["TrialResult"], config: DictConfig, 
     if not study.metrics:
         publish_files(study, trials, path.with_suffix(".csv"))
     else:
-        smoke = "SMOKE, one epoch on little data, ignore the scores: " * config.smoke
+        smoke = "SMOKE, one epoch on little data, ignore the scores: " * bool(config.smoke)
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
         small = study.small if smoke else ()
         title = smoke + ", ".join([f"{study.name}: {study.about}", *small, *settings])

@@ -26,7 +26,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
 from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
-from omegaconf import DictConfig
 
 from experiments.studies.measures import Accuracy, StudyMeasure, Subject
 from experiments.studies.pages import publish_page
@@ -38,7 +37,7 @@ from skin.core.safe_loading import check_seal, write_parquet
 from skin.errors import InputError
 from skin.evaluation.metrics import OUTCOMES, decode, disagreement, vote
 from skin.runs.build import build_device
-from skin.runs.configuration import fingerprint, source_tags
+from skin.runs.configuration import Config, fingerprint, source_tags
 from skin.runs.finished_run import TAG, FinishedRun, find_run
 from skin.runs.model_of_run import RunModel, load_model
 from skin.runs.store import Store, note_reuse, note_source
@@ -83,12 +82,12 @@ def train_study(study: Study, shard: Shard | None, smoke: bool = False) -> tuple
     return store, [run for run in _look(store, every) if run.run is not None or run.variant.trained]
 
 
-def _only(configs: Mapping[str, DictConfig], fingerprints: Collection[str]) -> dict[str, DictConfig]:
+def _only(configs: Mapping[str, Config], fingerprints: Collection[str]) -> dict[str, Config]:
     """Return the configurations with these fingerprints."""
     return {seed: config for seed, config in configs.items() if fingerprint(config) in fingerprints}
 
 
-def find_runs(study: Study, config: DictConfig, store: Store) -> list[Planned]:
+def find_runs(study: Study, config: Config, store: Store) -> list[Planned]:
     """Return finished runs: the named one, or the newest of rows and seeds on the simulator of ``config``.
 
     Runs of a row whose names differ in more than the seed are different variants.
@@ -129,7 +128,7 @@ def row_and_simulator(variant: Variant) -> tuple[str, str]:
     )
 
 
-def newest_finished(store: Store, config: DictConfig) -> Run | None:
+def newest_finished(store: Store, config: Config) -> Run | None:
     """Return the newest finished run of a configuration."""
     runs = store.find("FINISHED", fingerprint=fingerprint(config))
     if runs:
@@ -259,7 +258,7 @@ class TrialResult:
     cannot: Sequence[str] = ()
 
 
-def run_trials(store: Store, planned: Planned, study: Study, config: DictConfig) -> Iterator[TrialResult]:
+def run_trials(store: Store, planned: Planned, study: Study, config: Config) -> Iterator[TrialResult]:
     """Yield the results of a study for a run; those that exist are not measured again.
 
     Args:
@@ -327,7 +326,7 @@ class RestoredRun:
         config: of the command.
     """
 
-    def __init__(self, store: Store, run: Run, config: DictConfig) -> None:
+    def __init__(self, store: Store, run: Run, config: Config) -> None:
         self.run, self.config = run, config
         self.finished = FinishedRun(store, run, config.trust)
 
@@ -357,7 +356,7 @@ class RestoredRun:
             note_source(str(path), f"{study.name} of {run.info.run_name}", row["source"])
         return row
 
-    def _measured(self, measure: StudyMeasure, config: DictConfig, name: str) -> dict[str, Any]:
+    def _measured(self, measure: StudyMeasure, config: Config, name: str) -> dict[str, Any]:
         """Measure, and return the row; its files have a name."""
         subject = Subject(config, build_device(config), self.run, self.trained)
         result = measure(subject)

@@ -13,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from skin.core.files import CONF
 from skin.core.settings import check_groups
-from skin.runs.configuration import plain
 
 from skin.core import interrupt  # noqa: F401  # isort: skip
 import logging
@@ -33,7 +32,7 @@ from hydra.types import RunMode
 
 from skin.core.messages import JobInputError, one_line, to_input_error
 from skin.errors import InputError
-from skin.runs.configuration import check_server, overrides, refuse_null_groups, validate_config
+from skin.runs.configuration import Config, check_server, overrides, refuse_null_groups, validate_config
 from skin.runs.sweep import left_out
 
 # What a person may have meant by an override that Hydra refuses.
@@ -110,7 +109,7 @@ def _settings(part: Any, above: str) -> Iterator[str]:
 _GROUPS = ("body", "layout", "touch", "device", "contact")
 
 
-def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
+def check_quickly(config: Config, overrides: Sequence[str]) -> None:
     """Refuse settings of a skin that no skin has, and a port that does not exist.
 
     Args:
@@ -124,9 +123,7 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
     from skin.body.base import check_plausibility
     from skin.hardware.wire.reader import PortSettings, check_port
 
-    groups: dict[str, Any] = {
-        name: plain(config[name]) for name in _GROUPS if isinstance(config.get(name), DictConfig)
-    }
+    groups: dict[str, Any] = {name: group for name in _GROUPS if (group := getattr(config, name))}
     check_groups({name: groups[name] for name in ("body", "layout") if name in groups})
     check_plausibility(groups)
     device = groups.get("device", {})
@@ -134,7 +131,7 @@ def check_quickly(config: DictConfig, overrides: Sequence[str]) -> None:
         PortSettings.select({name: value for name, value in device.items() if value is not None})
         check_port(port)
     named = {override.split("=")[0].split(".")[0] for override in overrides}
-    if "run" in config and config.run is not None and not config.run.endswith(".onnx"):
+    if config.run is not None and not config.run.endswith(".onnx"):
         check_groups({name: groups[name] for name in ("device", "contact") if name in groups.keys() & named})
         if "touch" in named:
             from skin.touch.gesture import GestureSettings
@@ -147,7 +144,7 @@ _VERSION = "1.3"  # of Hydra, whose defaults hold
 _WORDS = (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
-def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Callable[..., None]]:
+def command(name: str = "train") -> Callable[[Callable[[Config], Any]], Callable[..., None]]:
     """Return a decorator that turns a function of a checked configuration into a command.
 
     Bad input ends the command with a message and exit code 2. In a multirun the job fails and the others
@@ -157,7 +154,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
         name: the primary configuration, a file in ``conf/``.
     """
 
-    def decorate(task: Callable[[DictConfig], Any]) -> Callable[..., None]:
+    def decorate(task: Callable[[Config], Any]) -> Callable[..., None]:
         started = []
 
         @wraps(task)
@@ -168,8 +165,7 @@ def command(name: str = "train") -> Callable[[Callable[[DictConfig], Any]], Call
             try:
                 refuse_null_groups(config)
                 checked = validate_config(config)
-                if checked.tracking is not None:
-                    check_server(checked.tracking.uri)
+                check_server(checked.tracking.uri)
                 check_quickly(checked, overrides())
                 return task(checked)
             except Exception as error:

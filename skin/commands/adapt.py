@@ -7,14 +7,12 @@ The gestures are recorded (skin record) or simulated. body= and layout= describe
 the run. Logs a new run, which keeps the weights if fine-tuning is not better on held-out gestures.
 """
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
-from skin.runs.configuration import overrides
+from skin.runs.configuration import Config, overrides
 
 
 @command("adapt")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Fine-tune a run, log the result, and print the figures before and after."""
     from skin.core.messages import quiet
     from skin.runs.adaptation import adapt

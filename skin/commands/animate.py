@@ -6,14 +6,13 @@
 Without device= the touch is simulated.
 """
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import Config
 
 
 @command("animate")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Write a GIF or PNG of a simulated or recorded touch."""
     if config.out is None or not config.out.endswith((".gif", ".png")):
         raise InputError(
@@ -27,10 +26,10 @@ def main(config: DictConfig) -> None:
 
     device = build_device(config)
     if device.simulation is None:
-        scene = read_scene(device, config.index)
+        scene = read_scene(device, config.index or 0)
     else:
         field = config.view == "skin3d"
-        scene = simulate_scene(device.simulation, list(config.labels), config.shape, config.seed, field)
+        scene = simulate_scene(device.simulation, list(config.labels or ()), config.shape, config.seed, field)
     path = Path(config.out).expanduser()
-    path = (still if path.suffix == ".png" else write_animation)(scene, config.view, path)
+    path = (still if path.suffix == ".png" else write_animation)(scene, str(config.view), path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

@@ -11,21 +11,19 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 
 _CONFIRMED = ("places", "channels", "broken")
 
 
 @command("calibrate")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Print the errors on held-out presses, and write a calibration with all presses."""
     if config.session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
-    files = [config.presses, None if config.calibrate.demo else config.session]
+    files = [config.presses, None if config.calibrate["demo"] else config.session]
     if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
         raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
 
@@ -42,7 +40,7 @@ def main(config: DictConfig) -> None:
     from skin.hardware.wiring import Confirmed, check_usable, device_channels, wired_bench
     from skin.runs.build import build_device
 
-    settings = plain(config)["calibrate"]
+    settings = config.calibrate
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
     if settings["demo"]:
@@ -66,4 +64,4 @@ def main(config: DictConfig) -> None:
     about = dict(calibration.about) | {"held_out": list(outcome.held_out), "rmse": rmse}
     about |= {"session": config.session, "presses_file": config.presses}
     channels = device_channels(session, confirmed)
-    print(write_calibration(replace(calibration, about=about, channels=channels), config.out))
+    print(write_calibration(replace(calibration, about=about, channels=channels), str(config.out)))

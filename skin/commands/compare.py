@@ -9,12 +9,10 @@ out=; run= compares the predictions of a run, too.
 
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.core.files import results
 from skin.errors import InputError
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 
 if TYPE_CHECKING:
     from skin.device.base import AbstractSimulated
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @command("compare")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Simulate a session, compare readings and, with ``run=``, predictions; write a page."""
     if config.session is None:
         raise InputError("which session? add session=session.csv, of skin record or a bench")
@@ -32,7 +30,7 @@ def main(config: DictConfig) -> None:
     from skin.runs.build import build_device
 
     quiet()
-    settings = plain(config)["compare"]
+    settings = config.compare
     device = build_device(config).simulated("a session is compared with a simulation")
     folder = results(config.out)
     about = f"Session {config.session}, simulated by {type(device.model).__name__}" + (
@@ -45,7 +43,7 @@ def main(config: DictConfig) -> None:
 
 
 def _compare_predictions(
-    config: DictConfig, device: "AbstractSimulated", comparison: "SessionComparison"
+    config: Config, device: "AbstractSimulated", comparison: "SessionComparison"
 ) -> "Agreement":
     """Return the predictions of a run for both sides."""
     import numpy as np

@@ -6,17 +6,15 @@
 Writes tables, pictures and JSON into out=.
 """
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.core.files import results
 from skin.core.settings import configured, import_target
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 
 
 @command("design")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Build the chosen analysis from its settings, run it and write its files."""
-    settings = plain(config)["design"]
+    settings = dict(config.design)
     target = import_target(settings.pop("_target_"), "design")
     configured(target, settings, "design").run(config, results(config.out))

@@ -8,17 +8,15 @@ Prints the settings that connect to it, then sends gestures until Ctrl-C.
 import signal
 from contextlib import suppress
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 
 _FORMATS = ("text", "binary")
 
 
 @command("emulate")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Send gestures of the configured simulator, device and layout in real time."""
     if config.format not in _FORMATS:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
@@ -27,12 +25,11 @@ def main(config: DictConfig) -> None:
     from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
     from skin.runs.build import build_device
 
-    groups = plain(config)
-    settings = configured(EmulatorSettings, groups["emulate"], "emulate")
-    faults = configured(Faults, groups["faults"], "faults")
+    settings = configured(EmulatorSettings, config.emulate, "emulate")
+    faults = configured(Faults, config.faults, "faults")
     device = build_device(config).simulated("only simulated gestures can be emulated")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    port = open_port(config.port, config.link)
+    port = open_port(str(config.port), config.link)
     try:
         emulator = Emulator(device, port, settings, faults, config.format == "binary", _notify)
         # Includes the first line, because its reader may stop the command at once.

@@ -9,15 +9,15 @@ Writes evaluation_<device>_<id>.md and .png into out=, and an MLflow run of its 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
+from hydra import compose
 
 from skin.commands._command import command
 from skin.core.files import results
 from skin.errors import InputError
-from skin.runs.configuration import overrides
+from skin.runs.configuration import Config, overrides
 
 if TYPE_CHECKING:
-    from skin.runs.progress import Steps
+    from skin.core.messages import Steps
 
 
 # Expected seconds of each step, for the share in the progress.
@@ -29,18 +29,19 @@ _STEPS = {
 
 
 @command("evaluate")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Restore a finished run, evaluate it, and print and log the metrics."""
-    from skin.runs.progress import Steps
+    from skin.core.messages import Steps
 
     with Steps(_STEPS) as steps:
         _evaluate(config, steps)
 
 
-def _evaluate(config: DictConfig, steps: "Steps") -> None:
+def _evaluate(config: Config, steps: "Steps") -> None:
     from skin.core.messages import quiet
     from skin.core.settings import option_name
     from skin.evaluation.report import evaluate, print_report, publish_evaluation, write_chances
+    from skin.evaluation.settings import check_evaluation
     from skin.runs.finished_run import FinishedRun
     from skin.runs.model_of_run import load_model
     from skin.runs.store import Store
@@ -48,8 +49,9 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
 
     quiet()
     run, folder, changes = FinishedRun.named(config), results(config.out), overrides()
-    config = run.configured(config, changes)
-    if "skins" in config.device and config.evaluation.profile is not None:
+    config = run.configured(compose("evaluate", changes), changes)
+    settings = check_evaluation(config.evaluation)
+    if "skins" in config.device and settings.profile is not None:
         raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
     model = load_model(run, config)
     device, learner, point = model.device, model.learner, model.point
@@ -70,7 +72,7 @@ def _evaluate(config: DictConfig, steps: "Steps") -> None:
             store.client.log_artifact(evaluation.info.run_id, str(path))
             print(f"{title}\n{text}\n{path}")
             return
-        report = evaluate(learner, device, config.evaluation, point)
+        report = evaluate(learner, device, settings, point)
         log_report(store, evaluation, report, device.task, {})
         about = describe_evaluation(title, changes, len(report.predictions))
         written = publish_evaluation(folder / f"{name}.md", report, device.task, run.title, about)

@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from annotated_types import Ge, Gt, MinLen
-from omegaconf import DictConfig
+from hydra import compose
 
 from skin.commands._command import command
 from skin.core.files import results
 from skin.errors import InputError
-from skin.runs.configuration import overrides, plain
+from skin.runs.configuration import Config, overrides
 
 if TYPE_CHECKING:
+    from skin.core.messages import Steps
     from skin.device.touches import Touches
     from skin.runs.model_of_run import RunModel
-    from skin.runs.progress import Steps
 
 _FORMATS = ("onnx", "folder")
 
@@ -57,7 +57,7 @@ _STEPS = {
 
 
 @command("export")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Restore a finished run, write it, and print the path."""
     if config.format not in _FORMATS:
         raise InputError(f"format must be one of {', '.join(_FORMATS)}, got {config.format}")
@@ -65,7 +65,7 @@ def main(config: DictConfig) -> None:
         _export_folder(config)
         return
 
-    from skin.runs.progress import Steps
+    from skin.core.messages import Steps
 
     if config.name is not None or config.licence is not None:
         raise InputError("name and licence are those of a folder: add format=folder, or leave them out")
@@ -73,7 +73,7 @@ def main(config: DictConfig) -> None:
         _export_file(config, steps)
 
 
-def _export_folder(config: DictConfig) -> None:
+def _export_folder(config: Config) -> None:
     """Write the files of a pretrained model, all or none."""
     from skin.runs.finished_run import FinishedRun
     from skin.runs.model_folder import check_folder, write_folder
@@ -81,15 +81,15 @@ def _export_folder(config: DictConfig) -> None:
     if config.out is not None:
         raise InputError(f"a folder is written to models/NAME, not to out={config.out}: add name=my_skin")
     folder = check_folder(config.name, config.licence)
-    write_folder(FinishedRun.named(config), folder, config.licence)
+    write_folder(FinishedRun.named(config), folder, str(config.licence))
     print(folder)
 
 
-def _export_file(config: DictConfig, steps: "Steps") -> None:
+def _export_file(config: Config, steps: "Steps") -> None:
     """Write the network of a run for one skin, with the thresholds of its alarm."""
     from skin.core.settings import configured
 
-    settings = configured(ExportSettings, plain(config)["export"], "export")
+    settings = configured(ExportSettings, config.export, "export")
     path = None if config.out is None else Path(config.out).expanduser()
     if path is not None and path.suffix != ".onnx":
         raise InputError(f"out={config.out} must end in .onnx: as in out=skin.onnx")
@@ -108,7 +108,7 @@ def _export_file(config: DictConfig, steps: "Steps") -> None:
         ) from error
     quiet()
     run = FinishedRun.named(config)
-    whole = run.configured(config, overrides())
+    whole = run.configured(compose("export", overrides()), overrides())
     model = load_model(run, whole, touch=settings.touch, one_skin=True)
     module = model.learner.pipeline(model.places)  # refused before anything else is simulated
     if advice := equation10_warning(run.stored):

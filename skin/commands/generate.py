@@ -8,16 +8,16 @@ has the displacements under the sensors. Prints a summary of the touches, and wa
 predicts a label.
 """
 
+from dataclasses import replace
 from pathlib import Path
-
-from omegaconf import DictConfig
 
 from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import Config
 
 
 @command("generate")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Draw a budget of n gestures and write readings, labels and parameters."""
     if config.out is None:
         raise InputError(
@@ -30,13 +30,10 @@ def main(config: DictConfig) -> None:
             "out=touches.parquet, or out=touches for a folder"
         )
 
-    from omegaconf import OmegaConf
-
     from skin.runs.build import build_device
     from skin.runs.generation import generate_data_set, generate_file
 
     device = build_device(config)
-    # The path of the file does not change the touches.
-    source = OmegaConf.masked_copy(config, [str(key) for key in config if key != "out"])
     generate = generate_file if path.suffix else generate_data_set
-    print(f"{path}: {generate(device, source, path)}")
+    # The path of the file does not change the touches.
+    print(f"{path}: {generate(device, replace(config, out=None), path)}")

@@ -8,17 +8,15 @@ Listens for seconds=, or until Ctrl-C.
 import signal
 from contextlib import suppress
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 
 
 @command("listen")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Print rate and errors once a second, and statistics of each channel at the end."""
-    device = plain(config)["device"]
+    device = config.device
     if device["port"] is None:
         raise InputError(
             "device.port is missing: add device.port=/dev/ttyACM0 or device.port=socket://HOST:NUMBER"

@@ -13,15 +13,16 @@ model at a port of this machine and serves the page. Ctrl-C stops.
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig, OmegaConf
+from hydra import compose
 
 from skin.commands._command import command
 from skin.errors import InputError
-from skin.runs.configuration import overrides, plain, validate_config
+from skin.runs.configuration import Config, overrides, validate_config
 
 if TYPE_CHECKING:
     from skin.hardware.live.engine_builder import LiveSettings
@@ -33,7 +34,7 @@ _DEMO = ("run=default_skin", "web=true")
 
 
 @command("live")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Load a run or an exported model, open the skin, and show verdicts until the command is ended."""
     if config.demo:
         with emulated_skin(overrides()) as (demo, words):
@@ -43,7 +44,7 @@ def main(config: DictConfig) -> None:
 
 
 @contextmanager
-def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]]:
+def emulated_skin(words: Sequence[str]) -> Iterator[tuple[Config, list[str]]]:
     """Emulate the skin of a run, without the imperfections of its training, at a port of this machine.
 
     Args:
@@ -56,8 +57,6 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]
         InputError: a device is given, or the run cannot be emulated.
     """
     from threading import Thread
-
-    from hydra import compose
 
     from skin.core.messages import quiet
     from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, open_port
@@ -77,16 +76,17 @@ def emulated_skin(words: Sequence[str]) -> Iterator[tuple[DictConfig, list[str]]
     thread.start()
     try:
         settings = {"port": port.address, "scale": emulator.converter.scale}
-        merged = OmegaConf.merge(config, {"device": settings})
-        assert isinstance(merged, DictConfig)
-        yield merged, [*words, *(f"device.{name}={value}" for name, value in settings.items())]
+        yield (
+            replace(config, device=config.device | settings),
+            [*words, *(f"device.{name}={value}" for name, value in settings.items())],
+        )
     finally:
         emulator.stop()
         thread.join()
         port.unplug()
 
 
-def show(config: DictConfig, changes: Sequence[str], own_mechanics: bool = False) -> None:
+def show(config: Config, changes: Sequence[str], own_mechanics: bool = False) -> None:
     """Show the predictions of a run for a skin until the command is ended.
 
     Args:
@@ -102,18 +102,18 @@ def show(config: DictConfig, changes: Sequence[str], own_mechanics: bool = False
     from skin.hardware.live.loop import Display, DisplayInfo, LiveLoop
     from skin.runs.exported_model import check_overrides
 
-    live = LiveSettings.of(plain(config)["live"])
+    live = LiveSettings.of(config.live)
     say = Console(stderr=True, highlight=False).print
     exported = str(config.run).endswith(".onnx")
     if exported:
-        check_overrides(config.run, config, changes)
+        check_overrides(str(config.run), compose("live", [*changes]), changes)
     else:
         quiet()
     try:
         with ExitStack() as opened:
             opened.enter_context(ends_on_signal())
             if exported:
-                watched = watch_exported(config.run, plain(config)["device"], live, say, opened)
+                watched = watch_exported(str(config.run), config.device, live, say, opened)
             else:
                 watched = watch_run(config, live, say, changes, opened, own_mechanics)
             source, model = watched.source, watched.model
@@ -130,7 +130,7 @@ def show(config: DictConfig, changes: Sequence[str], own_mechanics: bool = False
         print("ended", file=sys.stderr)
 
 
-def _views(display: "Display", config: DictConfig, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
+def _views(display: "Display", config: Config, live: "LiveSettings", open_: ExitStack) -> Iterator[str]:
     """Open what shows the verdicts; yield messages."""
     if live.log is not None:
         from skin.hardware.live.loop import log_alarms

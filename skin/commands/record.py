@@ -10,14 +10,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
 from skin.errors import InputError
+from skin.runs.configuration import Config
 
 
 @command("record")
-def main(config: DictConfig) -> None:
+def main(config: Config) -> None:
     """Record raw frames to a session, then convert its gestures to a recording."""
     if config.out is None or not config.out.endswith(".csv"):
         raise InputError(f"a session is a .csv file, got {config.out}: add out=session.csv")

@@ -6,13 +6,12 @@
 A run that finished with the same configuration is skipped; tracking.resume=false trains it again.
 """
 
-from omegaconf import DictConfig
-
 from skin.commands._command import command
+from skin.runs.configuration import Config
 
 
 @command()
-def main(config: DictConfig) -> bool:
+def main(config: Config) -> bool:
     """Train and evaluate one configuration; return False if a finished run has the results."""
     from skin.runs.train import train
 

@@ -1,11 +1,15 @@
-"""Error messages for a command, or one job of a multirun, that cannot continue."""
+"""What a command tells a person: errors in one sentence, and how far it is."""
 
 import errno
 import logging
+import math
 import os
 import sqlite3
+import sys
+import threading
+import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from hydra.errors import CompactHydraException, HydraException, InstantiationException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
@@ -106,3 +110,64 @@ def _tell_of_server(record: logging.LogRecord) -> bool:
     if "/mlflow" in str(record.args):
         record.msg, record.args = "the tracking server does not answer: trying again", ()
     return True
+
+
+# How far a command is.
+
+
+def format_duration(duration: float) -> str:
+    """Return a duration in s as text."""
+    minutes = math.ceil(duration / 60)
+    if duration > 2 * 3600:
+        return f"{duration / 3600:.1f} h"
+    return f"{duration:.0f} s" if duration < 90 else f"{minutes} min"
+
+
+class Steps:
+    """Prints how far a command is, on standard error, every ten seconds; use it in a ``with`` statement.
+
+    Args:
+        seconds: duration of each step on some machine, in order, by what the command does in it.
+        pause: s between two lines.
+
+    Attributes:
+        silent: whether to print nothing for now, such as while a person is prompted.
+    """
+
+    def __init__(self, seconds: Mapping[str, float], pause: float = 10.0) -> None:
+        self._seconds, self._pause = dict(seconds), pause
+        self._name, self.silent = next(iter(self._seconds)), False
+        self._done = 0.0  # s of the steps that have ended, as expected
+        self._began = self._step_began = time.monotonic()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._report, daemon=True)
+
+    def __enter__(self) -> "Steps":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def begin(self, name: str) -> None:
+        """Say which step begins; those before it have ended."""
+        names = list(self._seconds)
+        self._done = sum(self._seconds[before] for before in names[: names.index(name)])
+        self._name, self._step_began = name, time.monotonic()
+
+    def line(self) -> str:
+        """Return the step, the share that is done, and the estimated remaining time."""
+        now, whole = time.monotonic(), sum(self._seconds.values())
+        spent = self._step_began - self._began
+        pace = spent / self._done if self._done and spent else 1.0  # s for each expected one
+        # A step that takes longer than expected is almost done, never done.
+        share = (now - self._step_began) / (pace * self._seconds[self._name])
+        done = self._done + self._seconds[self._name] * min(share, 0.95)
+        left = (now - self._began) * (whole / done - 1) if done else pace * whole
+        return f"{self._name}: {100 * done / whole:.0f} % done, about {format_duration(left)} left"
+
+    def _report(self) -> None:
+        while not self._ended.wait(self._pause):
+            if not self.silent:
+                print(self.line(), file=sys.stderr, flush=True)

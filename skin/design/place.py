@@ -3,14 +3,13 @@
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
-from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
 from rich.progress import track
@@ -28,6 +27,7 @@ from skin.device.simulated import build_model
 from skin.errors import InputError
 from skin.plot.figures import save_figure
 from skin.runs.build import build_device
+from skin.runs.configuration import Config
 from skin.touch.movie import Movie
 from skin.touch.sampler import balanced
 
@@ -131,7 +131,7 @@ class Place:
     keep_out: str | Zones | None = None
     keep: Literal["all"] | Sequence[PositiveInt] = ()
 
-    def run(self, config: DictConfig, folder: Path) -> None:
+    def run(self, config: Config, folder: Path) -> None:
         """Place the sensors of the configured skin, print a table and write the files.
 
         Args:
@@ -143,9 +143,10 @@ class Place:
         """
         started = time.perf_counter()
         # Gestures must not depend on the layout that is to be replaced.
-        merged = OmegaConf.merge(config, {"touch": {"over_sensors": False}})
-        assert isinstance(merged, DictConfig)
-        device = build_device(merged).simulated("sensors are placed by simulated touches")
+        drawn = {"touch": config.touch | {"over_sensors": False}} if "touch" in config.device else {}
+        device = build_device(replace(config, device=config.device | drawn)).simulated(
+            "sensors are placed by simulated touches"
+        )
         forbidden = keep_out(self.keep_out, device.size)
         problem = PlacementProblem.of(device, forbidden, self.count, self.keep, self.distance, self.raster)
         noise = self._noise(device)

@@ -12,7 +12,6 @@ from typing import Annotated
 
 import torch
 from annotated_types import Ge, Gt, MinLen
-from omegaconf import DictConfig
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy.stats.qmc import Halton
 from torch import Tensor
@@ -24,6 +23,7 @@ from skin.errors import InputError
 from skin.mechanics.geometry import PARAMETERS, Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.runs.build import build_skin
+from skin.runs.configuration import Config
 
 # Covariance of the parameters given the readings, to first order: (J' R^-1 J + P)^-1, with the slopes J, the
 # variances R of the noise and the inverse variances P of the priors (Van Trees, Detection, Estimation, and
@@ -192,7 +192,7 @@ class LocalPrecision:
     touches: Annotated[int, Ge(16)] = 1024
     seed: Annotated[int, Ge(0)] = 0
 
-    def run(self, config: DictConfig, folder: Path) -> None:
+    def run(self, config: Config, folder: Path) -> None:
         """Write design.json and design.png for the configured skin, and print a table.
 
         Raises:

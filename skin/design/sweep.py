@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import MinLen
-from omegaconf import DictConfig
 from pydantic import PositiveFloat, PositiveInt
 from rich.console import Console
 from rich.progress import track
@@ -21,6 +20,7 @@ from skin.core.settings import checked
 from skin.design.precision import Findings, LocalPrecision
 from skin.errors import InputError
 from skin.runs.build import SkinModel, build_skin
+from skin.runs.configuration import Config
 
 Pair = tuple[PositiveInt, PositiveInt]
 
@@ -68,7 +68,7 @@ class Sweep(LocalPrecision):
     footprint: Footprint = (0.01, 0.01)
     height: PositiveFloat = 0.0005
 
-    def run(self, config: DictConfig, folder: Path) -> None:
+    def run(self, config: Config, folder: Path) -> None:
         """Write design_sweep.csv and design_sweep.png.
 
         Raises:

@@ -24,8 +24,9 @@ class Evaluation:
     profile: str | None = None
 
 
-def check_evaluation(settings: Evaluation) -> None:
-    """Raise InputError where the settings of an evaluation cannot be used."""
+def check_evaluation(settings: Evaluation | None) -> Evaluation:
+    """Return the settings of an evaluation, or raise InputError where they cannot be used."""
+    assert settings is not None
     for name, least in (("devices", 0), ("layouts", 0)):
         if getattr(settings, name) < least:
             raise InputError(f"evaluation.{name}={getattr(settings, name)} must be at least {least}")
@@ -39,6 +40,7 @@ def check_evaluation(settings: Evaluation) -> None:
             "the alarm's threshold is chosen on 1 safe gesture or more, got "
             f"{settings.safe_gestures}: use evaluation.safe_gestures={ENOUGH}"
         )
+    return settings
 
 
 @checked("measure")

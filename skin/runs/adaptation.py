@@ -13,7 +13,7 @@ original network by more than two standard errors of the difference, and the acc
 import sys
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import islice, product
 from typing import Annotated, Any, Literal
@@ -21,11 +21,11 @@ from typing import Annotated, Any, Literal
 import torch
 from annotated_types import Ge, Le, MinLen
 from hydra import compose
-from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from rich.console import Console
 from torch import Tensor, nn
 
+from skin.core.messages import Steps
 from skin.core.rng import Stream, generator
 from skin.core.settings import checked, configured
 from skin.device.base import AbstractDevice, Blank
@@ -34,13 +34,13 @@ from skin.errors import InputError
 from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.evaluation.report import evaluate, metrics_table
+from skin.evaluation.settings import check_evaluation
 from skin.learning.classifier import TouchClassifier, probabilities
 from skin.learning.data import TouchData
-from skin.runs.alarm_threshold import alarm_point, threshold_device
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.configuration import plain, validate_config
+from skin.runs.configuration import Config
 from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.progress import Steps
+from skin.runs.model_of_run import alarm_point, threshold_device
 from skin.runs.store import Store, note_reuse
 from skin.runs.train import log_configuration, log_learner, log_report, tags
 from skin.touch.labels import Task
@@ -257,11 +257,11 @@ class Target:
 
     device: AbstractDevice
     twin: AbstractDevice
-    config: DictConfig
+    config: Config
 
 
 def find_target(
-    parent: FinishedRun, config: DictConfig, settings: FineTuning, overrides: Sequence[str]
+    parent: FinishedRun, config: Config, settings: FineTuning, overrides: Sequence[str]
 ) -> Target:
     """Return the skin that a command describes.
 
@@ -275,28 +275,29 @@ def find_target(
         InputError: no skin is given, or its gestures have other labels than the run.
     """
     words = [word for word in overrides if _group(word) not in _COMMAND]
-    measured = parent.configured(config, words)
+    measured = parent.configured(compose("adapt", words), words)
     if "test" in measured.device:  # a recording, which is used as a whole
-        measured = _changed(measured, device={"test": "all"})
+        measured = replace(measured, device=measured.device | {"test": "all"})
     # The device of the run, on this skin: its fresh gestures determine the threshold of the alarm.
     words = [word for word in words if _group(word) not in ("device", "profile")]
     words += [] if "simulator" in parent.stored.device else ["device=simulated"]
-    simulated = _changed(
-        parent.configured(compose("adapt", words), words), evaluation=plain(config)["evaluation"]
-    )
+    simulated = replace(parent.configured(compose("adapt", words), words), evaluation=config.evaluation)
     device, twin = build_device(measured), threshold_device(simulated, simulated)
     _check(parent, device, twin)
     drawn = device.simulation is not None
     budget = simulated_budget(settings.gestures or _DEFAULT)
-    gestures = {"gestures": budget, "fresh": False} if drawn else {}
-    identity = {"run": parent.run.data.tags["fingerprint"], "device": plain(measured)["device"]}
-    adapted = _changed(
-        measured if drawn else simulated,
+    gestures: dict[str, Any] = {"gestures": budget, "fresh": False} if drawn else {}
+    identity = {"run": parent.run.data.tags["fingerprint"], "device": measured.device}
+    adapted = measured if drawn else simulated
+    assert adapted.data is not None
+    assert config.data is not None
+    adapted = replace(
+        adapted,
+        row=f"{str(adapted.row).removesuffix('_adapted')}_adapted",
         adapt=asdict(settings) | identity,
-        data=gestures | {"augment": plain(config)["data"]["augment"]},
-        device=gestures | ({"data_seed": settings.seed} if drawn else {}),
-        evaluation=plain(config)["evaluation"],
-        row=f"{parent.stored.row.removesuffix('_adapted')}_adapted",
+        data=replace(adapted.data, augment=config.data.augment, **gestures),
+        device=adapted.device | gestures | ({"data_seed": settings.seed} if drawn else {}),
+        evaluation=config.evaluation,
     )
     return Target(device, twin, adapted)
 
@@ -304,13 +305,6 @@ def find_target(
 def _group(override: str) -> str:
     """Return the group of an override."""
     return override.lstrip("+~").split("=")[0].split(".")[0]
-
-
-def _changed(config: DictConfig, row: str | None = None, **groups: dict[str, Any]) -> DictConfig:
-    """Return a configuration with other values in its groups, and perhaps another name."""
-    whole = plain(config) | ({"row": row} if row else {})
-    changes = {name: (whole.get(name) or {}) | values for name, values in groups.items()}
-    return validate_config(OmegaConf.create(whole | changes))
 
 
 def _check(parent: FinishedRun, device: AbstractDevice, twin: AbstractDevice) -> None:
@@ -362,7 +356,7 @@ def simulated_budget(count: int) -> int:
     return -(-count * 10 // 8)
 
 
-def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
+def adapt(config: Config, overrides: Sequence[str]) -> None:
     """Adapt a finished run to the skin of a configuration: log a new run and print the figures.
 
     Nothing is done if a run with the same fingerprint has finished, unless ``tracking.resume=false``.
@@ -379,8 +373,8 @@ def adapt(config: DictConfig, overrides: Sequence[str]) -> None:
         _adapt(config, overrides, steps)
 
 
-def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
-    settings = configured(FineTuning, plain(config)["adapt"], "adapt")
+def _adapt(config: Config, overrides: Sequence[str], steps: Steps) -> None:
+    settings = configured(FineTuning, config.adapt, "adapt")
     if config.tracking.threads:
         torch.set_num_threads(config.tracking.threads)
     parent = FinishedRun.named(config)
@@ -400,7 +394,7 @@ def _adapt(config: DictConfig, overrides: Sequence[str], steps: Steps) -> None:
     touches, others = choose_gestures(target.device, settings)
     steps.silent = False
     steps.begin("choosing the threshold of the alarm")
-    task, evaluation = target.device.task, target.config.evaluation
+    task, evaluation = target.device.task, check_evaluation(target.config.evaluation)
     point = alarm_point(parent, learner, target.config, one_skin=True, device=target.twin)
     figures: dict[str, float] = {}
     if others is not None:

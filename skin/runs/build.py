@@ -1,21 +1,22 @@
-"""Build the objects that a configuration names, group by group."""
+"""Build the objects that a configuration names, group by group, and find the settings of a skin's objects."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 
 from skin.body.base import AbstractBody, Sensors, check_plausibility, warn_of_surface
-from skin.body.layout import AbstractLayout
+from skin.body.layout import AbstractLayout, Listed
+from skin.core.files import CONF
 from skin.core.settings import check_groups, configured
 from skin.device.base import AbstractDevice
 from skin.errors import InputError
 from skin.learning.learner import AbstractLearner
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.runs.configuration import plain
+from skin.runs.configuration import Config
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,60 +41,52 @@ class SkinModel:
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
 
 
-def build_skin(config: DictConfig) -> SkinModel:
+def build_skin(config: Config) -> SkinModel:
     """Return the body, the sensors and the simulator."""
-    groups = plain(config)
-    body, layout = _body_and_layout(groups, "simulator")
-    sensors, simulator = layout.sensors(body), instantiate(groups["simulator"])
-    return SkinModel(body, layout, sensors, simulator)
+    body, layout = _body_and_layout(config, "simulator")
+    return SkinModel(body, layout, layout.sensors(body), instantiate(config.simulator))
 
 
-def _body_and_layout(groups: dict[str, Any], source: str) -> tuple[AbstractBody, AbstractLayout]:
+def _body_and_layout(config: Config, source: str) -> tuple[AbstractBody, AbstractLayout]:
     """Check body, layout and the group of what responds to touches; return the first two."""
-    _check_options(groups, "body", "layout", source)
-    check_plausibility(groups)
-    return instantiate(groups["body"]), instantiate(groups["layout"])
+    _check_options(config, "body", "layout", source)
+    check_plausibility(vars(config))
+    return instantiate(config.body), instantiate(config.layout)
 
 
-def _check_options(groups: dict[str, Any], *names: str) -> None:
+def _check_options(config: Config, *names: str) -> None:
     """Raise InputError where a group names no option, or has settings that its option does not take."""
-    for name in names:
-        if "_target_" not in (groups.get(name) or ()):
+    groups = {name: getattr(config, name) for name in names}
+    for name, group in groups.items():
+        if "_target_" not in group:
             raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
-    check_groups({name: groups[name] for name in names})
+    check_groups(groups)
 
 
-def build_device(config: DictConfig) -> AbstractDevice:
+def build_device(config: Config) -> AbstractDevice:
     """Return the device, with its body, layout and, if it has one, its simulator."""
-    groups = plain(config)
-    body, layout = _body_and_layout(groups, "device")
+    body, layout = _body_and_layout(config, "device")
     # Not arguments of instantiate, which would treat the dataclass of the body as a configuration.
-    device: AbstractDevice = instantiate(groups["device"], _partial_=True)(body=body, layout=layout)
+    device: AbstractDevice = instantiate(config.device, _partial_=True)(body=body, layout=layout)
     if device.simulation is not None and device.simulation.model.mechanical:
         warn_of_surface(body, device.simulation.sensors)
     return device
 
 
-def build_data(config: DictConfig, device: AbstractDevice) -> "TouchData":
+def build_data(config: Config, device: AbstractDevice) -> "TouchData":
     """Return the data module of a device's touches in the configured representation."""
     # Imported here because Lightning takes seconds and commands without training do not need it.
     from skin.learning.data import Augmentation, TouchData
 
-    groups = plain(config)
-    augmentation = configured(Augmentation, groups["data"]["augment"], "data.augment")
-    _check_options(groups, "representation")
-    representation = instantiate(groups["representation"])
-    return TouchData(
-        device,
-        representation,
-        config.data.batch_size,
-        config.seed,
-        augmentation,
-        partial(_geometry, config),
-    )
+    assert config.data is not None
+    augmentation = configured(Augmentation, config.data.augment, "data.augment")
+    _check_options(config, "representation")
+    representation = instantiate(config.representation)
+    geometry = partial(_geometry, config)
+    return TouchData(device, representation, config.data.batch_size, config.seed, augmentation, geometry)
 
 
-def _geometry(config: DictConfig) -> "Tensor":
+def _geometry(config: Config) -> "Tensor":
     """Return what the sensors of the configured skin respond to, (S, G)."""
     from skin.mechanics.geometry import sensor_geometry
 
@@ -101,8 +94,83 @@ def _geometry(config: DictConfig) -> "Tensor":
     return sensor_geometry(skin.body, skin.sensors, skin.simulator(skin.body, skin.sensors))
 
 
-def build_learner(config: DictConfig) -> AbstractLearner:
+def build_learner(config: Config) -> AbstractLearner:
     """Return an untrained learner."""
-    groups = plain(config)
-    _check_options(groups, "learner")
-    return instantiate(groups["learner"], seed=config.seed)
+    _check_options(config, "learner")
+    learner: AbstractLearner = instantiate(config.learner, seed=config.seed)
+    return learner
+
+
+# The settings of a skin that was built in Python.
+
+
+def with_skin(config: Config, body: AbstractBody | str | None, layout: AbstractLayout | str | None) -> Config:
+    """Return the configuration of a run with another body or layout.
+
+    Args:
+        config: of the run.
+        body: the body, the name of an option (``arm``), or None for that of the settings.
+        layout: the layout, the name of an option (``grid``), the path of a CSV file, or None.
+
+    Raises:
+        InputError: there is no such option or file, or a sensor lies outside the body.
+    """
+    if body is not None:
+        settings = _default_option("body", body) if isinstance(body, str) else _body_settings(body)
+        config = replace(config, body=settings)
+    if isinstance(layout, str):
+        config = replace(config, layout=_layout_settings(layout))
+    elif layout is not None:
+        check_groups({"body": config.body})
+        config = replace(config, layout=_listed_settings(layout, instantiate(config.body)))
+    return config
+
+
+def _body_settings(body: AbstractBody) -> dict[str, Any]:
+    """Return the settings of a body: the arguments that it was built from."""
+    if not isinstance(body, AbstractBody):
+        raise InputError(f"body must be a body such as skin.Sheet, or the name of one, got {body!r}")
+    settings = {field.name: getattr(body, field.name) for field in fields(body) if field.init}
+    settings["layers"] = [asdict(layer) for layer in body.layers]
+    for layer in settings["layers"]:
+        layer["material"] = {key: value for key, value in layer["material"].items() if value is not None}
+    plain = {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()}
+    return {"_target_": _class_name(body), "_convert_": "all", **plain}
+
+
+def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, Any]:
+    """Return settings for the sensors that a layout has in a body."""
+    if not isinstance(layout, AbstractLayout):
+        raise InputError(f"layout must be a layout such as skin.Grid, a name or a CSV file, got {layout!r}")
+    sensors = layout.sensors(body)
+    return {
+        "_target_": f"{Listed.__module__}.{Listed.__qualname__}",
+        "_convert_": "all",
+        "positions": sensors.positions.tolist(),
+        "footprint": list(sensors.footprint),
+        "normals": sensors.normals.tolist(),
+    }
+
+
+def _layout_settings(name: str) -> dict[str, Any]:
+    """Return the settings of a layout that is given by its name or by its file."""
+    if name.lower().endswith(".csv"):
+        return _default_option("layout", "file") | {"path": name}
+    return _default_option("layout", name)
+
+
+def _default_option(group: str, name: str) -> dict[str, Any]:
+    """Return the default settings of an option.
+
+    Raises:
+        InputError: there is no such option.
+    """
+    options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    if name not in options:
+        raise InputError(f"there is no {group} {name}: give one of {', '.join(options)}, or build one")
+    settings: Any = OmegaConf.to_container(OmegaConf.load(CONF / group / f"{name}.yaml"))
+    return settings
+
+
+def _class_name(built: object) -> str:
+    return f"{type(built).__module__}.{type(built).__qualname__}"

@@ -1,4 +1,4 @@
-"""The configuration: its schema and its fingerprint.
+"""The configuration: its schema, its fingerprint, and that of a finished run with other settings.
 
 Only Hydra is imported here: ``--help`` and a mistyped key must not import torch.
 """
@@ -7,26 +7,26 @@ import hashlib
 import json
 import platform
 import re
-import subprocess
-from collections.abc import Iterator
-from functools import cache
-from pathlib import Path
-from typing import Any
-
-from skin import __version__
-from skin.core.files import BUNDLED, MANIFEST, ROOT, candidates
-
-from skin.core import interrupt  # noqa: F401  # isort: skip
 import socket
-from dataclasses import dataclass, field
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
 from math import isnan
-from typing import cast
+from pathlib import Path
+from typing import Any, cast
 from urllib.parse import urlsplit
 
+from hydra import initialize_config_dir
+from hydra._internal.defaults_list import create_defaults_list
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from skin import __version__
+from skin.core.files import BUNDLED, CONF, MANIFEST, ROOT, candidates
 from skin.core.messages import one_line
 from skin.errors import InputError
 from skin.evaluation.settings import Evaluation
@@ -155,35 +155,38 @@ class Data:
 class Tracking:
     """Where runs are logged, and whether finished ones are skipped (``conf/train.yaml``)."""
 
-    uri: str | None
-    artifacts: str | None
-    experiment: str
-    resume: bool
-    threads: int | None
+    uri: str | None = None
+    artifacts: str | None = None
+    experiment: str = "skin"
+    resume: bool = True
+    threads: int | None = None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    """Top-level keys of a configuration; groups without a type here are checked by their class."""
+    """A checked configuration in plain containers. What it does not set is None, a group that it lacks empty.
+
+    Groups without a type here are checked by their class.
+    """
 
     row: str | None = None
-    seed: int | None = None
-    epochs: dict[str, int] | None = None
-    touch: dict[str, Any] | None = None
-    body: dict[str, Any] | None = None
-    layout: dict[str, Any] | None = None
-    simulator: dict[str, Any] | None = None
-    device: dict[str, Any] | None = None
-    representation: dict[str, Any] | None = None
-    model: dict[str, Any] | None = None
-    fusion: dict[str, Any] | None = None
-    learner: dict[str, Any] | None = None
+    seed: int = 0
+    epochs: dict[str, int] = field(default_factory=dict)
+    touch: dict[str, Any] = field(default_factory=dict)
+    body: dict[str, Any] = field(default_factory=dict)
+    layout: dict[str, Any] = field(default_factory=dict)
+    simulator: dict[str, Any] = field(default_factory=dict)
+    device: dict[str, Any] = field(default_factory=dict)
+    representation: dict[str, Any] = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
+    fusion: dict[str, Any] = field(default_factory=dict)
+    learner: dict[str, Any] = field(default_factory=dict)
     data: Data | None = None
-    optimizer: dict[str, Any] | None = None
-    trainer: dict[str, Any] | None = None
+    optimizer: dict[str, Any] = field(default_factory=dict)
+    trainer: dict[str, Any] = field(default_factory=dict)
     evaluation: Evaluation | None = None
-    tracking: Tracking | None = None
-    contact: dict[str, Any] | None = None
+    tracking: Tracking = field(default_factory=Tracking)
+    contact: dict[str, Any] = field(default_factory=dict)
     shard: str | None = None
     # What a command other than training adds.
     run: str | None = None
@@ -191,33 +194,33 @@ class Config:
     licence: str | None = None
     trust: bool = False
     n: int | None = None
-    out: str | None = field(default=None)
+    out: str | None = None
     view: str | None = None
     labels: list[str] | None = None
     shape: str | None = None
     index: int | None = None
     session: str | None = None
     presses: str | None = None
-    calibrate: dict[str, Any] | None = None
+    calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
     link: str | None = None
     seconds: float | None = None
     web: bool | None = None
     demo: bool | None = None
-    live: dict[str, Any] | None = None
-    export: dict[str, Any] | None = None
+    live: dict[str, Any] = field(default_factory=dict)
+    export: dict[str, Any] = field(default_factory=dict)
     gestures: int | None = None
     format: str | None = None
-    emulate: dict[str, Any] | None = None
-    faults: dict[str, Any] | None = None
-    record: dict[str, Any] | None = None
-    compare: dict[str, Any] | None = None
-    study: dict[str, Any] | None = None
+    emulate: dict[str, Any] = field(default_factory=dict)
+    faults: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+    compare: dict[str, Any] = field(default_factory=dict)
+    study: dict[str, Any] = field(default_factory=dict)
     smoke: bool | None = None
-    table: dict[str, Any] | None = None
-    results: dict[str, Any] | None = None
-    design: dict[str, Any] | None = None
-    adapt: dict[str, Any] | None = None
+    table: dict[str, Any] = field(default_factory=dict)
+    results: dict[str, Any] = field(default_factory=dict)
+    design: dict[str, Any] = field(default_factory=dict)
+    adapt: dict[str, Any] = field(default_factory=dict)
 
 
 def is_server(uri: str | None) -> bool:
@@ -251,22 +254,23 @@ def check_server(uri: str | None) -> None:
         )
 
 
-def validate_config(config: DictConfig) -> DictConfig:
-    """Return a configuration that fits the schema, read-only.
+def validate_config(config: Any) -> Config:
+    """Return a configuration that fits the schema, with every interpolation resolved.
+
+    Args:
+        config: as Hydra composes it, or in plain containers.
 
     Raises:
-        InputError: a key or a value does not fit.
+        InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
         whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+        # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
+        for name, reason in _not_numbers(OmegaConf.to_container(whole)):
+            raise InputError(f"{name} is {reason}: give a number")
+        return cast(Config, OmegaConf.to_object(whole))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
-    assert isinstance(whole, DictConfig)
-    # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
-    for name, reason in _not_numbers(OmegaConf.to_container(whole)):
-        raise InputError(f"{name} is {reason}: give a number")
-    OmegaConf.set_readonly(whole, True)
-    return whole
 
 
 def refuse_null_groups(config: DictConfig) -> None:
@@ -296,26 +300,190 @@ def _not_numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
             yield from _not_numbers(entry, f"{name}.{key}" if name else str(key))
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """Return a configuration with every interpolation resolved, as plain containers.
-
-    Raises:
-        InputError: an interpolation cannot be resolved.
-    """
-    try:
-        return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    except OmegaConfBaseException as error:
-        raise InputError(one_line(error)) from error
+def settings_of(config: Config) -> dict[str, Any]:
+    """Return what a configuration sets, in plain containers."""
+    return {key: value for key, value in asdict(config).items() if value not in (None, {})}
 
 
-def fingerprint(config: DictConfig) -> str:
+def fingerprint(config: Config) -> str:
     """Return a hash of everything that results depend on: configuration, files it names, version."""
     # Unset keys belong to other commands; a new command must not change the fingerprint of finished runs.
-    groups = plain(config).items()
-    content = {key: value for key, value in groups if key not in _STEERING and value is not None}
-    return config_hash(content)
+    return config_hash({key: value for key, value in settings_of(config).items() if key not in _STEERING})
 
 
 def overrides() -> list[str]:
     """Return the overrides on the command line of the running command."""
     return list(HydraConfig.get().overrides.task)
+
+
+# The configuration of a finished run with the overrides of a command line.
+
+
+# Groups that the weights of a run depend on.
+_FIXED = (
+    "representation",
+    "model",
+    "fusion",
+    "learner",
+    "optimizer",
+    "trainer",
+    "experiment",
+    "sweep",
+    "seed",
+)
+
+
+def apply_overrides(stored: Config, composed: DictConfig, overrides: Sequence[str]) -> Config:
+    """Return a run's configuration with the overrides of a command line, checked.
+
+    An option that the command line chooses may set more than its own group: the file of a skin in
+    docs/your-skin.md has a body, positions and a simulator. All of its settings are taken.
+
+    Args:
+        stored: as :attr:`skin.runs.finished_run.FinishedRun.stored` gives it.
+        composed: a new configuration with the overrides, as Hydra composes it.
+        overrides: of the command line; only these settings are taken from ``composed``.
+
+    Raises:
+        InputError: an override changes a setting that the weights depend on.
+    """
+    whole = OmegaConf.create(asdict(stored))
+    _follow(whole, composed)
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    keys = [override.key_or_group for override in parsed if not _is_steering(override.key_or_group)]
+    for key in keys:
+        if key.split(".")[0] in _FIXED:
+            raise InputError(f"{key} was fixed when the run was trained: leave it out, or train another run")
+    for option in _find_options(overrides) if keys else []:
+        _take_option(whole, composed, option)
+    for key in keys:
+        if key.split(".")[0] in composed:  # a profile sets the device, and nothing of its own
+            _take(whole, composed, key)
+    whole.tracking = composed.tracking
+    return validate_config(whole)
+
+
+def _is_steering(key: str) -> bool:
+    """Return whether an override says which run is used, or how the command runs."""
+    return key in ("run", "trust") or key.startswith("hydra")
+
+
+@dataclass(frozen=True)
+class _Option:
+    """What an option that was chosen sets, in its file and in those that the file includes.
+
+    Attributes:
+        name: as in ``body/mine``.
+        group: whose option it is.
+        settings: values in the file by their paths from the root of the configuration.
+    """
+
+    name: str
+    group: str
+    settings: dict[tuple[str, ...], Any]
+
+
+def _find_options(overrides: Sequence[str]) -> list[_Option]:
+    """Return the options that a command line chooses, and those that they choose in turn."""
+    if not GlobalHydra.instance().is_initialized():  # in Python, not in a command
+        with initialize_config_dir(str(CONF), version_base=None):
+            return _find_options(overrides)
+    loader = GlobalHydra.instance().config_loader()
+    # The loader has no public function that returns the files of a configuration.
+    parsed, files = loader._parse_overrides_and_create_caching_repo("train", list(overrides))  # type: ignore[attr-defined]
+    groups = [override for override in parsed if files.group_exists(override.key_or_group)]
+    composition = create_defaults_list(files, "train", groups, prepend_hydra=True, skip_missing=True)
+    choices = composition.overrides.override_choices.items()
+    chosen = {f"{group}/{name}": group for group, name in choices if not group.startswith("hydra/")}
+    options: list[_Option] = []
+    for element in reversed(composition.defaults):  # a file comes after the ones that it includes
+        path = element.config_path or ""
+        group = chosen.get(path) or chosen.get(element.parent or "")
+        content = files.load_config(path) if group else None
+        if group is None or content is None:
+            continue
+        chosen[path] = group
+        package = tuple(element.package.split(".")) if element.package else ()
+        options.append(_Option(path, group, dict(_leaves(_raw(content.config), package))))
+    return options
+
+
+def _leaves(settings: dict[str, Any], above: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield all values with their paths; a list is one value."""
+    for name, value in settings.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*above, name))
+        else:
+            yield (*above, name), value
+
+
+def _take_option(whole: DictConfig, composed: DictConfig, option: _Option) -> None:
+    """Take the settings of an option.
+
+    Raises:
+        InputError: it changes a setting that the weights depend on.
+    """
+    settings = _raw(composed)
+    taken = option.group in composed and option.group not in _FIXED
+    if taken:
+        _take(whole, composed, option.group)
+    for path, value in option.settings.items():
+        group = path[0]
+        if taken and group == option.group:
+            continue
+        # What a later file or the command line replaced is not taken.
+        if _is_steering(group) or _value(settings, path) != value:
+            continue
+        if group in _FIXED:
+            if _value(_raw(whole), path) != _value(OmegaConf.to_container(composed, resolve=True), path):
+                raise InputError(
+                    f"{'.'.join(path)} in the option {option.name} was fixed when the run was trained: leave "
+                    "it out of the file, or train another run"
+                )
+        elif _value(settings, (group, "_target_")) != _value(_raw(whole), (group, "_target_")):
+            _take(whole, composed, group)
+        else:
+            _take_leaf(whole, path, value)
+
+
+def _value(settings: Any, path: tuple[str, ...]) -> Any:
+    """Return the value at a path; None where there is none."""
+    for name in path:
+        settings = settings.get(name) if isinstance(settings, dict) else None
+    return settings
+
+
+def _take(whole: DictConfig, composed: DictConfig, key: str) -> None:
+    """Take a group or a setting, unresolved, so that a device refers to the simulator of this run."""
+    parent, _, name = key.rpartition(".")
+    source = OmegaConf.select(composed, parent) if parent else composed
+    OmegaConf.update(whole, key, _raw(source)[name], merge=False)
+
+
+def _take_leaf(whole: DictConfig, path: tuple[str, ...], value: Any) -> None:
+    """Take one setting; names of materials in its path may have dots."""
+    part = whole
+    for name in path[:-1]:
+        if not isinstance(part.get(name), DictConfig):
+            part[name] = {}
+        part = part[name]
+    part[path[-1]] = value
+
+
+def _follow(whole: DictConfig, composed: DictConfig) -> None:
+    """Restore the interpolations of the device to other groups that the run had.
+
+    Stored configurations are resolved; without this ``simulator=naive`` would not reach ``device.simulator``.
+    """
+    device = _raw(whole.device)
+    for name, value in _raw(composed.device).items():
+        if not isinstance(value, str) or not value.startswith("${") or name not in device:
+            continue
+        if OmegaConf.select(whole, value[2:-1]) == device[name]:
+            device[name] = value
+    whole.device = device
+
+
+def _raw(config: DictConfig) -> dict[str, Any]:
+    """Return plain containers with interpolations as they stand."""
+    return OmegaConf.to_container(config, resolve=False)  # type: ignore[return-value]

@@ -15,7 +15,7 @@ import numpy as np
 from annotated_types import Ge, Gt, MinLen
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from skin.body.base import Sensors
 from skin.core.files import json_line
@@ -23,8 +23,7 @@ from skin.core.safe_loading import KEY as CHECKSUM
 from skin.core.safe_loading import ChecksumError, check_content, limited_memory, read_file
 from skin.core.settings import ONCE, check_groups, check_targets, configured
 from skin.errors import InputError
-from skin.runs.configuration import plain
-from skin.runs.overrides import apply_overrides
+from skin.runs.configuration import Config, apply_overrides, settings_of, validate_config
 from skin.runs.trained_model import TrainedModel
 from skin.touch.labels import Task
 
@@ -388,7 +387,7 @@ _FREE = ("device", "live", "web", "seconds", "run", "trust", "tracking", "hydra"
 _CLOSE = 1e-6  # m; positions in the file are single precision
 
 
-def describe_skin(config: DictConfig, positions: np.ndarray) -> dict[str, Any] | None:
+def describe_skin(config: Config, positions: np.ndarray) -> dict[str, Any] | None:
     """Return the settings of the skin of a network, for its file.
 
     Args:
@@ -399,8 +398,8 @@ def describe_skin(config: DictConfig, positions: np.ndarray) -> dict[str, Any] |
         The groups :data:`GROUPS`, plain; None if the sensors are not those of the configuration, such as
         those of a recording.
     """
-    groups = {name: value for name, value in plain(config).items() if name in GROUPS}
-    return groups if _at(_sensors(groups), positions) else None
+    described = {name: value for name, value in settings_of(config).items() if name in GROUPS}
+    return described if _at(_sensors(config), positions) else None
 
 
 def check_overrides(path: str, composed: DictConfig, overrides: Sequence[str]) -> None:
@@ -446,20 +445,20 @@ def _agrees(metadata: ModelMetadata, composed: DictConfig, overrides: list[str],
             "out, or write the file again with skin export"
         )
     check_targets({name: metadata.skin.get(name) for name in ("body", "layout")}, path)
-    stored = OmegaConf.create({"device": {}, **{name: metadata.skin.get(name) for name in GROUPS}})
-    before = plain(apply_overrides(stored, composed, []))
-    after = plain(apply_overrides(stored, composed, overrides))
-    if any(after[group] != before[group] for group in GROUPS if group != "layout"):
+    stored = validate_config({name: group for name in GROUPS if (group := metadata.skin.get(name))})
+    before, after = (apply_overrides(stored, composed, words) for words in ([], overrides))
+    if any(getattr(after, group) != getattr(before, group) for group in GROUPS if group != "layout"):
         return False
-    same = after["layout"].get("footprint") == before["layout"].get("footprint")
+    same = after.layout.get("footprint") == before.layout.get("footprint")
     # A file of the same name may list other positions.
     return same and _at(_sensors(after), np.array(metadata.positions))
 
 
-def _sensors(groups: dict[str, Any]) -> Sensors:
-    """Return the sensors that settings describe."""
-    check_groups({name: groups[name] for name in ("body", "layout")})
-    return instantiate(groups["layout"]).sensors(instantiate(groups["body"]))
+def _sensors(config: Config) -> Sensors:
+    """Return the sensors that a configuration describes."""
+    check_groups({"body": config.body, "layout": config.layout})
+    sensors: Sensors = instantiate(config.layout).sensors(instantiate(config.body))
+    return sensors
 
 
 def _at(sensors: Sensors, positions: np.ndarray) -> bool:

@@ -22,7 +22,7 @@ from mlflow.entities import LifecycleStage, Metric, Run, RunData, RunInfo, RunSt
 from mlflow.exceptions import MlflowException
 from mlflow.utils.file_utils import local_file_uri_to_path
 from mlflow.utils.uri import is_local_uri
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from skin.core.files import candidates
@@ -32,8 +32,7 @@ from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint, parse_operating_point
 from skin.learning.data import TouchData
 from skin.learning.learner import AbstractLearner
-from skin.runs.configuration import validate_config
-from skin.runs.overrides import apply_overrides
+from skin.runs.configuration import Config, apply_overrides, validate_config
 from skin.runs.store import Store
 
 TAG = "operating_point"
@@ -73,13 +72,13 @@ class FinishedRun:
     trust: bool = False
 
     @classmethod
-    def named(cls, config: DictConfig) -> "FinishedRun":
+    def named(cls, config: Config) -> "FinishedRun":
         """Return the run that a command names with ``run=``.
 
         Raises:
             InputError: as of :func:`find_run`.
         """
-        return find_run(Store.existing(config.tracking), config.run, config.trust)
+        return find_run(Store.existing(config.tracking), str(config.run), config.trust)
 
     @property
     def identity(self) -> str:
@@ -92,8 +91,8 @@ class FinishedRun:
         return str(self.run.info.run_name)
 
     @cached_property
-    def stored(self) -> DictConfig:
-        """The resolved configuration of the run.
+    def stored(self) -> Config:
+        """The configuration of the run.
 
         Raises:
             InputError: it cannot be read, is that of another version, or names a class that is not allowed
@@ -109,17 +108,15 @@ class FinishedRun:
             raise InputError(f"run {self.identity} has no readable config.yaml: it holds no settings")
         if not self.trust:
             check_targets(stored, f"config.yaml of run {self.identity}")
-        config = OmegaConf.create(stored)
         try:
-            validate_config(config)
+            return validate_config(stored)
         except InputError as error:
             raise InputError(
                 f"config.yaml of run {self.identity} does not fit this version: {error}: train it again"
             ) from error
-        return config
 
-    def configured(self, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
-        """Return the configuration with overrides, as :func:`skin.runs.overrides.apply_overrides` does."""
+    def configured(self, composed: DictConfig, overrides: Sequence[str]) -> Config:
+        """Return the configuration with the overrides of a command line."""
         return apply_overrides(self.stored, composed, overrides)
 
     @property

@@ -11,23 +11,22 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from omegaconf import DictConfig
 
 from skin.body.base import require_memory
 from skin.core.files import MANIFEST
+from skin.core.messages import format_duration
 from skin.device.balance import report_balance, summary_line
 from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
 from skin.device.touches import Part
 from skin.errors import InputError
-from skin.runs.configuration import fingerprint, plain, source_tags
-from skin.runs.progress import format_duration
+from skin.runs.configuration import Config, fingerprint, settings_of, source_tags
 
 _PAUSE = 10.0  # s between two lines of progress
 _BYTES = 40.0  # of memory for each reading of a file: with displacements, and a table of everything
 
 
-def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) -> str:
+def generate_data_set(device: AbstractDevice, config: Config, folder: Path) -> str:
     """Write the touches of a device as a data set, and return a summary of it.
 
     Shards are drawn on as many threads as torch has. Each appears whole, and those that are in the folder
@@ -45,7 +44,7 @@ def generate_data_set(device: AbstractDevice, config: DictConfig, folder: Path) 
     if not parts:
         whole = device.recording()
         parts = [Part(len(whole), lambda: whole)]
-    source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(plain(config)))}
+    source = {"config_hash": fingerprint(config), "config": json.loads(json.dumps(settings_of(config)))}
     if not (folder / MANIFEST).is_file():
         _begin(device, parts, source, folder)
     manifest = Manifest.read(folder)
@@ -164,7 +163,7 @@ class _Progress:
             )
 
 
-def generate_file(device: AbstractDevice, config: DictConfig, path: Path) -> str:
+def generate_file(device: AbstractDevice, config: Config, path: Path) -> str:
     """Write the touches of a device as one recording, and return a summary of them.
 
     Args:
@@ -175,13 +174,13 @@ def generate_file(device: AbstractDevice, config: DictConfig, path: Path) -> str
         InputError: the touches do not fit into memory, or the file cannot be written.
     """
     if (simulation := device.simulation) is not None:
-        readings = float(config.n * simulation.window * len(simulation.sensors))
+        readings = float((config.n or 0) * simulation.window * len(simulation.sensors))
         require_memory(
             _BYTES * readings, f"n={config.n} in one file", "add out=FOLDER for a data set, which needs less"
         )
     recording = device.recording()
     report_balance(device, recording)
-    about = recording.metadata | {"config_hash": fingerprint(config), "config": plain(config)}
+    about = recording.metadata | {"config_hash": fingerprint(config), "config": settings_of(config)}
     write_recording(replace(recording, metadata=about), path)
     # The metadata of a file may have any content.
     return f"{len(recording)} gestures" if simulation is None else summary_line(recording.metadata["summary"])

@@ -15,7 +15,7 @@ from skin.core.files import unwritable
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL, parse_operating_point
 from skin.evaluation.report import PERCENTAGES, format_number
-from skin.runs.configuration import plain
+from skin.runs.configuration import settings_of
 from skin.runs.finished_run import CARD, CONFIG, FORMAT, MODELS, RECORD, SUMS, FinishedRun, checksums, is_name
 from skin.runs.store import PROCESS
 
@@ -101,7 +101,7 @@ def write_folder(run: FinishedRun, folder: Path, licence: str) -> None:
 
 def _write(run: FinishedRun, licence: str, folder: Path) -> None:
     """Write the files of a model to a folder that has its name."""
-    settings = {key: value for key, value in plain(run.stored).items() if key not in _PRIVATE}
+    settings = {key: value for key, value in settings_of(run.stored).items() if key not in _PRIVATE}
     tags, metrics = run.run.data.tags, run.run.data.metrics
     weights = run.fetch(tags["learned"], str(folder))
     size = weights.stat().st_size

@@ -1,36 +1,52 @@
 """The model of a finished run: it predicts, evaluates and raises the alarm on the skin that it is used on."""
 
+import logging
+import os
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from functools import cached_property
 from math import log
-from typing import overload
+from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 import torch
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
 from numpy.typing import ArrayLike
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from skin import __version__
 from skin.body.base import AbstractBody
 from skin.body.layout import AbstractLayout
-from skin.core.messages import to_input_error
+from skin.core import array_cache
+from skin.core.messages import Steps, to_input_error
 from skin.core.settings import configured
-from skin.device.base import AbstractDevice
-from skin.device.skins import SkinDistribution
+from skin.device import imperfection
+from skin.device.base import AbstractDevice, AbstractSimulated
+from skin.device.calibration import Calibration, read_calibration
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.evaluation.operating_point import LABEL, ContactThreshold, OperatingPoint, Predictor, Watching, rise
+from skin.evaluation import decisions, operating_point
+from skin.evaluation.operating_point import (
+    LABEL,
+    ContactThreshold,
+    OperatingPoint,
+    Predictor,
+    Watching,
+    choose_for_touches,
+    choose_operating_point,
+    rise,
+)
+from skin.evaluation.settings import Evaluation, check_evaluation
 from skin.learning.learner import AbstractLearner
-from skin.runs.alarm_threshold import alarm_point, alarm_point_for_touches
-from skin.runs.build import build_data, build_device, build_learner, build_skin
-from skin.runs.configuration import Tracking, plain, validate_config
+from skin.runs.build import build_data, build_device, build_learner, build_skin, with_skin
+from skin.runs.configuration import Config, Tracking
 from skin.runs.exported_model import ExportedModel, ModelMetadata
 from skin.runs.finished_run import FinishedRun, find_run
-from skin.runs.overrides import with_skin
-from skin.runs.progress import Steps
 from skin.runs.store import Store
 from skin.runs.trained_model import TrainedModel
 
@@ -38,6 +54,193 @@ _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a devic
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
 _EXPECTED = 20.0  # s
+_SOURCES = (operating_point, decisions, imperfection)  # of the thresholds that are kept on disk
+_log = logging.getLogger(__name__)
+
+
+# Which threshold of the alarm holds for a run on a skin and a device. That for single windows is stored
+# with the run. That of the live view, which judges many windows of a touch, depends on the rate, too.
+
+
+def alarm_point(
+    run: FinishedRun,
+    learner: Predictor,
+    config: Config,
+    one_skin: bool = False,
+    device: AbstractDevice | None = None,
+) -> OperatingPoint | None:
+    """Return the operating point of a run for single windows; None if its task has no label ``dangerous``.
+
+    Safe touches are more easily mistaken on some skins and devices than on others, so a threshold that was
+    chosen over many of them has another false-alarm rate on each. A run that was trained on drawn skins gets
+    one for its skin, and every run one for ``evaluation.profile``. Otherwise the stored one holds.
+
+    Args:
+        run: the run.
+        learner: of the run, trained.
+        config: its configuration with the skin to use.
+        one_skin: the skin of ``config`` counts even if its device draws others.
+        device: on which another threshold is chosen; None: that of :func:`threshold_device`.
+
+    Raises:
+        InputError: the stored operating point cannot be read; see also :func:`threshold_device`.
+    """
+    settings, stored = check_evaluation(config.evaluation), run.stored
+    all_skins = "skins" in config.device and not one_skin
+    same_profile = settings.profile == (stored.evaluation and stored.evaluation.profile)
+    if all_skins or ("skins" not in stored.device and same_profile):
+        return stored_point(run, learner, settings)
+    return choose_operating_point(learner, device or threshold_device(stored, config), settings)
+
+
+def stored_point(run: FinishedRun, learner: Predictor, settings: Evaluation) -> OperatingPoint | None:
+    """Return the operating point that is stored with a run; None if its task has no label ``dangerous``.
+
+    If the run has none for the target rate, it is chosen now if the device of its training draws fresh
+    gestures; else the threshold is 0.5. Both cases are reported on standard error.
+
+    Args:
+        run: the run.
+        learner: of the run, trained.
+        settings: the target rate and the number of safe gestures.
+
+    Raises:
+        InputError: the stored operating point cannot be read.
+    """
+    point, target = run.point, settings.false_alarm_rate
+    if run.stores_point and (point is None or point.target == target):
+        return point
+    lacks = f"run {run.identity} stores no alarm threshold for {100 * target:g} % false alarms"
+    if "simulator" in run.stored.device:
+        point = choose_operating_point(learner, build_device(run.stored), settings)
+        message = None if point is None else f"{lacks}, it is chosen now: {point.sentence()}"
+    else:
+        point = point or OperatingPoint.default(target)
+        message = (
+            f"{lacks} and its device draws no fresh gestures: {point.sentence()}; train it again to store one"
+        )
+    if message:
+        _log.warning(message)
+    return point
+
+
+def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
+    """Return the device whose fresh gestures determine the threshold of the alarm.
+
+    It is the device of the training on the skin of ``config``. If ``evaluation.profile`` is set, every
+    gesture is measured by another device of this profile.
+
+    Args:
+        stored: configuration of a training.
+        config: the same with the skin to use.
+
+    Raises:
+        InputError: the training has no simulated touches, or there is no such profile.
+    """
+    profile, settings = check_evaluation(config.evaluation).profile, stored.device
+    if "simulator" not in settings:
+        raise InputError(
+            f"evaluation.profile={profile} chooses the alarm's threshold on simulated touches, and this run "
+            "was trained on others: leave it out"
+        )
+    skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
+    settings = settings | skin
+    if profile is not None:
+        settings |= profile_settings(profile)
+        # Drawn skins draw a device for every gesture without being told.
+        every = {} if "skins" in settings else {"randomise": True, "calibration": None}
+        settings = {name: value for name, value in settings.items() if name != "randomise"} | every
+    device = build_device(replace(stored, **skin, device=settings)).reference
+    assert device is not None
+    return device
+
+
+def alarm_point_for_touches(
+    run: FinishedRun,
+    learner: Predictor,
+    config: Config,
+    watching: Watching,
+    say: Callable[[str], None],
+) -> OperatingPoint:
+    """Return the operating point of a run for safe touches as the live view judges them; it is kept on disk.
+
+    Args:
+        run: the run; its task has the label ``dangerous``.
+        learner: of the run, trained.
+        config: its configuration with the skin, the device and the profile to use.
+        watching: how the device is watched.
+        say: called with each message for the user.
+
+    Raises:
+        InputError: there is no such profile, or the calibration cannot be read.
+    """
+    settings = check_evaluation(config.evaluation)
+    if "simulator" not in run.stored.device:
+        point = stored_point(run, learner, settings)
+        assert point is not None  # it has the label
+        return point
+    device = threshold_device(run.stored, config)
+    path = config.device.get("calibration") if config.device.get("port") else None
+    calibration = read_calibration(path) if path and settings.profile is None else None
+    if calibration is not None:
+        device = device.replace(**_remaining(calibration), randomise=True, calibration=None)
+    target, count = settings.false_alarm_rate, min(settings.safe_gestures, operating_point.SAFE_TOUCHES)
+    content = _content(run, config, watching, device) | {"target": target, "count": count}
+    key = array_cache.hashed(content, [Path(str(module.__file__)) for module in _SOURCES])
+
+    def choose() -> dict[str, np.ndarray]:
+        devices = "" if settings.profile is None else f" and devices of the profile {settings.profile}"
+        say(f"choosing the alarm's threshold on {count} safe touches at {watching.rate:.3g} Hz{devices}")
+        threads = torch.get_num_threads()
+        torch.set_num_threads(os.cpu_count() or 1)  # nothing is watched yet
+        point = choose_for_touches(learner, device, watching, target, count)
+        torch.set_num_threads(threads)
+        return {"point": np.array([point.threshold, point.raised])}
+
+    file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
+    threshold, raised = array_cache.kept(file, key, {"point": (2,)}, choose)["point"].tolist()
+    return OperatingPoint(threshold, target, count, int(raised), device.data_seed, rate=watching.rate)
+
+
+def _content(
+    run: FinishedRun, config: Config, watching: Watching, device: AbstractSimulated
+) -> dict[str, Any]:
+    """Return what a threshold depends on."""
+    imperfections = {name: str(value) for name, value in vars(device.imperfection).items()}
+    return {
+        "run": run.identity,
+        "device": run.stored.device,
+        "skin": {group: getattr(config, group) for group in ("body", "layout", "simulator", "touch")},
+        "positions": device.sensors.positions.round(9).tolist(),
+        "imperfections": imperfections,
+        "watching": asdict(watching),
+    }
+
+
+def _remaining(calibration: Calibration) -> dict[str, Any]:
+    """Return the imperfections that a calibrated device is left with: its gains are known to 2 %."""
+    values = calibration.values()
+    names = ("noise", "hysteresis", "time_constant")
+    left = {name: float(np.median(values[name])) for name in names}
+    clip = float(np.median(values["clip"]))
+    limit = {"clip": clip} if np.isfinite(clip) else {}
+    return left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
+
+
+def profile_settings(name: str) -> dict[str, Any]:
+    """Return the settings of the device in a profile (``conf/profile/``).
+
+    Raises:
+        InputError: there is no such profile.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    names = loader.get_group_options("profile")
+    if name not in names:
+        raise InputError(f"there is no profile {name}: choose one of {', '.join(names)}")
+    return OmegaConf.to_container(compose(f"profile/{name}").device, resolve=True)  # type: ignore[return-value]
+
+
+# The model.
 
 
 class RunModel(TrainedModel):
@@ -66,7 +269,7 @@ class RunModel(TrainedModel):
         point: OperatingPoint | None = None,
         touch: float | None = None,
         run: FinishedRun | None = None,
-        watched: DictConfig | None = None,
+        watched: Config | None = None,
     ) -> None:
         self.device, self.learner, self.point, self.run, self.config = device, learner, point, run, watched
         self.identity, self.title = ("none", "untrained") if run is None else (run.identity, run.title)
@@ -258,18 +461,17 @@ def load_run(
         if body is not None or layout is not None:
             raise InputError(f"{name} is a network for one skin: leave out body and layout")
         return ExportedModel(name)
-    run = find_run(Store.existing(Tracking(uri, None, "skin", True, None)), name, trust)
+    run = find_run(Store.existing(Tracking(uri)), name, trust)
     try:
-        whole = with_skin(plain(run.stored), body, layout)
-        return load_model(run, validate_config(OmegaConf.create(whole)))
+        return load_model(run, with_skin(run.stored, body, layout))
     except InstantiationException as error:
         raise to_input_error(error) or error from error
 
 
 def load_model(
     run: FinishedRun,
-    config: DictConfig | None = None,
-    watched: DictConfig | None = None,
+    config: Config | None = None,
+    watched: Config | None = None,
     device: AbstractDevice | None = None,
     touch: float | None = None,
     one_skin: bool = False,
@@ -283,13 +485,13 @@ def load_model(
         watched: its configuration with the device that a live view watches; None: ``config``.
         device: to use it on; None: that of ``config``.
         touch: as in :class:`RunModel`.
-        one_skin: as in :func:`skin.runs.alarm_threshold.alarm_point`.
+        one_skin: as in :func:`alarm_point`.
         alarm: choose the threshold of the alarm for single windows; False: it has none.
 
     Raises:
         InputError: its weights do not fit the configuration.
     """
-    config = validate_config(run.stored) if config is None else config
+    config = config or run.stored
     if device is None:
         _warn_of_unknown_skin(run.stored, config)
     with run.described():
@@ -301,11 +503,13 @@ def load_model(
     return RunModel(device, learner, data.example, point, touch, run, watched or config)
 
 
-def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:
+def _warn_of_unknown_skin(stored: Config, config: Config) -> None:
     """Warn where a run that was trained on drawn skins is used on one that they do not include."""
-    if (ranges := OmegaConf.select(stored, "device.skins")) is None:
+    if (ranges := stored.device.get("skins")) is None:
         return
-    distribution, skin = configured(SkinDistribution, plain(ranges), "device.skins"), build_skin(config)
+    from skin.device.skins import SkinDistribution
+
+    distribution, skin = configured(SkinDistribution, ranges, "device.skins"), build_skin(config)
     if outside := distribution.outside(skin.body, skin.sensors):
         warnings.warn(
             f"this skin is unlike those that the run was trained on: {', '.join(outside)}; its verdicts may "
@@ -315,14 +519,14 @@ def _warn_of_unknown_skin(stored: DictConfig, config: DictConfig) -> None:
         )
 
 
-def equation10_warning(stored: DictConfig, device: AbstractDevice | None = None) -> str | None:
+def equation10_warning(stored: Config, device: AbstractDevice | None = None) -> str | None:
     """Return a warning if a run trained with equation 10 is used on a real skin; else None.
 
     Args:
         stored: the run's configuration.
         device: the watched device; None: a real skin.
     """
-    reading = OmegaConf.select(stored, "device.simulator.reading")
+    reading = (stored.device.get("simulator") or {}).get("reading")
     if reading != "equation10" or (device is not None and not device.real):
         return None
     return (

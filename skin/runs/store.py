@@ -258,7 +258,7 @@ def _tag(client: MlflowClient, experiment: Experiment) -> None:
 
 def print_table_link(address: str = "http://127.0.0.1:5000") -> None:
     """Print the link to the runs of ``mlflow.db`` in the current folder, at a server that shows them."""
-    experiment = Store.open(Tracking(None, None, "skin", True, None)).experiment
+    experiment = Store.open(Tracking()).experiment
     table = f"{address}/#/experiments/{experiment}/runs"
     print(f"runs: {table}?workflowType=machine_learning&viewStateShareKey={_VIEW}")
 

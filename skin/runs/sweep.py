@@ -1,6 +1,7 @@
 """A sweep: one parent run in MLflow, one line of progress per job. The UI of MLflow compares its runs."""
 
 import atexit
+import csv
 import os
 import re
 import sys
@@ -19,10 +20,10 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from skin.core.messages import to_input_error
+from skin.core.files import ROOT
+from skin.core.messages import PARENT, format_duration, to_input_error
 from skin.errors import InputError
-from skin.runs.configuration import check_server, plain, validate_config
-from skin.runs.progress import SweepProgress, expected_seconds, format_duration
+from skin.runs.configuration import Config, check_server, validate_config
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -121,6 +122,65 @@ def _words(config: DictConfig) -> list[str]:
     return words
 
 
+class SweepProgress:
+    """Estimates the remaining time of a sweep.
+
+    Args:
+        seconds: earlier duration of each job on some machine, in order; None if unknown.
+        finished: numbers of the jobs that have finished before, and take no time.
+        partial: numbers of the jobs that continue an interrupted run, so that the time they take says nothing
+            about the speed of the machine.
+    """
+
+    def __init__(
+        self,
+        seconds: list[float | None],
+        finished: Collection[int] = (),
+        partial: Collection[int] = (),
+    ) -> None:
+        measured = [value for value in seconds if value is not None]
+        typical = sum(measured) / len(measured) if measured else 1.0
+        self._expected = [typical if value is None else value for value in seconds]
+        for number in finished:
+            self._expected[number] = 0.0
+        self._partial = frozenset(partial)
+        self._sure = bool(measured)
+        self._spent = self._done = 0.0
+
+    def finish(self, number: int, seconds: float, skipped: bool) -> None:
+        """Record the end of a job; skipped and continued jobs do not count for the machine's speed."""
+        if not skipped and number not in self._partial:
+            self._spent += seconds
+            self._done += self._expected[number]
+        self._expected[number] = 0.0
+
+    def left(self) -> float | None:
+        """Return the estimated remaining time, s, scaled by this machine's speed so far; None if unknown."""
+        if not self._done:
+            return sum(self._expected) if self._sure else None
+        return sum(self._expected) * self._spent / self._done
+
+
+def expected_seconds(store: "Store", config: Config, tags: Mapping[str, str]) -> float | None:
+    """Return the duration of the last finished run of the same row and simulator, s.
+
+    Without one, it is estimated from the published table: seconds per epoch times epochs, plus a third for
+    the evaluation. None if the row is not in the table.
+    """
+    same = {name: tags[name] for name in ("row", "simulator")}
+    if finished := store.find("FINISHED", **same):
+        info = finished[0].info
+        return (info.end_time - info.start_time) / 1e3
+    published = ROOT / "docs" / "results" / "table.csv"
+    if not published.is_file():
+        return None
+    with published.open(newline="") as file:
+        for line in csv.DictReader(file):
+            if same.items() <= line.items() and line["seconds_per_epoch"]:
+                return 5 + 1.3 * config.trainer["max_epochs"] * float(line["seconds_per_epoch"])
+    return None
+
+
 class SweepCallback(Callback):
     """Hydra's callback of every command: opens and closes the parent run, prints progress.
 
@@ -176,7 +236,6 @@ class SweepCallback(Callback):
         composed = [_compose_job(config, job) for job in self._jobs]
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
 
-        from skin.core.messages import PARENT
         from skin.runs.store import Store
         from skin.runs.train import SWEPT, tags
 
@@ -285,16 +344,14 @@ def _without_hydra(config: DictConfig) -> DictConfig:
     return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
 
 
-def _compose_job(config: DictConfig, job: Mapping[str, str]) -> DictConfig | None:
+def _compose_job(config: DictConfig, job: Mapping[str, str]) -> Config | None:
     """Return the configuration of a job; None where it will be refused."""
     words = [f"{key}={value}" for key, value in job.items()]
     whole = GlobalHydra.instance().config_loader().load_sweep_config(config, words)
     try:
-        made = validate_config(_without_hydra(whole))
-        plain(made)
+        return validate_config(_without_hydra(whole))
     except InputError:
         return None
-    return made
 
 
 def _share_cores(launcher: DictConfig) -> None:

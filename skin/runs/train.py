@@ -20,7 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
 from mlflow.exceptions import MlflowException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
@@ -38,10 +38,18 @@ from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
 from skin.learning.network import LAST
 from skin.plot.figures import confusions, save_figure
-from skin.runs.alarm_threshold import threshold_device
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.configuration import MACHINE, Tracking, fingerprint, overrides, plain, source_tags
+from skin.runs.configuration import (
+    MACHINE,
+    Config,
+    Tracking,
+    fingerprint,
+    overrides,
+    settings_of,
+    source_tags,
+)
 from skin.runs.finished_run import TAG
+from skin.runs.model_of_run import threshold_device
 from skin.runs.store import Store, note_reuse
 from skin.touch.labels import Task
 
@@ -56,7 +64,7 @@ _NETWORK = ("representation", "model", "fusion", "optimizer", "trainer")  # a ne
 _NAMED = ("experiment", "row", "seed", "simulator", *(f"trainer.{name}" for name in MACHINE))
 
 
-def train(config: DictConfig) -> bool:
+def train(config: Config) -> bool:
     """Train and evaluate a configuration; return False if a finished run has the results.
 
     A run that finished with the same fingerprint is not repeated, and one that was killed is continued,
@@ -71,13 +79,13 @@ def train(config: DictConfig) -> bool:
     identity["threads"] = str(torch.get_num_threads())
     if _is_finished(store, config, identity):
         return False
-    check_evaluation(config.evaluation)
+    settings = check_evaluation(config.evaluation)
     device = build_device(config)
-    judged = device if config.evaluation.profile is None else threshold_device(config, config)
+    judged = device if settings.profile is None else threshold_device(config, config)
     data, learner = build_data(config, device), build_learner(config)
     learner.check(data)
     report_balance(device, shown=PARENT not in os.environ)
-    name = " ".join([config.row, identity["simulator"], *_differences(config), f"seed {config.seed}"])
+    name = " ".join([identity["row"], identity["simulator"], *_differences(config), f"seed {config.seed}"])
     store = Store.open(config.tracking)
     with alone(config.tracking, identity["fingerprint"]):
         if _is_finished(store, config, identity):  # by a process that began earlier
@@ -87,8 +95,8 @@ def train(config: DictConfig) -> bool:
             learner.unfinished = _unfinished_folder(config.tracking, run)
             log_configuration(store, run.info.run_id, config, data.hash)
             learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
-            point = choose_operating_point(learner, judged, config.evaluation)
-            report = evaluate(learner, device, config.evaluation, point)
+            point = choose_operating_point(learner, judged, settings)
+            report = evaluate(learner, device, settings, point)
             values = {"seconds_per_epoch": learner.seconds_per_epoch, "parameters": learner.parameters}
             log_learner(store, run, learner)
             log_report(store, run, report, device.task, values)
@@ -199,7 +207,7 @@ def _unfinished(settings: Tracking) -> Path:
     return Path(settings.artifacts or "mlartifacts").expanduser() / "unfinished"
 
 
-def _is_finished(store: Store, config: DictConfig, identity: dict[str, str]) -> bool:
+def _is_finished(store: Store, config: Config, identity: dict[str, str]) -> bool:
     """Return whether a run did a training before and may replace it; print its metrics."""
     if not config.tracking.resume:
         return False
@@ -233,37 +241,37 @@ def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
         store.client.set_tag(run.info.run_id, "learned", path.name)
 
 
-def _join(config: DictConfig) -> None:
+def _join(config: Config) -> None:
     """Train in one of several processes (``trainer.devices``); the first one does all the rest."""
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         data, learner = build_data(config, build_device(config)), build_learner(config)
         learner.fit(data)
 
 
-def tags(config: DictConfig) -> dict[str, str]:
+def tags(config: Config) -> dict[str, str]:
     """Return the tags that identify a run."""
     return {
         "fingerprint": fingerprint(config),
-        "row": config.row,
+        "row": str(config.row),
         "simulator": simulator(config),
         "seed": str(config.seed),
     }
 
 
-def simulator(config: DictConfig) -> str:
+def simulator(config: Config) -> str:
     """Return the name of the simulator that touches come from; without one, of the device."""
     name = "simulator" if "simulator" in config.device else "device"
-    return _option(config.device.simulator if name == "simulator" else config.device, name)
+    return _option(config.device["simulator"] if name == "simulator" else config.device, name)
 
 
-def _option(part: DictConfig, name: str) -> str:
+def _option(part: dict[str, Any], name: str) -> str:
     """Return the name of the option that a part of a configuration builds."""
     if "_target_" not in part:
         raise InputError(f"{name} chooses no option: leave it out, or give one that --help lists")
     return option_name(import_target(part["_target_"], name))
 
 
-def log_configuration(store: Store, run: str, config: DictConfig, data_hash: str) -> None:
+def log_configuration(store: Store, run: str, config: Config, data_hash: str) -> None:
     """Log the configuration of a run before it starts.
 
     Args:
@@ -272,28 +280,23 @@ def log_configuration(store: Store, run: str, config: DictConfig, data_hash: str
         config: its configuration; unused groups may be left out.
         data_hash: of the touches of its training.
     """
-    chosen = {key: value for key, value in plain(config).items() if value is not None}
+    chosen = settings_of(config)
     store.client.log_text(run, OmegaConf.to_yaml(OmegaConf.create(chosen)), "config.yaml")
     store.client.set_tag(run, "data_hash", data_hash)
     groups = ("simulator", "device", "representation", "model", "fusion", "learner")
     unused = _unused(config)
-    used = [group for group in groups if group in config and group not in unused]
-    choices = {group: _option(config[group], group) for group in used}
+    used = [group for group in groups if group in chosen and group not in unused]
+    choices = {group: _option(chosen[group], group) for group in used}
     scalars = {"seed": config.seed, "row": config.row}
     if "simulator" in config.device:
-        scalars |= {
-            "gestures": config.data.gestures,
-            "fresh": config.data.fresh,
-            "stream": config.data.stream,
-            "direction": config.data.direction,
-        }
+        scalars |= {name: chosen["data"][name] for name in ("gestures", "fresh", "stream", "direction")}
     else:
         choices.pop("simulator", None)
     params = relevant_overrides(config) | choices | scalars
     store.client.log_batch(run, params=[Param(name, str(value)) for name, value in params.items()])
 
 
-def _differences(config: DictConfig) -> list[str]:
+def _differences(config: Config) -> list[str]:
     """Return the overrides that distinguish this run: in a sweep, those that are swept."""
     changes = {key: value for key, value in relevant_overrides(config).items() if key not in _NAMED}
     if SWEPT in os.environ:
@@ -301,7 +304,7 @@ def _differences(config: DictConfig) -> list[str]:
     return [f"{key.split('.')[-1]}={value}" for key, value in changes.items()]
 
 
-def relevant_overrides(config: DictConfig) -> dict[str, str]:
+def relevant_overrides(config: Config) -> dict[str, str]:
     """Return the overrides of the running command that affect its result; empty without a command."""
     if not HydraConfig.initialized():
         return {}
@@ -319,9 +322,9 @@ def relevant_overrides(config: DictConfig) -> dict[str, str]:
     }
 
 
-def _unused(config: DictConfig) -> tuple[str, ...]:
+def _unused(config: Config) -> tuple[str, ...]:
     """Return the groups that have no part in a run, because its learner holds no network."""
-    return () if _holds(plain(config).get("learner"), "model") else _NETWORK
+    return () if _holds(config.learner, "model") else _NETWORK
 
 
 def _holds(value: Any, name: str) -> bool:

@@ -6,7 +6,6 @@ import torch
 from skin.body.base import Sheet
 from skin.errors import InputError
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 
 ONE = "body.layers=[{material: {name: rubber, young: 83e3, poisson: 0.45}, thickness: 0.012}]"
 SMALL = ("body.size=[0.08,0.08]", "body.cells=[4,4]", "layout=grid", "layout.rows=2", "layout.columns=2")
@@ -46,7 +45,7 @@ SMALL = ("body.size=[0.08,0.08]", "body.cells=[4,4]", "layout=grid", "layout.row
 )
 def test_a_value_off_by_a_unit_is_refused_with_the_range(configured, override, message):
     with pytest.raises(Exception, match=message) as refused:
-        build_device(validate_config(configured(override)))
+        build_device(configured(override))
     assert isinstance(refused.value, InputError) or isinstance(refused.value.__cause__, InputError)
 
 
@@ -60,7 +59,7 @@ def test_a_value_off_by_a_unit_is_refused_with_the_range(configured, override, m
 )
 def test_so_is_one_of_an_arm_or_a_rigid_object(configured, overrides, message):
     with pytest.raises(InputError, match=message):
-        build_device(validate_config(configured("body=arm", "simulator=solid", *overrides)))
+        build_device(configured("body=arm", "simulator=solid", *overrides))
 
 
 def test_a_class_takes_what_a_proof_needs():
@@ -69,7 +68,7 @@ def test_a_class_takes_what_a_proof_needs():
 
 def readings(configured, *overrides):
     """Return what four sensors read of 100 kPa on one cell above the first."""
-    model = build_device(validate_config(configured(*SMALL, "body.cells=[8,8]", *overrides))).model
+    model = build_device(configured(*SMALL, "body.cells=[8,8]", *overrides)).model
     pressure = torch.zeros(8, 8)
     pressure[2, 2] = 1e5
     return model(pressure).readings
@@ -77,7 +76,7 @@ def readings(configured, *overrides):
 
 @pytest.mark.parametrize("simulator", ["fem", "solid"])
 def test_sensors_on_the_surface_are_warned_of(configured, simulator):
-    config = validate_config(configured(f"simulator={simulator}", *SMALL, ONE))
+    config = configured(f"simulator={simulator}", *SMALL, ONE)
     with pytest.warns(
         UserWarning, match=r"4 of 4 sensors lie on the surface.*layout.depth=0.004 simulator=solid"
     ):
@@ -85,7 +84,7 @@ def test_sensors_on_the_surface_are_warned_of(configured, simulator):
 
 
 def test_without_mechanics_nobody_is_warned(configured):
-    build_device(validate_config(configured("simulator=naive", *SMALL, ONE)))
+    build_device(configured("simulator=naive", *SMALL, ONE))
 
 
 STACK = (

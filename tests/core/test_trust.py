@@ -5,7 +5,7 @@ import pytest
 from skin.core.files import CONF
 from skin.core.settings import GROUPS, check_targets
 from skin.errors import InputError
-from skin.runs.configuration import plain, validate_config
+from skin.runs.configuration import settings_of
 
 OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 
@@ -17,7 +17,7 @@ def refuse(name):
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_may_be_built(configured, group, option):
-    check_targets(plain(validate_config(configured(f"{group}={option}"))), "a run")
+    check_targets(settings_of(configured(f"{group}={option}")), "a run")
 
 
 @pytest.mark.parametrize(

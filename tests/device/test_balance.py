@@ -8,13 +8,12 @@ import pytest
 from skin.device.balance import accuracy_from_shape, balance_table, check_label_leakage, class_balance
 from skin.errors import InputError
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 from skin.touch.gesture import GestureSettings
 
 
 @pytest.fixture(scope="module")
 def device(configured):
-    return build_device(validate_config(configured("simulator=naive", "data.gestures=160", "layout=grid")))
+    return build_device(configured("simulator=naive", "data.gestures=160", "layout=grid"))
 
 
 def test_a_shape_that_is_the_label_tells_it():

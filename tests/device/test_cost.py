@@ -299,7 +299,7 @@ def test_rows_learn_from_a_sparse_view(configured, report, row, setting):
 
 
 def test_rules_say_that_they_know_other_labels(configured, report):
-    config = validate_config(configured("experiment=rules", *overrides(report)))
+    config = configured("experiment=rules", *overrides(report))
     with pytest.raises(InputError, match=r"learner=rules knows the labels big.*got grab, hit"):
         build_learner(config).fit(build_data(config, build_device(config)))
 

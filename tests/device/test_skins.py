@@ -8,7 +8,6 @@ from skin.core.rng import generator
 from skin.device import skins
 from skin.errors import InputError
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 
 SMALL = (
     "device=skins", "device.count=2", "device.test_skins=1", "device.skins.length=[0.08,0.1]",
@@ -19,7 +18,7 @@ SMALL = (
 
 @pytest.fixture(scope="module")
 def device(configured):
-    return build_device(validate_config(configured(*SMALL)))
+    return build_device(configured(*SMALL))
 
 
 def test_touches_of_skins_with_few_sensors_are_filled_up(device):
@@ -49,7 +48,7 @@ def test_test_skins_are_not_training_skins(device):
 
 def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
     """With skin_seed=0 and data_seed=0, one stream used to do both for skin e and epoch e."""
-    fresh, used = build_device(validate_config(configured(*SMALL))), []
+    fresh, used = build_device(configured(*SMALL)), []
 
     def noted(stream, *key):
         used.append((stream, *key))
@@ -70,7 +69,7 @@ def test_no_stream_defines_a_skin_and_orders_an_epoch(configured, monkeypatch):
 
 
 def test_a_blank_device_prepares_no_skin(configured):
-    fresh = build_device(validate_config(configured(*SMALL)))
+    fresh = build_device(configured(*SMALL))
     blank = fresh.blank()
     assert blank.touches("train").readings.shape == (1, 30, 25)
     assert "training_skins" not in vars(fresh)
@@ -87,5 +86,5 @@ def test_a_blank_device_prepares_no_skin(configured):
 )
 def test_refuses(configured, override, words):
     with pytest.raises(InputError) as caught:
-        build_device(validate_config(configured(*SMALL, override)))
+        build_device(configured(*SMALL, override))
     assert words in str(caught.value)

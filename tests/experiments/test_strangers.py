@@ -15,7 +15,7 @@ from skin.body.base import Sheet
 from skin.errors import InputError
 from skin.mechanics.simulator.solid import Elastic, build_mesh
 from skin.runs.build import build_device, build_learner
-from skin.runs.configuration import Tracking, plain, validate_config
+from skin.runs.configuration import Tracking, settings_of
 from skin.runs.finished_run import FinishedRun, find_run
 from skin.runs.store import Store
 
@@ -67,7 +67,7 @@ def put(store, configured, tmp_path):
     """Return a function that stores a finished run and returns its id."""
 
     def put(change=None, *overrides, text=None, learned=None):
-        config = plain(validate_config(configured(*SKIN, "learner=rules", *overrides)))
+        config = settings_of(configured(*SKIN, "learner=rules", *overrides))
         config.pop("tracking")
         config |= change or {}
         path = tmp_path / "rules.json" if learned is None else learned

@@ -12,7 +12,6 @@ from skin.errors import InputError
 from skin.learning.data import Augmentation, TouchData
 from skin.learning.representation import Readings
 from skin.runs.build import build_data, build_device
-from skin.runs.configuration import validate_config
 from skin.touch.labels import TOUCH_SLIDING
 
 
@@ -202,11 +201,11 @@ def test_time_that_runs_backwards_is_refused_where_touches_have_a_direction(made
 
 
 def test_touches_without_geometry_get_that_of_the_configured_skin(configured):
-    config = validate_config(configured("representation=sites", "simulator=solid", "simulator.divisions=1"))
+    config = configured("representation=sites", "simulator=solid", "simulator.divisions=1")
     device = build_device(config)
     touches, data = device.touches("test")[:8], build_data(config, device)
     unknown = replace(touches, geometry=None)
     torch.testing.assert_close(data.show(unknown).x, data.show(touches).x)
     torch.testing.assert_close(data.show(unknown).summary, data.show(touches).summary)
-    other = build_data(validate_config(configured("representation=sites", "simulator=naive")), device)
+    other = build_data(configured("representation=sites", "simulator=naive"), device)
     assert not torch.allclose(other.show(unknown).x, data.show(touches).x)

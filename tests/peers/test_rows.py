@@ -11,7 +11,7 @@ from skin.core.files import CONF
 from skin.core.settings import check_targets
 from skin.learning.data import TouchData
 from skin.runs.build import build_learner
-from skin.runs.configuration import Tracking, fingerprint, plain, validate_config
+from skin.runs.configuration import Tracking, fingerprint, settings_of, validate_config
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -37,7 +37,7 @@ def test_every_row_is_built_and_may_be_loaded(row):
     config = composed(row)
     build_learner(config)
     assert config.row == row
-    check_targets(plain(config), "a run")
+    check_targets(settings_of(config), "a run")
 
 
 @pytest.fixture(scope="module")

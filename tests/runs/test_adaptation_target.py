@@ -6,14 +6,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from skin.core.files import CONF
 from skin.device.base import split_slices
 from skin.errors import InputError
 from skin.runs.adaptation import FineTuning, choose_gestures, find_target, simulated_budget
 from skin.runs.build import build_device
-from skin.runs.configuration import plain, validate_config
+from skin.runs.configuration import validate_config
 from skin.runs.finished_run import FinishedRun
 
 NAIVE = ["simulator=naive", "layout=grid", "layout.rows=2", "layout.columns=2"]
@@ -70,14 +69,14 @@ def test_gestures_without_labels_are_refused(made_up_device, monkeypatch):
 def test_the_threshold_of_the_alarm_may_be_for_a_profile():
     words = ["evaluation.profile=rough", "device.noise=0.3"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        stored = OmegaConf.create(plain(validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))))
+        stored = validate_config(compose("train", [*NAIVE, "device.noise=0.2"]))
         run = SimpleNamespace(
             info=SimpleNamespace(run_id="a"), data=SimpleNamespace(tags={"fingerprint": "b"})
         )
         parent = FinishedRun(None, run)
         parent.__dict__["stored"] = stored
         found = {
-            given: find_target(parent, compose("adapt", given), FineTuning(), given)
+            given: find_target(parent, validate_config(compose("adapt", given)), FineTuning(), given)
             for given in (tuple(words), ())
         }
     profiled, plainly = found.values()

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
-from skin.runs.alarm_threshold import alarm_point, threshold_device
-from skin.runs.configuration import plain, validate_config
+from skin.runs.configuration import validate_config
 from skin.runs.finished_run import TAG, FinishedRun
-from skin.runs.overrides import profile_settings
+from skin.runs.model_of_run import alarm_point, profile_settings, threshold_device
 
 SMALL = ["simulator=naive", "data.gestures=40", "evaluation.safe_gestures=16"]
 
@@ -26,13 +24,8 @@ def hydra():
         yield lambda *words: validate_config(compose("train", [*SMALL, *words]))
 
 
-def kept(config):
-    """Return a configuration as a run stores it."""
-    return OmegaConf.create(plain(config))
-
-
 def test_a_profile_replaces_the_imperfections_of_the_training(hydra):
-    stored = kept(hydra("seed=3", "device.quantum=0.1"))
+    stored = hydra("seed=3", "device.quantum=0.1")
     device = threshold_device(stored, hydra("evaluation.profile=calibrated", "layout=grid", "layout.rows=3"))
     assert device.randomise
     assert (device.gain_spread, device.noise, device.dead, device.tare) == (0.02, 0.1, [0, 2], True)
@@ -41,18 +34,18 @@ def test_a_profile_replaces_the_imperfections_of_the_training(hydra):
 
 
 def test_without_a_profile_it_is_the_device_of_the_training(hydra):
-    stored = kept(hydra("profile=rough"))
+    stored = hydra("profile=rough")
     device = threshold_device(stored, hydra())
     assert (device.gain_spread, device.randomise) == (0.2, False)
 
 
 def test_a_profile_does_not_follow_a_calibration(hydra, tmp_path):
-    stored = kept(hydra(f"device.calibration={tmp_path}/gone.yaml"))
+    stored = hydra(f"device.calibration={tmp_path}/gone.yaml")
     assert threshold_device(stored, hydra("evaluation.profile=mild")).calibration is None
 
 
 def test_a_profile_holds_on_a_run_of_drawn_skins(hydra):
-    stored = kept(hydra("device=skins", "device.count=1"))
+    stored = hydra("device=skins", "device.count=1")
     for profile in ("rough", "drawn"):
         device = threshold_device(stored, hydra(f"evaluation.profile={profile}"))
         assert device.randomise
@@ -63,7 +56,7 @@ def run_of(config, point):
     """Return as much of a run as its operating point is read from."""
     data = SimpleNamespace(tags={TAG: point.text()})
     run = FinishedRun(None, SimpleNamespace(data=data, info=SimpleNamespace(run_id="abc")))
-    run.__dict__["stored"] = kept(config)
+    run.__dict__["stored"] = config
     return run
 
 
@@ -97,7 +90,7 @@ def test_another_profile_and_one_of_many_skins_have_a_threshold_of_their_own(hyd
 
 def test_more_noise_means_higher_readings_at_rest(hydra):
     """The gestures are measured by devices of the profile, each by another one."""
-    stored = kept(hydra())
+    stored = hydra()
     idle = {}
     for profile in ("mild", "harsh"):
         touches = threshold_device(stored, hydra(f"evaluation.profile={profile}")).fresh_touches(40)
@@ -106,11 +99,11 @@ def test_more_noise_means_higher_readings_at_rest(hydra):
 
 
 def test_runs_on_other_touches_are_refused(hydra, tmp_path):
-    stored = kept(hydra("device=recording", f"device.path={tmp_path}/x.csv"))
+    stored = hydra("device=recording", f"device.path={tmp_path}/x.csv")
     with pytest.raises(InputError, match="trained on others"):
         threshold_device(stored, hydra("evaluation.profile=rough"))
 
 
 def test_unknown_profiles_are_refused(hydra):
     with pytest.raises(InputError, match="no profile soft: choose one of calibrated, drawn, harsh"):
-        threshold_device(kept(hydra()), hydra("evaluation.profile=soft"))
+        threshold_device(hydra(), hydra("evaluation.profile=soft"))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import skops.io as sio
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostingRegressor
 from sklearn.linear_model import LinearRegression
 
@@ -17,10 +16,10 @@ from skin.core.files import CONF
 from skin.errors import InputError
 from skin.evaluation.operating_point import OperatingPoint
 from skin.evaluation.settings import Evaluation
-from skin.runs.alarm_threshold import stored_point
 from skin.runs.build import build_data, build_device, build_learner
-from skin.runs.configuration import Tracking, validate_config
+from skin.runs.configuration import Config, Tracking, validate_config
 from skin.runs.finished_run import TAG, FinishedRun, find_run
+from skin.runs.model_of_run import stored_point
 from skin.runs.store import Store
 
 # MLflow's own business with SQLAlchemy.
@@ -65,7 +64,7 @@ def test_a_name_that_means_no_single_run_is_refused(store, name, reason):
         find_run(store, name)
 
 
-RECORDED = OmegaConf.create({"device": {"_target_": "skin.device.recording.Recorded"}})
+RECORDED = Config(device={"_target_": "skin.device.recording.Recorded"})
 
 
 def tagged(text=None):

@@ -4,7 +4,8 @@ from time import sleep
 
 import pytest
 
-from skin.runs.progress import Steps, SweepProgress, expected_seconds, format_duration
+from skin.core.messages import Steps, format_duration
+from skin.runs.sweep import SweepProgress, expected_seconds
 
 
 def test_nothing_known_gives_no_estimate():
@@ -68,7 +69,7 @@ def test_the_published_table_tells_where_no_run_does(configured):
 
 def test_steps_say_the_share_and_the_time_that_is_left(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("skin.runs.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("skin.core.messages.time.monotonic", lambda: now[0])
     steps = Steps({"load": 10, "evaluate": 30})
     now[0] += 5
     assert steps.line() == "load: 12 % done, about 35 s left"

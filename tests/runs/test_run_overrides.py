@@ -2,36 +2,34 @@
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from skin.core.files import CONF
 from skin.errors import InputError
-from skin.runs.configuration import plain, validate_config
-from skin.runs.overrides import apply_overrides
+from skin.runs.configuration import apply_overrides, settings_of, validate_config
 
 
 def stored(*overrides):
     """Return a configuration as a run keeps it: every value final."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.create(plain(validate_config(compose("train", list(overrides)))))
+        return validate_config(compose("train", list(overrides)))
 
 
 def bring_back(run, *overrides):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return plain(apply_overrides(run, compose("evaluate", list(overrides)), overrides))
+        return settings_of(apply_overrides(run, compose("evaluate", list(overrides)), overrides))
 
 
 def test_nothing_named_changes_nothing():
     run = stored("experiment=sequence_graph", "simulator=naive", "device.offset=0.3", "seed=4")
     back = bring_back(run, "run=latest")
-    assert {key: back[key] for key in run} == plain(run)
+    assert back == settings_of(run)
 
 
 def test_only_what_is_named_changes():
     run = stored("experiment=sequence_graph", "simulator=naive", "device.offset=0.3")
     back = bring_back(run, "device.seed=7")
     assert (back["device"].pop("seed"), back["device"].pop("offset")) == (7, 0.3)
-    before = plain(run)
+    before = settings_of(run)
     assert before["device"].pop("seed") == 0
     before["device"].pop("offset")
     assert back["device"] == before["device"]
@@ -140,4 +138,4 @@ def test_what_has_no_effect_in_a_training_has_none_on_a_run(folder):
 def test_a_profile_changes_only_its_settings_of_the_device():
     back = bring_back(stored("device.offset=0.3"), "profile=mild")
     assert back["device"]["offset"] == 0.3
-    assert back["device"]["noise"] == plain(stored("profile=mild"))["device"]["noise"]
+    assert back["device"]["noise"] == stored("profile=mild").device["noise"]

@@ -7,7 +7,8 @@ from hydra.utils import instantiate
 from skin.body.base import Arm, Layer, Sheet
 from skin.body.layout import File, Grid, Random
 from skin.body.material import Material, Relaxation
-from skin.runs.overrides import with_skin
+from skin.runs.build import with_skin
+from skin.runs.configuration import Config
 
 LAYERS = [
     {"material": "Dragon Skin 10 Medium", "thickness": 0.01},
@@ -29,20 +30,20 @@ LAYERS = [
 def test_the_settings_build_the_same_skin(body, layout):
     if isinstance(layout, File):
         body = Sheet((0.16, 0.16), (16, 16), LAYERS)
-    settings = with_skin({"seed": 1}, body, layout)
-    assert settings["seed"] == 1
-    assert instantiate(settings["body"]) == body
-    sensors, expected = instantiate(settings["layout"]).sensors(body), layout.sensors(body)
+    config = with_skin(Config(seed=1), body, layout)
+    assert config.seed == 1
+    assert instantiate(config.body) == body
+    sensors, expected = instantiate(config.layout).sensors(body), layout.sensors(body)
     np.testing.assert_allclose(sensors.positions, expected.positions)
     np.testing.assert_allclose(sensors.normals, expected.normals)
     assert sensors.footprint == expected.footprint
 
 
 def test_names_and_files_are_options():
-    settings = with_skin({}, "arm", "sensors.csv")
-    assert settings["body"]["_target_"] == "skin.body.base.Arm"
-    assert settings["layout"] == {
+    config = with_skin(Config(), "arm", "sensors.csv")
+    assert config.body["_target_"] == "skin.body.base.Arm"
+    assert config.layout == {
         "_target_": "skin.body.layout.File", "_convert_": "all", "path": "sensors.csv",
         "footprint": [0.01, 0.01], "depth": None,
     }  # fmt: skip
-    assert with_skin({"layout": 1}, None, None) == {"layout": 1}
+    assert with_skin(Config(seed=1), None, None) == Config(seed=1)

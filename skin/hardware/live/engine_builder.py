@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from omegaconf import DictConfig
+from hydra import compose
 
 from skin.core.settings import configured
 from skin.device.resampling import Frame
@@ -21,6 +21,7 @@ from skin.hardware.live.engine import DebounceSettings, Detection, EngineSetting
 from skin.hardware.wire.channels import RawRange, UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
+from skin.runs.configuration import Config
 from skin.runs.exported_model import ExportedModel
 from skin.runs.trained_model import TrainedModel
 
@@ -300,7 +301,7 @@ def watch_exported(
 
 
 def watch_run(
-    config: DictConfig,
+    config: Config,
     live: LiveSettings,
     say: Callable[[str], None],
     overrides: Sequence[str],
@@ -329,7 +330,8 @@ def watch_run(
 
     torch.set_num_threads(config.tracking.threads or 1)
     run = FinishedRun.named(config)
-    watched = run.configured(config, overrides)
+    composed = compose("live", [*overrides])
+    watched = run.configured(composed, overrides)
     device = build_device(watched)
     # A port is opened first: that it is missing must not take as long to say as a run takes to load.
     port = open_source(device) if device.real else None
@@ -337,7 +339,7 @@ def watch_run(
         opened.enter_context(port.skin)
     # The training data stay those of the run, for any watched device.
     trained = run.configured(
-        config, [word for word in overrides if not word.startswith(("device=", "device."))]
+        composed, [word for word in overrides if not word.startswith(("device=", "device."))]
     )
     say(f"loading {run.title} ({run.identity[:8]})")
     if not own_mechanics and (advice := equation10_warning(run.stored, device)):

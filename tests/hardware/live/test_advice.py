@@ -3,7 +3,6 @@
 import pytest
 
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 from skin.runs.model_of_run import equation10_warning
 
 PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
@@ -15,12 +14,12 @@ PORT = ("device=serial", "device.port=/dev/ttyACM0", "device.scale=0.04")
 )
 def test_a_run_on_equation_10_is_announced_at_a_port_only(configured, trained, warned):
     stored = configured(f"simulator={trained}")
-    said = equation10_warning(stored, build_device(validate_config(configured(*PORT))))
+    said = equation10_warning(stored, build_device(configured(*PORT)))
     assert (said is not None) == warned
     assert said is None or "simulator=solid" in said
-    assert equation10_warning(stored, build_device(validate_config(configured("simulator=naive")))) is None
+    assert equation10_warning(stored, build_device(configured("simulator=naive"))) is None
 
 
 def test_another_reading_of_plates_is_not(configured):
     stored = configured("simulator=fem", "simulator.reading=interface")
-    assert equation10_warning(stored, build_device(validate_config(configured(*PORT)))) is None
+    assert equation10_warning(stored, build_device(configured(*PORT))) is None

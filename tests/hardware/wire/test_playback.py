@@ -10,12 +10,11 @@ from skin.errors import InputError
 from skin.hardware.wire.reader import SkinDisconnected
 from skin.hardware.wire.skin import open_skin
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 
 
 @pytest.fixture(scope="module")
 def device(configured):
-    return build_device(validate_config(configured("simulator=naive", "device.dead=1")))
+    return build_device(configured("simulator=naive", "device.dead=1"))
 
 
 @pytest.fixture(scope="module")

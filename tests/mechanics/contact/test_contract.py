@@ -7,7 +7,6 @@ import torch
 from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.build import build_device
-from skin.runs.configuration import validate_config
 
 OPTIONS = sorted(path.stem for path in (CONF / "contact").glob("*.yaml"))
 SMALL = ("body.cells=[16,16]", "layout=grid", "data.gestures=40", "device.test_gestures=32")
@@ -15,7 +14,7 @@ SMALL = ("body.cells=[16,16]", "layout=grid", "data.gestures=40", "device.test_g
 
 @pytest.fixture(scope="module", params=OPTIONS)
 def device(request, configured):
-    return build_device(validate_config(configured(f"contact={request.param}", "simulator=solid", *SMALL)))
+    return build_device(configured(f"contact={request.param}", "simulator=solid", *SMALL))
 
 
 def test_touches_are_made_of_pressures_that_carry_their_force(device):
@@ -38,7 +37,7 @@ def test_rigid_objects_need_a_surface_that_gives_way(configured, simulator):
     with pytest.raises(
         InputError, match=f"simulator={simulator}: set simulator=solid, or contact=prescribed"
     ):
-        build_device(validate_config(configured("contact=rigid", f"simulator={simulator}")))
+        build_device(configured("contact=rigid", f"simulator={simulator}"))
 
 
 def test_the_command_line_says_so_too(run, tmp_path):

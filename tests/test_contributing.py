@@ -77,4 +77,4 @@ def test_a_mistake_is_one_sentence(run, own, overrides, said):
 
 def test_a_simulator_without_epochs_trains_as_long_as_fem(configured):
     config = configured("experiment=sequence_graph", "data.name=gaussian")
-    assert config.trainer.max_epochs == config.epochs.fem
+    assert config.trainer["max_epochs"] == config.epochs["fem"]

@@ -97,8 +97,7 @@ def _geometry(config: Config) -> "Tensor":
 def build_learner(config: Config) -> AbstractLearner:
     """Return an untrained learner."""
     _check_options(config, "learner")
-    learner: AbstractLearner = instantiate(config.learner, seed=config.seed)
-    return learner
+    return instantiate(config.learner, seed=config.seed)
 
 
 # The settings of a skin that was built in Python.
@@ -119,7 +118,9 @@ def with_skin(config: Config, body: AbstractBody | str | None, layout: AbstractL
         settings = _default_option("body", body) if isinstance(body, str) else _body_settings(body)
         config = replace(config, body=settings)
     if isinstance(layout, str):
-        config = replace(config, layout=_layout_settings(layout))
+        file = layout.lower().endswith(".csv")
+        settings = _default_option("layout", "file" if file else layout)
+        config = replace(config, layout=settings | ({"path": layout} if file else {}))
     elif layout is not None:
         check_groups({"body": config.body})
         config = replace(config, layout=_listed_settings(layout, instantiate(config.body)))
@@ -135,7 +136,7 @@ def _body_settings(body: AbstractBody) -> dict[str, Any]:
     for layer in settings["layers"]:
         layer["material"] = {key: value for key, value in layer["material"].items() if value is not None}
     plain = {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()}
-    return {"_target_": _class_name(body), "_convert_": "all", **plain}
+    return {"_target_": f"{type(body).__module__}.{type(body).__qualname__}", "_convert_": "all", **plain}
 
 
 def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, Any]:
@@ -152,13 +153,6 @@ def _listed_settings(layout: AbstractLayout, body: AbstractBody) -> dict[str, An
     }
 
 
-def _layout_settings(name: str) -> dict[str, Any]:
-    """Return the settings of a layout that is given by its name or by its file."""
-    if name.lower().endswith(".csv"):
-        return _default_option("layout", "file") | {"path": name}
-    return _default_option("layout", name)
-
-
 def _default_option(group: str, name: str) -> dict[str, Any]:
     """Return the default settings of an option.
 
@@ -168,9 +162,4 @@ def _default_option(group: str, name: str) -> dict[str, Any]:
     options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
     if name not in options:
         raise InputError(f"there is no {group} {name}: give one of {', '.join(options)}, or build one")
-    settings: Any = OmegaConf.to_container(OmegaConf.load(CONF / group / f"{name}.yaml"))
-    return settings
-
-
-def _class_name(built: object) -> str:
-    return f"{type(built).__module__}.{type(built).__qualname__}"
+    return OmegaConf.to_container(OmegaConf.load(CONF / group / f"{name}.yaml"))  # type: ignore[return-value]

@@ -404,15 +404,17 @@ def _find_options(overrides: Sequence[str]) -> list[_Option]:
             continue
         chosen[path] = group
         package = tuple(element.package.split(".")) if element.package else ()
-        options.append(_Option(path, group, dict(_leaves(_raw(content.config), package))))
+        options.append(_Option(path, group, dict(iterate_leaves(_raw(content.config), package))))
     return options
 
 
-def _leaves(settings: dict[str, Any], above: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+def iterate_leaves(
+    settings: dict[str, Any], above: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield all values with their paths; a list is one value."""
     for name, value in settings.items():
         if isinstance(value, dict) and value:
-            yield from _leaves(value, (*above, name))
+            yield from iterate_leaves(value, (*above, name))
         else:
             yield (*above, name), value
 

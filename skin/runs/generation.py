@@ -20,7 +20,7 @@ from skin.device.base import AbstractDevice, in_threads
 from skin.device.files import DataSet, Manifest, describe_recording, write_recording
 from skin.device.touches import Part
 from skin.errors import InputError
-from skin.runs.configuration import Config, fingerprint, settings_of, source_tags
+from skin.runs.configuration import Config, fingerprint, iterate_leaves, settings_of, source_tags
 
 _PAUSE = 10.0  # s between two lines of progress
 _BYTES = 40.0  # of memory for each reading of a file: with displacements, and a table of everything
@@ -81,7 +81,10 @@ def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
     """Check that a data set was begun with the same settings by the same code."""
     commit = source_tags()["source_commit"]
     if manifest.config_hash != source["config_hash"]:
-        before, now = dict(_flat(manifest.config)), dict(_flat(source["config"]))
+        before, now = (
+            {".".join(path): value for path, value in iterate_leaves(settings)}
+            for settings in (manifest.config, source["config"])
+        )
         changed = [name for name in before | now if before.get(name, ...) != now.get(name, ...)]
         changed.sort(key=lambda name: name.count("."))  # settings before what is derived from them
         differences = [f"{name}={before.get(name)}, not {now.get(name)}" for name in changed[:3]]
@@ -94,15 +97,6 @@ def _compare(manifest: Manifest, source: dict[str, Any], folder: Path) -> None:
             f"{folder} was begun by the code of commit {manifest.source_commit[:12]}, this is {commit[:12]}: "
             "use that code, or add out= with a new folder"
         )
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the settings of a configuration by their names on the command line."""
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from skin.core.files import unwritable
 from skin.errors import InputError
 from skin.evaluation.operating_point import LABEL, parse_operating_point
 from skin.evaluation.report import PERCENTAGES, format_number
-from skin.runs.configuration import settings_of
+from skin.runs.configuration import iterate_leaves, settings_of
 from skin.runs.finished_run import CARD, CONFIG, FORMAT, MODELS, RECORD, SUMS, FinishedRun, checksums, is_name
 from skin.runs.store import PROCESS
 
@@ -210,15 +210,12 @@ def _settings(group: Mapping[str, Any], *without: str) -> str:
     """Return the class of a group, if it has one, and its settings; nested ones as ``outer.inner``."""
     settings = {key: value for key, value in group.items() if key not in without}
     name = [f"`{settings['_target_']}`"] if "_target_" in settings else []
-    return " ".join([*name, ", ".join(_flat(settings))]).strip()
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, entry in value.items():
-        if isinstance(entry, Mapping):
-            yield from _flat(entry, f"{prefix}{key}.")
-        elif not key.startswith("_") and entry is not None:
-            yield f"{prefix}{key}={str(entry).replace('|', '/')}"
+    texts = [
+        f"{'.'.join(path)}={str(value).replace('|', '/')}"
+        for path, value in iterate_leaves(settings)
+        if not path[-1].startswith("_") and value not in (None, {})
+    ]
+    return " ".join([*name, ", ".join(texts)]).strip()
 
 
 def _table(title: str, rows: Iterator[tuple[str, str]], about: str = "") -> str:

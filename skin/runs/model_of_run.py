@@ -185,7 +185,16 @@ def alarm_point_for_touches(
     if calibration is not None:
         device = device.replace(**_remaining(calibration), randomise=True, calibration=None)
     target, count = settings.false_alarm_rate, min(settings.safe_gestures, operating_point.SAFE_TOUCHES)
-    content = _content(run, config, watching, device) | {"target": target, "count": count}
+    content = {
+        "run": run.identity,
+        "device": run.stored.device,
+        "skin": {group: getattr(config, group) for group in ("body", "layout", "simulator", "touch")},
+        "positions": device.sensors.positions.round(9).tolist(),
+        "imperfections": {name: str(value) for name, value in vars(device.imperfection).items()},
+        "watching": asdict(watching),
+        "target": target,
+        "count": count,
+    }
     key = array_cache.hashed(content, [Path(str(module.__file__)) for module in _SOURCES])
 
     def choose() -> dict[str, np.ndarray]:
@@ -200,21 +209,6 @@ def alarm_point_for_touches(
     file = array_cache.folder(None) / f"threshold_{key[:16]}.npz"
     threshold, raised = array_cache.kept(file, key, {"point": (2,)}, choose)["point"].tolist()
     return OperatingPoint(threshold, target, count, int(raised), device.data_seed, rate=watching.rate)
-
-
-def _content(
-    run: FinishedRun, config: Config, watching: Watching, device: AbstractSimulated
-) -> dict[str, Any]:
-    """Return what a threshold depends on."""
-    imperfections = {name: str(value) for name, value in vars(device.imperfection).items()}
-    return {
-        "run": run.identity,
-        "device": run.stored.device,
-        "skin": {group: getattr(config, group) for group in ("body", "layout", "simulator", "touch")},
-        "positions": device.sensors.positions.round(9).tolist(),
-        "imperfections": imperfections,
-        "watching": asdict(watching),
-    }
 
 
 def _remaining(calibration: Calibration) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One run: build, train, evaluate, log."""
+"""One run: build, train, evaluate, log; and evaluate it again on other touches."""
 
 import json
 import logging
@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 from filelock import FileLock, Timeout
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from mlflow.entities import Param, Run
@@ -25,14 +26,14 @@ from pytorch_lightning.loggers import MLFlowLogger
 from pytorch_lightning.utilities import rank_zero_only
 from rich.console import Console
 
-from skin.core.files import unwritable
-from skin.core.messages import PARENT, quiet
+from skin.core.files import results, unwritable
+from skin.core.messages import PARENT, Steps, quiet
 from skin.core.settings import import_target, option_name
 from skin.device.balance import report_balance
 from skin.errors import InputError
 from skin.evaluation.metrics import OUTCOMES
 from skin.evaluation.operating_point import choose_operating_point
-from skin.evaluation.report import Report, evaluate, metrics_table
+from skin.evaluation.report import Report, evaluate, metrics_table, publish_evaluation, write_chances
 from skin.evaluation.report import print_report as show
 from skin.evaluation.settings import check_evaluation
 from skin.learning.learner import AbstractLearner
@@ -48,8 +49,8 @@ from skin.runs.configuration import (
     settings_of,
     source_tags,
 )
-from skin.runs.finished_run import TAG
-from skin.runs.model_of_run import threshold_device
+from skin.runs.finished_run import TAG, FinishedRun
+from skin.runs.model_of_run import load_model, threshold_device
 from skin.runs.store import Store, note_reuse
 from skin.touch.labels import Task
 
@@ -71,7 +72,10 @@ def train(config: Config) -> bool:
     unless ``tracking.resume=false``.
     """
     quiet()
-    _limit_threads(config.tracking.threads)
+    if (threads := config.tracking.threads) is not None:
+        if threads < 1:
+            raise InputError(f"tracking.threads={threads} must be at least 1, or null")
+        torch.set_num_threads(threads)
     if getattr(rank_zero_only, "rank", 0):
         _join(config)
         return True
@@ -92,7 +96,8 @@ def train(config: Config) -> bool:
             return False
         again = find_unfinished(store, config.tracking, identity["fingerprint"])
         with store.run(name, identity, os.environ.get(PARENT), again) as run:
-            learner.unfinished = _unfinished_folder(config.tracking, run)
+            learner.unfinished = _unfinished(config.tracking) / run.info.run_id
+            learner.unfinished.mkdir(exist_ok=True)
             log_configuration(store, run.info.run_id, config, data.hash)
             learner.fit(data, RunLogger(store, run.info.run_id, learner.unfinished))
             point = choose_operating_point(learner, judged, settings)
@@ -188,20 +193,6 @@ def find_unfinished(store: Store, settings: Tracking, identity: str) -> Run | No
     return None
 
 
-def _unfinished_folder(settings: Tracking, run: Run) -> Path:
-    """Return the folder for the checkpoints of a run; it is made where it is missing.
-
-    Raises:
-        InputError: it cannot be made.
-    """
-    folder = _unfinished(settings) / run.info.run_id
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error, "tracking.artifacts=FOLDER") from error
-    return folder
-
-
 def _unfinished(settings: Tracking) -> Path:
     """Return the folder of the checkpoints and locks of all trainings."""
     return Path(settings.artifacts or "mlartifacts").expanduser() / "unfinished"
@@ -209,28 +200,13 @@ def _unfinished(settings: Tracking) -> Path:
 
 def _is_finished(store: Store, config: Config, identity: dict[str, str]) -> bool:
     """Return whether a run did a training before and may replace it; print its metrics."""
-    if not config.tracking.resume:
-        return False
-    finished = store.find("FINISHED", fingerprint=identity["fingerprint"])
-    if finished:
-        _show_finished(finished[0])
+    finished = store.find("FINISHED", fingerprint=identity["fingerprint"]) if config.tracking.resume else []
+    for run in finished[:1]:
+        note_reuse(run)
+        if PARENT not in os.environ:  # a sweep prints the metrics of all its runs
+            _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
+            Console().print(metrics_table(run.data.metrics, run.info.run_name))
     return bool(finished)
-
-
-def _show_finished(run: Run) -> None:
-    """Print the metrics of a run that did a training before; a sweep prints those of all its runs."""
-    note_reuse(run)
-    if PARENT not in os.environ:
-        _log.info("run %s did this before: tracking.resume=false repeats it", run.info.run_id)
-        Console().print(metrics_table(run.data.metrics, run.info.run_name))
-
-
-def _limit_threads(number: int | None) -> None:
-    """Set the number of threads of torch; None: its default."""
-    if number is not None:
-        if number < 1:
-            raise InputError(f"tracking.threads={number} must be at least 1, or null")
-        torch.set_num_threads(number)
 
 
 def log_learner(store: Store, run: Run, learner: AbstractLearner) -> None:
@@ -361,3 +337,76 @@ def _write(report: Report, task: Task, folder: Path) -> None:
     if report.confusion is not None:
         named = dict(zip(task.binary, report.confusion.numpy(), strict=True))
         save_figure(confusions(named, ("no", "yes")), folder / "confusion.png")
+
+
+# Evaluate a finished run again.
+
+
+# Expected seconds of each step, for the share in the progress.
+_STEPS = {
+    "loading the run and the threshold of its alarm": 20.0,
+    "reading or simulating the touches": 10.0,
+    "evaluating them": 30.0,
+}
+
+
+def evaluate_run(config: Config, changes: Sequence[str]) -> None:
+    """Evaluate a finished run on the touches that a command describes; print and log the metrics.
+
+    Args:
+        config: of ``skin evaluate``.
+        changes: the overrides of the command line.
+
+    Raises:
+        InputError: the run cannot be loaded, or does not fit the touches.
+    """
+    quiet()
+    with Steps(_STEPS) as steps:
+        _evaluate(config, changes, steps)
+
+
+def _evaluate(config: Config, changes: Sequence[str], steps: Steps) -> None:
+    run, folder = FinishedRun.named(config), results(config.out)
+    config = run.configured(compose("evaluate", [*changes]), changes)
+    settings = check_evaluation(config.evaluation)
+    if "skins" in config.device and settings.profile is not None:
+        raise InputError("evaluation.profile chooses the threshold for one skin: add device=simulated")
+    model = load_model(run, config)
+    device, learner, point = model.device, model.learner, model.point
+    steps.begin("reading or simulating the touches")
+    steps.silent = device.real
+    touches = device.touches("test")  # read before anything is logged, because a port may fail
+    steps.silent = False
+    steps.begin("evaluating them")
+    title = f"{run.title} ({run.identity})"
+    tags = {"evaluated": run.identity, "overrides": " ".join(changes)}
+    store = Store.open(config.tracking)
+    with store.run(f"evaluation of {run.title}", tags, run.identity) as evaluation:
+        # Evaluations do not overwrite each other's files.
+        name = f"evaluation_{option_name(device)}_{evaluation.info.run_id[:8]}"
+        if touches.labels is None:
+            chances = learner.probabilities(touches)
+            text, path = write_chances(chances, device.task, point, folder / f"{name}.csv")
+            store.client.log_artifact(evaluation.info.run_id, str(path))
+            print(f"{title}\n{text}\n{path}")
+            return
+        report = evaluate(learner, device, settings, point)
+        log_report(store, evaluation, report, device.task, {})
+        about = describe_evaluation(title, changes, len(report.predictions))
+        written = publish_evaluation(folder / f"{name}.md", report, device.task, run.title, about)
+        for path in written:
+            store.client.log_artifact(evaluation.info.run_id, str(path))
+    show(report, title)
+    print(*written, sep="\n")
+
+
+def describe_evaluation(title: str, changes: Sequence[str], count: int) -> str:
+    """Return a sentence about an evaluation of ``count`` gestures.
+
+    Args:
+        title: of the run.
+        changes: the overrides; none keep the settings of the run.
+        count: number of gestures.
+    """
+    settings = f"`{' '.join(changes)}`" if changes else "the settings of the run"
+    return f"Run {title}, evaluated with {settings}, {count} gestures."

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from skin.commands.evaluate import describe_evaluation
 from skin.device.files import read_recording, write_recording
+from skin.runs.train import describe_evaluation
 
 SMALL = [
     "data.gestures=160",

@@ -12,6 +12,7 @@ from skin.body.layout import File
 from skin.core.files import CONF
 from skin.design.place import Place
 from skin.errors import InputError
+from skin.runs.configuration import validate_config
 
 SIZE = (0.12, 0.08)
 SHEET = Sheet(SIZE, [12, 8], [{"material": "EcoFlex 00-30", "thickness": 0.005}] * 2)
@@ -28,7 +29,7 @@ def placed(tmp_path_factory):
     def place(*overrides, **settings):
         folder = tmp_path_factory.mktemp("placed")
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("train", overrides=[*NAIVE, *overrides])
+            config = validate_config(compose("train", overrides=[*NAIVE, *overrides]))
         Place(**{"touches": TOUCHES} | settings).run(config, folder)
         return folder
 

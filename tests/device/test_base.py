@@ -18,6 +18,7 @@ from skin.evaluation.settings import Evaluation
 from skin.evaluation.streams import evaluate_windows
 from skin.hardware.serial import Serial, open_source
 from skin.runs.build import build_device
+from skin.runs.configuration import validate_config
 
 CONF = Path(__file__).parents[2] / "conf"
 POINT = OperatingPoint.default(0.02)
@@ -26,7 +27,7 @@ SMALL = ["data.gestures=50", "device.test_gestures=20", "simulator=naive"]
 
 def build(*overrides: str) -> AbstractDevice:
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return build_device(compose("train", overrides=list(overrides)))
+        return build_device(validate_config(compose("train", overrides=list(overrides))))
 
 
 EVERYWHERE = ("recording", "simulated")  # others need what is not everywhere: a corpus, a port

@@ -113,15 +113,15 @@ def test_settings_of_the_command_line_hold_for_every_variant(composed):
     _, every = composed(*words("graphs", "norm"), "device.noise=0.2", "trainer.max_epochs=3")
     for one in every:
         config = one.configs["0"]
-        assert (config.device.noise, config.trainer.max_epochs) == (0.2, 3)
+        assert (config.device["noise"], config.trainer["max_epochs"]) == (0.2, 3)
         assert (config.evaluation.devices, config.tracking.experiment) == (0, "studies")
 
 
 def test_settings_of_a_variant_hold_instead_of_the_common_ones(composed):
     simulators = {one.name: one.configs["0"].simulator for one in composed(*SENSORS)[1]}
-    assert simulators["fem grid 9"]._target_ != simulators["arm grid 9"]._target_
+    assert simulators["fem grid 9"]["_target_"] != simulators["arm grid 9"]["_target_"]
     given = composed(*SENSORS, "simulator=naive")[1]
-    assert len({one.configs["0"].simulator._target_ for one in given}) == 1
+    assert len({one.configs["0"].simulator["_target_"] for one in given}) == 1
 
 
 def test_one_row_is_a_list_of_one(composed):

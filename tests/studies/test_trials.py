@@ -1,6 +1,5 @@
 """Conditions of a study and their devices."""
 
-import functools
 import time
 from dataclasses import replace
 
@@ -8,11 +7,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hydra import compose, initialize_config_dir
 
 from experiments.studies import trials
 from experiments.studies.measures import Margins
 from experiments.studies.study import Study, Variant
 from experiments.studies.trials import RestoredRun, TrialResult, numbered_settings, read_row, votes, write_row
+from skin.core.files import CONF
 from skin.errors import InputError
 from skin.runs.configuration import fingerprint
 from skin.runs.finished_run import find_pretrained
@@ -75,8 +76,12 @@ def measured(configured, tmp_path, monkeypatch):
         return ROW | {"run": self.run.data.tags["fingerprint"], "name": name}
 
     monkeypatch.setattr(RestoredRun, "_measured", measure)
-    compose = functools.partial(configured, "experiment=rules")
-    monkeypatch.setattr(trials, "compose", lambda name, words: compose(*words))
+
+    def compose_row(name, words):
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return compose(name, ["experiment=rules", *words])
+
+    monkeypatch.setattr(trials, "compose", compose_row)
 
     def train(run=None, **settings):
         if run is None:

@@ -138,11 +138,8 @@ class SelfTest:
         self, conversion: UnitConversion, device: RawRange
     ) -> Iterator[tuple[str, EngineSettings, UnitConversion, RawRange]]:
         """Yield each setting with everything in use but this setting, which is nominal."""
-        used, nominal, unit = (
-            self.used,
-            self._plausible,
-            unit_conversion(len(self.presses), None, 1.0, None, None),
-        )
+        used, nominal = self.used, self._plausible
+        unit = unit_conversion(len(self.presses), None, 1.0, None, None)
         contact = replace(used.detection, threshold=nominal.detection.threshold)
         drift = replace(used.detection, drift=nominal.detection.drift)
         above = replace(used.patience, above=nominal.patience.above)

@@ -356,17 +356,14 @@ class Faults:
             if number >= sensors:
                 raise InputError(f"there is no channel {number}: the layout has {sensors} sensors, from 0")
 
-    def happen(self, kind: str, frames: int, rate: float, generator: np.random.Generator) -> np.ndarray:
-        """Draw the frames in which a fault given by its rate occurs, (frames,), bool."""
-        per_minute: float | Sequence[float] = getattr(self, kind)
-        if not isinstance(per_minute, int | float) or not per_minute:
-            return np.zeros(frames, dtype=bool)
-        return generator.random(frames) < per_minute / 60 / rate
-
-    def moments(self, kind: str, rate: float) -> frozenset[int]:
-        """Return the frames, counted from the start, in which a fault given by times occurs."""
-        listed = getattr(self, kind)
-        return frozenset() if isinstance(listed, int | float) else frozenset(round(t * rate) for t in listed)
+    def happen(
+        self, kind: str, first: int, frames: int, rate: float, generator: np.random.Generator
+    ) -> np.ndarray:
+        """Return in which frames from ``first`` on a fault occurs, (frames,), bool; a rate is drawn."""
+        often: float | Sequence[float] = getattr(self, kind)
+        if not isinstance(often, int | float):
+            return np.isin(first + np.arange(frames), [round(t * rate) for t in often])
+        return generator.random(frames) < often / 60 / rate if often else np.zeros(frames, dtype=bool)
 
     def damaged(self, data: bytes, generator: np.random.Generator) -> bytes:
         """Return bytes with flipped bits and lost bytes."""
@@ -446,7 +443,6 @@ class Emulator:
         self._over = Event()
         self._noise = generator(Stream.NOISE, device.seed, Stream.TEST, 2, settings.seed)
         self._chance = generator(Stream.TEST, 3, settings.seed)
-        self._listed = {kind: faults.moments(kind, settings.rate) for kind in KINDS}
 
     def run(self, seconds: float | None = None, count: int | None = None) -> None:
         """Send until ``count`` gestures or ``seconds`` of device time are over, or until :meth:`stop`."""
@@ -487,7 +483,8 @@ class Emulator:
     def _play(self, values: np.ndarray, end: int | None) -> bool:
         """Send frames when they are due; return whether the run is over."""
         rate = self.settings.rate
-        chances = {kind: self.faults.happen(kind, len(values), rate, self._chance) for kind in KINDS}
+        happen = self.faults.happen
+        faults = {kind: happen(kind, self._number, len(values), rate, self._chance) for kind in KINDS}
         for place, row in enumerate(values):
             if end is not None and self._number >= end:
                 return True
@@ -495,7 +492,7 @@ class Emulator:
             if self._over.wait(max(0.0, due - monotonic())):
                 return True
             for kind in KINDS:
-                if chances[kind][place] or self._number in self._listed[kind]:
+                if faults[kind][place]:
                     getattr(self, f"_{kind}")()
             if self._number % max(1, round(_HEADER * rate)) == 0:
                 self._header()

@@ -24,10 +24,10 @@ def test_bits_and_bytes_at_their_rates():
 
 def test_a_rate_is_per_minute_and_a_list_is_moments():
     draw = np.random.default_rng(2)
-    happened = Faults(reset=6.0).happen("reset", 600_000, 100.0, draw).sum()
+    happened = Faults(reset=6.0).happen("reset", 0, 600_000, 100.0, draw).sum()
     assert happened == pytest.approx(600, abs=5 * np.sqrt(600))
-    assert Faults(reset=[1.5, 3]).moments("reset", 100.0) == {150, 300}
-    assert not Faults(reset=[1.5]).happen("reset", 1000, 100.0, draw).any()
+    listed = Faults(reset=[1.5, 3]).happen("reset", 100, 300, 100.0, draw)
+    assert np.flatnonzero(listed).tolist() == [50, 200]
 
 
 @pytest.mark.parametrize(

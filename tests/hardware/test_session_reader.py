@@ -285,12 +285,12 @@ def values(stored):
 
 
 @pytest.mark.parametrize("name", ["x.csv", "x.csv.json"])
-def test_damage_never_passes_for_another_value(session, tmp_path, name):
+def test_damage_never_passes_for_another_value(session, tmp_path, name, caplog):
     for path in session.parent.iterdir():
         if path.is_file():
             (tmp_path / path.name).write_bytes(path.read_bytes())
     whole = values(read_session(session))
-    logging.getLogger("skin.hardware.record").setLevel(logging.ERROR)
+    caplog.set_level(logging.ERROR, "skin.hardware.record")
 
     @DAMAGED_FILES
     @given(data=st.data())

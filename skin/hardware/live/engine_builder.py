@@ -18,7 +18,7 @@ from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.evaluation.decisions import DRIFT
 from skin.hardware.live.engine import DebounceSettings, Detection, EngineSettings, sensor_list
-from skin.hardware.wire.channels import RawRange, UnitConversion
+from skin.hardware.wire.channels import RawRange, UnitConversion, unit_conversion
 from skin.hardware.wire.reader import PortSettings, SkinTimeout
 from skin.hardware.wire.skin import SerialSource, Skin, Source
 from skin.runs.configuration import Config
@@ -66,7 +66,7 @@ class SelfTest:
             InputError: fewer touches raise the alarm than with nominal settings, or a valid sensor cannot
                 raise it.
         """
-        unit = nominal_conversion(len(self.presses))
+        unit = unit_conversion(len(self.presses), None, 1.0, None, None)
         expected = self.find(self._plausible, unit, RawRange())
         raised = self.find(self.used, conversion, device)
         # A place without a valid sensor is shown as unknown, which hides nothing, unless there are many.
@@ -139,7 +139,8 @@ class SelfTest:
         self, conversion: UnitConversion, device: RawRange
     ) -> Iterator[tuple[str, EngineSettings, UnitConversion, RawRange]]:
         """Yield each setting with everything in use but this setting, which is nominal."""
-        used, nominal, unit = self.used, self._plausible, nominal_conversion(len(self.presses))
+        used, nominal = self.used, self._plausible
+        unit = unit_conversion(len(self.presses), None, 1.0, None, None)
         contact = replace(used.detection, threshold=nominal.detection.threshold)
         drift = replace(used.detection, drift=nominal.detection.drift)
         above = replace(used.patience, above=nominal.patience.above)
@@ -153,11 +154,6 @@ class SelfTest:
         yield "the mask of broken sensors (device.calibration, or a tare at the limit)", used, masked, device
         yield "device.limits", used, conversion, replace(device, limits=(None, None))
         yield "device.scale or device.calibration", used, unit, RawRange()
-
-
-def nominal_conversion(sensors: int) -> UnitConversion:
-    """Return the conversion of a device that sends N."""
-    return UnitConversion(np.ones(sensors), np.zeros(sensors), np.zeros(sensors, dtype=bool))
 
 
 def _frames(

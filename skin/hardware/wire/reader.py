@@ -69,10 +69,8 @@ class PortSettings:
 
     def __post_init__(self) -> None:
         # To open the port shows whether it is one.
-        settings = {
-            entry.name: (getattr(self, entry.name), entry.default) for entry in fields(PortSettings)[1:]
-        }
-        changed = {name: value for name, (value, default) in settings.items() if value != default}
+        settings = {entry.name: getattr(self, entry.name) for entry in fields(PortSettings)[1:]}
+        changed = {name: value for name, value in settings.items() if value != getattr(PortSettings, name)}
         check_settings(PortSettings, changed, "device")
         if self.tare < 0:
             raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")

@@ -4,9 +4,10 @@ import re
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 import skin
-from skin.core.files import ROOT
+from skin.core.files import CONF, ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted(
@@ -45,3 +46,12 @@ def test_every_page_is_in_the_table_of_contents():
 def test_the_reference_lists_the_public_names():
     names = set(re.findall(r"^\| `skin\.(\w+)`", (DOCS / "api.md").read_text(), re.MULTILINE))
     assert names == set(skin.__all__)
+
+
+def test_studies_that_pages_name_exist():
+    for page in PAGES:
+        text = "" if page.name == "CHANGELOG.md" else page.read_text()
+        for name, parts in re.findall(r"\bstudy=(\w+)(?: study\.part=\[?([\w,]+))?", text):
+            path = CONF / "study" / f"{name}.yaml"
+            assert path.is_file(), (page, name)
+            assert not parts or set(parts.split(",")) <= set(OmegaConf.load(path).parts), (page, parts)

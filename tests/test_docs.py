@@ -55,3 +55,10 @@ def test_studies_that_pages_name_exist():
             path = CONF / "study" / f"{name}.yaml"
             assert path.is_file(), (page, name)
             assert not parts or set(parts.split(",")) <= set(OmegaConf.load(path).parts), (page, parts)
+
+
+def test_tests_that_pages_name_exist():
+    for page in PAGES:
+        text = "" if page.name == "CHANGELOG.md" else page.read_text()
+        for name in re.findall(r"\btests/[\w/]+\.py", text):
+            assert (ROOT / name).is_file(), (page, name)

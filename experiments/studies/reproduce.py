@@ -28,6 +28,7 @@ Written by `python -m experiments.studies.reproduce` from the statements in `con
 - `study=…` is short for `skin study study=…`. An empty cell repeats the command above.
 - “b855708”: measured at that commit; the code is gone, or no published file has the value.
 - Finite elements, default settings, three or five seeds, unless stated. In parentheses: report sections.
+- Differences are in percentage points.
 - *agree* and *disagree* need a difference beyond the [margin](protocol.md#intervals-and-comparisons) (±) and
   three seeds (or devices of one training). The pages of `skin study` add the margin over test gestures, which
   is here only where it decides. With so many statements, some verdicts are due to chance.
@@ -112,7 +113,8 @@ def _tested(settings: dict[str, Any]) -> str:
 def _line(statement: Statement, command: str, trials: Sequence[TrialResult]) -> str:
     says = statement.says + (f" ({statement.section})" if statement.section else "")
     result = judge(statement, trials)
-    return f"| {says} | {command} | {comparison_text(result)}: *{result.verdict}* |\n"
+    text = comparison_text(result).replace(" points", "")
+    return f"| {says} | {command} | {text}: *{result.verdict}* |\n"
 
 
 def _told(line: Mapping[str, str]) -> str:

@@ -321,10 +321,13 @@ def default_mesh(quick: bool) -> CheckResult:
         readings[cells, divisions] = ours = _pressed(cells, divisions)
         error = (ours - exact) / exact[:, :1]
         remarks.append(
-            f"{cells} x {cells} cells, {divisions} rows a layer, a 40 mm square pressed: "
-            f"readings {_list(error[0])}, D_s {_list(error[1])}, D_t {_list(error[2])} of the value under "
-            "its middle, for sensors under its middle, 5 mm and 20 mm beside its edge"
+            f"{cells} x {cells} cells, {divisions} rows a layer: readings {_list(error[0])}, "
+            f"D_s {_list(error[1])}, D_t {_list(error[2])}"
         )
+    remarks[0] += (
+        ", of the value under the middle of a 40 mm square, for sensors under its middle, 5 mm and 20 mm "
+        "beside its edge"
+    )
     fine = (32, 2) if quick else (32, 3)
     ours = readings[fine]
     findings = [

@@ -112,7 +112,8 @@ _HEAD = """# Physics, verified
 Written by `make physics`, which exits with code 1 if a law does not hold: each is checked against an
 independent solution. Only digits that are the same on every processor are shown; rounding errors are an
 upper bound. `results/physics.json` holds all digits of one machine. `pytest tests/mechanics` checks what
-small examples can show: balance and reciprocity, `fem` against PyNite, relaxation, `naive`, and contact.
+small examples can show: balance and reciprocity, `solid` against scikit-fem, `fem` against PyNite,
+relaxation, `naive`, and contact.
 
 | law | reference | worst error | tolerance | |
 |---|---|---|---|---|

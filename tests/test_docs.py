@@ -5,10 +5,11 @@ import shlex
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 import skin
 from skin.__main__ import verbs
-from skin.core.files import ROOT
+from skin.core.files import CONF, ROOT
 
 DOCS = ROOT / "docs"
 PAGES = sorted(
@@ -66,3 +67,19 @@ def test_commands_name_existing_verbs_and_options(page):
             if (ROOT / "conf" / group).is_dir():
                 for option in options.split(","):
                     assert (ROOT / "conf" / group / f"{option}.yaml").exists(), word
+
+
+def test_studies_that_pages_name_exist():
+    for page in PAGES:
+        text = "" if page.name == "CHANGELOG.md" else page.read_text()
+        for name, parts in re.findall(r"\bstudy=(\w+)(?: study\.part=\[?([\w,]+))?", text):
+            path = CONF / "study" / f"{name}.yaml"
+            assert path.is_file(), (page, name)
+            assert not parts or set(parts.split(",")) <= set(OmegaConf.load(path).parts), (page, parts)
+
+
+def test_tests_that_pages_name_exist():
+    for page in PAGES:
+        text = "" if page.name == "CHANGELOG.md" else page.read_text()
+        for name in re.findall(r"\btests/[\w/]+\.py", text):
+            assert (ROOT / name).is_file(), (page, name)

@@ -22,10 +22,10 @@ from sklearn.svm import SVC
 from experiments.studies.comparison import combine_verdicts, judge_claim, paired
 from experiments.studies.measures import ProbeSettings
 from experiments.studies.pages import Page
-from skin.body.layout import Scattered
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.errors import InputError
+from skin.evaluation.report import scattered_devices
 from skin.learning.graph import adjacency, neighbours
 from skin.learning.learner import AbstractLearner
 from skin.plot.figures import COLOURS, MARKS
@@ -36,8 +36,7 @@ _BINS = 20
 
 FRAME = "readings, one frame"
 
-# No training draws from these, and no layout of data/layouts is among the scattered ones.
-_FIRST_SEED, _FIRST_LAYOUT = 1_000_000, 101
+_FIRST_SEED = 1_000_000  # no training draws from these
 _COSTS = (0.1, 1, 10, 100)
 _FOLDS = 3
 
@@ -206,22 +205,17 @@ def _touches(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list
 
 def _layouts(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list[Touches]:
     """Return as many other touches on each of some scattered layouts; none where that cannot be."""
-    simulation = device.simulation
-    if simulation is None or settings.layouts < 2:
+    if device.simulation is None or settings.layouts < 2:
         return []
-    count = len(simulation.sensors)
-    rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
-    if count // rows > 3 * rows:
-        return []  # this number of sensors cannot form a grid
-    sensors, devices = simulation.sensors, list[AbstractDevice]()
-    for number in range(settings.layouts):
-        seed_of = _FIRST_LAYOUT + number
-        layout = Scattered(
-            rows, count // rows, seed=seed_of, footprint=sensors.footprint, depth=sensors.positions[:, 2]
-        )
-        draw = _FIRST_SEED * (2 + number) + seed
-        devices.append(simulation.replace(layout=layout, data_seed=draw, gestures=settings.test))
-    return [device.recording().touches for device in devices]
+    try:
+        others = list(scattered_devices(device.simulation, settings.layouts))
+    except InputError:  # this number of sensors cannot form a grid
+        return []
+    draws = (_FIRST_SEED * (2 + number) + seed for number in range(settings.layouts))
+    return [
+        other.replace(data_seed=draw, gestures=settings.test).recording().touches
+        for other, draw in zip(others, draws, strict=True)
+    ]
 
 
 def _labels(sets: Sequence[Touches]) -> np.ndarray:

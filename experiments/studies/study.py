@@ -57,6 +57,7 @@ class Statement:
     others: Sequence[Mapping[str, str]] = ()
     level: float | None = None
     by: float = 0.0
+    over_gestures: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,12 +130,12 @@ def chosen_studies(config: Config) -> list[Study]:
         options = ", ".join(parts) or "none"
         raise InputError(f"study.part={unknown[0]} is none of the parts of study={option}: {options}")
     if not parts:
-        return [_configured(settings, option)]
+        return [configured_study(settings, option)]
     if settings["name"] and len(names) > 1:
         raise InputError(
             f"study.name={settings['name']} names one part: choose it, as in study.part={names[0]}"
         )
-    return [_configured(_with_command_line(settings | parts[name]), name) for name in names]
+    return [configured_study(_with_command_line(settings | parts[name]), name) for name in names]
 
 
 def _with_command_line(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,7 +149,7 @@ def _with_command_line(settings: Mapping[str, Any]) -> dict[str, Any]:
     return OmegaConf.to_container(changed, resolve=False)  # type: ignore[return-value]
 
 
-def _configured(settings: dict[str, Any], name: str) -> Study:
+def configured_study(settings: dict[str, Any], name: str) -> Study:
     """Return the study with some settings, checked."""
     settings["name"] = settings["name"] or name
     check_settings(Study, settings, "study")
@@ -195,38 +196,56 @@ def sweeps(
 def variants(study: Study, smoke: bool = False) -> list[Variant]:
     """Return every variant that a study trains or shows, with its configurations."""
     untrained = () if study.rows is not None else study.finished
-    pairs = [pair for block, line in sweeps(study, study.trainings, smoke) for pair in _variants(block, line)]
+    every = list[tuple[dict[str, str], Variant]]()
+    for block, line in sweeps(study, study.trainings, smoke):
+        every += _variants(block, line)
     for block, line in sweeps(study, untrained, smoke):
         # Rows of peers are in a folder of their own.
         finished = _variants(block, line, (f"hydra.searchpath=['file://{peers.CONF}']",))
-        pairs += [(named, replace(variant, trained=False)) for named, variant in finished]
-    shared = set.intersection(*(set(named.items()) for named, _ in pairs)) if pairs else set()
-    return [
-        replace(variant, name=" ".join(_short(*item) for item in named.items() if item not in shared))
-        for named, variant in pairs
-    ]
+        every += [(named, replace(variant, trained=False)) for named, variant in finished]
+    names = _names([named for named, _ in every])
+    return [replace(variant, name=name) for name, (_, variant) in zip(names, every, strict=True)]
+
+
+def trained_settings(study: Study) -> dict[str, Mapping[str, str]]:
+    """Return the settings that a study gives each variant that it trains, by the variant's name."""
+    rows = {} if study.rows is None else {"experiment": study.rows}
+    pairs = []
+    for block in study.trainings:
+        chosen = {**block, **rows}
+        words = as_overrides({key: value for key, value in chosen.items() if key != "name"})
+        pairs += [_settings(chosen, job) for job in sweep_jobs(words, {})]
+    return dict(zip(_names([named for named, _ in pairs]), (chosen for _, chosen in pairs), strict=True))
 
 
 def _variants(
     block: Mapping[str, Any], line: Sequence[str], places: Sequence[str] = ()
 ) -> list[tuple[dict[str, str], Variant]]:
     """Return each variant of a sweep, with what may name it."""
-    name, variants = block.get("name"), dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
+    variants = dict[tuple[str, ...], tuple[dict[str, str], Variant]]()
     for job in sweep_jobs(list(line), {}):
-        chosen = {key: job[key] for key in block if key != "name"}
-        named = {
-            key: value
-            for key, value in chosen.items()
-            if isinstance(block[key], list) or (not name and key in _NAMED)
-        }
-        words = [*places, *(f"{key}={value}" for key, value in job.items())]
-        config = validate_config(compose("train", words))
-        start = {"name": name} if name else {}
-        _, variant = variants.setdefault(
-            tuple(chosen.values()), (start | named, Variant("", start | chosen, {}))
+        named, chosen = _settings(block, job)
+        config = validate_config(
+            compose("train", [*places, *(f"{key}={value}" for key, value in job.items())])
         )
+        _, variant = variants.setdefault(tuple(chosen.values()), (named, Variant("", chosen, {})))
         variant.configs[str(config.seed)] = config
     return list(variants.values())
+
+
+def _settings(block: Mapping[str, Any], job: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the settings of a job that may name its variant, and all that its study gives it."""
+    chosen = {"name": block["name"]} if block.get("name") else {}
+    swept = [key for key, value in block.items() if isinstance(value, list) or (not chosen and key in _NAMED)]
+    return chosen | {key: job[key] for key in swept}, chosen | {
+        key: job[key] for key in block if key != "name"
+    }
+
+
+def _names(every: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return a name for each variant, of what tells it from the others."""
+    shared = set.intersection(*(set(named.items()) for named in every)) if every else set()
+    return [" ".join(_short(*item) for item in named.items() if item not in shared) for named in every]
 
 
 def _short(key: str, value: str) -> str:

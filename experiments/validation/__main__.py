@@ -45,8 +45,6 @@ LAWS = (
         "Hertz", solid.hertz),
     Law("punch", "Flat rigid punches, square and round: force for a given approach.",
         "capacitance of a square plate (Read, 1997); Johnson, section 3.4", solid.flat_punch),
-    Law("direct", "The precomputed operator gives the same result as solving each frame.",
-        "scikit-fem alone, in the mixed form", solid.single_frames),
     Law("arm", "A sleeve of large radius behaves like a sheet.", "the sheet", solid.wide_arm),
     Law("tube", "A sleeve on a rigid core under uniform pressure behaves like a bonded tube of two layers.",
         "Lame's equations", solid.sleeve),

@@ -127,24 +127,34 @@ def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touche
 
 
 def _layouts(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
-    """Yield the share of the test touches for other layouts with as many sensors, equally deep and tilted.
+    """Yield the share of the test touches for each of some other layouts.
 
     A gesture whose dangerous pressure no sensor of a layout would feel takes another path there.
     """
-    count = len(device.sensors)
-    rows = max(number for number in range(1, int(count**0.5) + 1) if count % number == 0)
-    if count // rows > 3 * rows:
-        raise InputError(f"{count} sensors cannot form a grid, so there are no other layouts of them")
-    for number in range(settings.layouts):
+    for number, other in enumerate(scattered_devices(device, settings.layouts)):
+        yield _share(other.touches("test"), number, settings.layouts)
+
+
+def scattered_devices(device: AbstractSimulated, count: int) -> Iterator[AbstractSimulated]:
+    """Yield a device on each of some scattered layouts with as many sensors, equally deep and tilted.
+
+    Raises:
+        InputError: the sensors cannot form a grid.
+    """
+    sensors = len(device.sensors)
+    rows = max(number for number in range(1, int(sensors**0.5) + 1) if sensors % number == 0)
+    if sensors // rows > 3 * rows:
+        raise InputError(f"{sensors} sensors cannot form a grid, so there are no other layouts of them")
+    for number in range(count):
         layout = Scattered(
             rows,
-            count // rows,
+            sensors // rows,
             seed=_FIRST_LAYOUT + number,
             footprint=device.sensors.footprint,
             depth=device.sensors.positions[:, 2],
             normals=device.sensors.normals,
         )
-        yield _share(device.replace(layout=layout).touches("test"), number, settings.layouts)
+        yield device.replace(layout=layout)
 
 
 def _share(touches: Touches, number: int, count: int) -> Touches:
@@ -190,14 +200,23 @@ def print_report(report: Report, title: str, console: Console | None = None) -> 
 
 def metrics_table(metrics: Mapping[str, float], title: str) -> Table:
     """Return a table of the metrics with a suffix such as ``/accuracy``; others are omitted."""
+    (_, *sets), *lines = metric_rows(metrics)
+    table = Table("", *sets, title=title)
+    for line in lines:
+        table.add_row(*line)
+    return table
+
+
+def metric_rows(metrics: Mapping[str, float], degree: str = "") -> list[list[str]]:
+    """Return the sets of touches, and a row per metric that is shown; ``degree`` is the sign of angles."""
     names = [name for name in metrics if name.endswith(_SHOWN)]
     sets = list(dict.fromkeys(name.split("/")[0] for name in names))
-    table = Table("", *sets, title=title)
+    rows = [["", *sets]]
     for line in dict.fromkeys(name.split("/", 1)[1] for name in names):
+        unit, sign = (1, degree) if line.endswith("/degrees") else (100, "")
         values = (metrics.get(f"{column}/{line}") for column in sets)
-        unit = 1 if line.endswith("/degrees") else 100
-        table.add_row(line, *(format_number(value, unit) for value in values))
-    return table
+        rows.append([line, *(format_number(value, unit) + sign * (value is not None) for value in values)])
+    return rows
 
 
 def format_number(value: float | None, unit: float = 100) -> str:
@@ -214,19 +233,10 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
         title: of the page.
         about: a sentence on where the touches came from.
     """
-    columns = list(dict.fromkeys(name.split("/")[0] for name in report.metrics))
+    (_, *columns), *rows = metric_rows(report.metrics, "°")
     lines = [f"# {title}", "", about, "", "Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
-    rows = dict.fromkeys(name.split("/", 1)[1] for name in report.metrics)
-    for row in rows:
-        if row.endswith(PERCENTAGES):
-            shares = (report.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(f"| {row} | {' | '.join(map(format_number, shares))} |")
-        if row.endswith("/degrees"):
-            sizes = (report.metrics.get(f"{column}/{row}") for column in columns)
-            lines.append(
-                f"| {row} | {' | '.join(format_number(x, 1) + '°' * (x is not None) for x in sizes)} |"
-            )
+    lines += [f"| {' | '.join(row)} |" for row in rows]
     if report.point is not None and report.reached is not None:
         lines += ["", f"{report.point.sentence()}; {report.reached.sentence()}."]
     lines += [f"\n{column}: {reason}" for column, reason in report.cannot.items()]

@@ -69,7 +69,6 @@ def test_a_line_per_variant_with_mean_and_margin():
         "false alarms": "2.0 ± 0.0",
         "s/epoch": "1.50",
         "parameters": "105621",
-        "self": "0.31",
     }
     assert second[:2] == ["weight=none (1 failed)", "70.0"]
     assert third[:2] == ["weight=stiffness (1 failed)", "failed"]

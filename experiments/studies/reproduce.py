@@ -1,0 +1,128 @@
+"""Write docs/reproduce.md: every statement, tested on the published results.
+
+    python -m experiments.studies.reproduce
+
+The statements are in conf/study/, and those without a study in conf/statements.yaml.
+"""
+
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from experiments.studies.comparison import StatementResult, combine_verdicts, conclusions, judge_claim
+from experiments.studies.study import Statement, Study, Variant, configured_study, trained_settings
+from experiments.studies.study_page import comparison_text
+from experiments.studies.trials import TrialResult
+from skin.core.files import CONF, ROOT, write
+from skin.core.settings import configured
+
+_PAGE = ROOT / "docs" / "reproduce.md"
+_HEAD = """# Reproduction of the report's statements
+
+Written by `python -m experiments.studies.reproduce` from the statements in `conf/` and the published results.
+
+- `study=…` is short for `skin study study=…`. An empty cell repeats the command above.
+- “b855708”: measured at that commit; the code is gone, or no published file has the value.
+- Finite elements, default settings, three or five seeds, unless stated. In parentheses: report sections.
+- Differences are in percentage points.
+- *agree* and *disagree* need a difference beyond the [margin](protocol.md#intervals-and-comparisons) (±) and
+  three seeds (or devices of one training). The pages of `skin study` add the margin over test gestures, which
+  is here only where it decides. With so many statements, some verdicts are due to chance.
+"""
+
+
+def reproduce_page() -> str:
+    """Return the page of the committed files."""
+    studies = dict(every_study())
+    sections: Any = OmegaConf.to_container(OmegaConf.load(CONF / "statements.yaml"))
+    parts = [_HEAD]
+    for section in sections:
+        parts.append(f"\n## {section['title']}\n\n| statement | command | outcome |\n|---|---|---|\n")
+        for name in section["studies"]:
+            parts += _study_lines(*studies[name])
+        parts += [_told(line) if "told" in line else _tested(line) for line in section["statements"]]
+    return "".join(parts)
+
+
+def every_study() -> Iterator[tuple[str, tuple[str, Study]]]:
+    """Yield the name of each comparison, with its command and its settings."""
+    base: Any = OmegaConf.to_container(OmegaConf.load(CONF / "study.yaml").study)
+    for path in sorted((CONF / "study").glob("*.yaml")):
+        settings: Any = base | OmegaConf.to_container(OmegaConf.load(path), resolve=False)  # type: ignore[operator]
+        parts = settings.pop("parts")
+        del settings["part"]
+        for name in parts or [path.stem]:
+            command = f"study={path.stem}" + (f" study.part={name}" if parts else "")
+            yield name, (command, configured_study(settings | parts.get(name, {}), name))
+
+
+def published_trials(name: str, chosen: Mapping[str, Mapping[str, str]] | None = None) -> list[TrialResult]:
+    """Return the trials in a published file of a study; none without the file.
+
+    Args:
+        name: of the study.
+        chosen: settings of each variant, by its name.
+    """
+    path = ROOT / "docs" / "results" / f"study_{name}.csv"
+    lines = list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
+    # Several devices of one training are the sample.
+    several = len({line["seed"] for line in lines}) == 1 and any(line.get("device") for line in lines)
+    trials = []
+    for line in lines:
+        variant, seed, condition, device, run = (
+            line.pop(key, "") for key in ("variant", "seed", "condition", "device", "run")
+        )
+        settings = (chosen or {}).get(variant, {"name": variant, "row": variant.split()[0]})
+        metrics = {key: float(value) for key, value in line.items() if value}
+        seed = device if several else seed
+        trials.append(TrialResult(Variant(variant, settings, {}), seed, condition, "", run, metrics))
+    return trials
+
+
+def judge(statement: Statement, trials: Sequence[TrialResult]) -> StatementResult:
+    """Return the verdict on a statement, with its margin over gestures, which published files do not hold."""
+    (result,) = conclusions([statement], trials)
+    compared = {
+        name: pair and replace(pair, margin=math.hypot(pair.margin, statement.over_gestures))
+        for name, pair in result.compared.items()
+    }
+    verdicts = [judge_claim(statement.claim, pair, statement.by) for pair in compared.values()]
+    return StatementResult(statement, compared, combine_verdicts(verdicts))
+
+
+def _study_lines(command: str, study: Study) -> Iterator[str]:
+    trials = published_trials(study.name, trained_settings(study))
+    if not trials:
+        yield f"| {len(study.statements)} on the {study.about} | `{command}` | *not tested* |\n"
+        return
+    for number, statement in enumerate(study.statements):
+        yield _line(statement, "" if number else f"`{command}`", trials)
+
+
+def _tested(settings: dict[str, Any]) -> str:
+    """Return the line of a statement that is tested on a published file."""
+    name = settings.pop("results")
+    link = f"[values](results/study_{name}.csv)"
+    return _line(configured(Statement, {"id": ""} | settings, "statement"), link, published_trials(name))
+
+
+def _line(statement: Statement, command: str, trials: Sequence[TrialResult]) -> str:
+    says = statement.says + (f" ({statement.section})" if statement.section else "")
+    result = judge(statement, trials)
+    text = comparison_text(result).replace(" points", "")
+    return f"| {says} | {command} | {text}: *{result.verdict}* |\n"
+
+
+def _told(line: Mapping[str, str]) -> str:
+    command = line.get("command", "")
+    command = f"`{command}`" if command and not command.startswith("[") else command
+    commit = f" ({line['commit']})" if "commit" in line else ""
+    return f"| {line['says']} | {command} | {line['told']}{commit} |\n"
+
+
+if __name__ == "__main__":
+    print(write(reproduce_page(), _PAGE))

@@ -1,0 +1,148 @@
+"""scikit-fem alone, in the mixed form, reads single frames as the precomputed operator does."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+from skfem import (
+    BilinearForm,
+    CellBasis,
+    ElementHex0,
+    ElementHex1,
+    ElementVector,
+    FacetBasis,
+    Functional,
+    LinearForm,
+    MeshHex,
+    condense,
+)
+from skfem.helpers import ddot, div, sym_grad
+
+from skin.body.base import Sensors, Sheet
+from skin.mechanics.simulator._hexahedra import Hexahedra
+from skin.mechanics.simulator.solid import Elastic, build_mesh, reading_rows
+
+LAYERS = [
+    {"material": {"name": "muscle", "young": 560e3, "poisson": 0.49}, "thickness": 0.010},
+    {"material": {"name": "skin", "young": 170e3, "poisson": 0.499}, "thickness": 0.005},
+]
+
+
+@pytest.mark.parametrize(("seed", "shear"), [(0, 0.0), (1, 0.5)])
+def test_the_operator_agrees_with_scikit_fem_on_single_frames(seed, shear):
+    body = Sheet((0.12, 0.12), (8, 8), LAYERS)
+    place = np.array([3 * body.cell[0], 4 * body.cell[1], 0.005])
+    mesh, extent = build_mesh(body, 2, {}), 2 * body.cell[0]
+    sensors = Sensors(place[None], (extent, extent))
+    down, above = np.array([[0.0, 0, 1]]), place * [1, 1, 0]
+    rows = [reading_rows(mesh, sensors), mesh.motion(place[None], down), mesh.motion(above[None], down)]
+    along, _, inwards = Elastic(mesh).transfer(sp.vstack(rows).tocsr())
+    pressure = 1e4 * np.random.default_rng(seed).random(body.shape)
+    theirs = solve_frame(mesh, pressure, shear, place, extent)
+    ours = (inwards + shear * along) @ pressure.ravel()
+    assert ours == pytest.approx([theirs.reading, theirs.sensor, theirs.surface], rel=1e-8)
+
+
+_GAUSS = (np.array([-1, 1]) / np.sqrt(3) + 1) / 2
+
+
+@dataclass(frozen=True)
+class FrameSolution:
+    """The solution of one frame.
+
+    Attributes:
+        reading: normal force on a rectangle of whole cells, N.
+        sensor: displacement into the skin of the node in its middle, m.
+        surface: the same of the node above, m.
+    """
+
+    reading: float
+    sensor: float
+    surface: float
+
+
+def solve_frame(
+    mesh: Hexahedra, pressure: np.ndarray, shear: float, place: np.ndarray, extent: float
+) -> FrameSolution:
+    """Solve a flat skin under one frame in the mixed form, with one pressure unknown per element.
+
+    Args:
+        mesh: gives points, cells and materials.
+        pressure: (H, W), Pa.
+        shear: tangential traction along x divided by the pressure.
+        place: (3,), m: a node between two rows of elements.
+        extent: side of the sensor's footprint, m: whole cells about the node.
+    """
+    points = MeshHex(mesh.nodes.T.copy(), mesh.corners.T.copy())
+    basis = CellBasis(points, ElementVector(ElementHex1()), intorder=2)
+    inner = basis.with_element(ElementHex0())
+    lam, mu = mesh.lame
+    shape = basis.dx.shape
+    fields = {"mu": np.broadcast_to(mu[:, None], shape), "lam": np.broadcast_to(lam[:, None], shape)}
+    elastic = BilinearForm(lambda u, v, w: 2 * w.mu * ddot(sym_grad(u), sym_grad(v))).assemble(
+        basis, **fields
+    )
+    grown = BilinearForm(lambda u, q, w: div(u) * q).assemble(basis, inner)
+    squeezed = BilinearForm(lambda p, q, w: p * q / w.lam).assemble(inner, **fields)
+    whole = sp.block_array([[elastic, grown.T], [grown, -squeezed]]).tocsr()
+
+    top = FacetBasis(points, basis.elem, facets=points.facets_satisfying(lambda x: np.abs(x[2]) < 1e-12))
+    columns, rows = (np.diff(line[:2])[0] for line in mesh.lines[:2])
+
+    def traction(v, w):
+        push = pressure[(w.x[1] // rows).astype(int), (w.x[0] // columns).astype(int)]
+        return push * (shear * v[0] - v[2])
+
+    load = np.concatenate([LinearForm(traction).assemble(top), np.zeros(inner.N)])
+    table = basis.get_dofs(lambda x: np.abs(x[2] + mesh.lines[2][-1]) < 1e-12).all()
+    solution = _solve(*condense(whole, load, D=table))
+    moved, squeeze = solution[: basis.N], solution[basis.N :]
+    below = np.array([place[0], place[1], -place[2]])
+    above = np.array([place[0], place[1], 0.0])
+    sensor, surface = (-_at(points, basis, moved, spot)[2] for spot in (below, above))
+    return FrameSolution(
+        _reading(points, basis, moved, squeeze, fields["mu"], mesh, place, extent), sensor, surface
+    )
+
+
+def _solve(matrix, right, whole, free) -> np.ndarray:
+    """Solve with one step of iterative refinement, because the mixed form is ill-conditioned."""
+    factors = splu(matrix.tocsc())
+    first = factors.solve(right)
+    answer = whole.copy()
+    answer[free] = first + factors.solve(right - matrix @ first)
+    return answer
+
+
+def _at(points: MeshHex, basis: CellBasis, moved: np.ndarray, spot: np.ndarray) -> np.ndarray:
+    """Return the displacement (3,) of the node at a place."""
+    node = np.linalg.norm(points.p - spot[:, None], axis=0).argmin()
+    return moved[basis.nodal_dofs[:, node]]
+
+
+def _reading(points, basis, moved, squeeze, mu, mesh: Hexahedra, place, extent: float) -> float:
+    """Integrate -sigma_zz over the footprint in the rows above and below, and interpolate linearly."""
+    x, y, z = points.p[:, points.t].mean(axis=1)
+    within = (np.abs(x - place[0]) < extent / 2) & (np.abs(y - place[1]) < extent / 2)
+    lines = mesh.lines[2]
+    row = int(np.searchsorted(lines, place[2] - 1e-9))
+    upper, lower = (lines[row - 1] + lines[row]) / 2, (lines[row] + lines[row + 1]) / 2
+    s, t = np.meshgrid(_GAUSS, _GAUSS)
+    half_way = np.stack([s.ravel(), t.ravel(), np.full(4, 0.5)])
+    felt = []
+    for middle in (upper, lower):
+        elements = np.flatnonzero(within & (np.abs(z + middle) < 1e-9))
+        plane = CellBasis(points, basis.elem, quadrature=(half_way, np.full(4, 0.25)), elements=elements)
+        push = Functional(lambda w: -(2 * w.mu * w["u"].grad[2][2] + w.q) / w.high)
+        shape = plane.dx.shape
+        felt.append(
+            push.assemble(
+                plane, u=plane.interpolate(moved), mu=np.broadcast_to(mu[elements, :1], shape),
+                q=np.broadcast_to(squeeze[elements][:, None], shape),
+                high=np.full(shape, 2 * abs(lines[row] - middle)),
+            )
+        )  # fmt: skip
+    share = (place[2] - upper) / (lower - upper)
+    return float((1 - share) * felt[0] + share * felt[1])

@@ -1,0 +1,40 @@
+"""The page of the statements is that of the committed statements and results."""
+
+import pytest
+
+from experiments.studies.reproduce import every_study, judge, published_trials, reproduce_page
+from experiments.studies.study import Statement
+from skin.core.files import ROOT
+
+
+def test_the_committed_page_is_what_the_committed_files_say():
+    """``python -m experiments.studies.reproduce`` writes it."""
+    assert (ROOT / "docs" / "reproduce.md").read_text() == reproduce_page()
+
+
+def test_every_statement_is_on_the_page():
+    text = (ROOT / "docs" / "reproduce.md").read_text()
+    for command, study in dict(every_study()).values():
+        if study.statements:
+            assert f"`{command}`" in text
+            for statement in study.statements if published_trials(study.name) else ():
+                assert f"| {statement.says}" in text
+
+
+def test_a_margin_over_gestures_counts():
+    trials = published_trials("sensors")
+    lines = {"one": {"name": "placed 16", "condition": "above a sensor"}}
+    lines |= {"others": [{"name": "grid 25", "condition": "above a sensor"}]}
+    about = {"metric": "same/overall/accuracy", "claim": "greater", "by": -0.3}
+    sure = judge(Statement("a", "b", **lines, **about), trials)
+    wide = judge(Statement("a", "b", **lines, **about, over_gestures=0.2), trials)
+    (narrow,), (margin,) = sure.compared.values(), wide.compared.values()
+    assert (sure.verdict, wide.verdict) == ("disagree", "undecided")
+    assert margin.margin == pytest.approx((narrow.margin**2 + 0.2**2) ** 0.5)
+    assert margin.mean == narrow.mean
+
+
+def test_devices_of_one_training_are_the_sample():
+    assert {trial.seed for trial in published_trials("dead")} == {"1", "2", "3", "4", "5"}
+    assert {trial.seed for trial in published_trials("layouts")} == {"0", "1", "2"}
+    assert published_trials("nothing") == []

@@ -15,7 +15,14 @@ HEAVY = ("torch", "mlflow", "pytorch_lightning", "numpy", "scipy")
 LIGHT = f"""
 import json, os, sys
 from importlib import import_module
+from omegaconf import OmegaConf
 from skin.__main__ import main, verbs
+from skin.core.files import CONF
+from tests.starter import remembering
+OmegaConf.load = staticmethod(remembering(OmegaConf.load))
+for path in CONF.rglob("*.yaml"):
+    with path.open() as file:
+        OmegaConf.load(file)
 for module in verbs().values():
     import_module(module)
 for line in sys.stdin:

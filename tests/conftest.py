@@ -35,13 +35,14 @@ import pytest
 import torch
 from filelock import FileLock
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from skin.core.files import ROOT
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
 from skin.runs.configuration import Config, validate_config
 from skin.touch.labels import TOUCH
-from tests.starter import copying
+from tests.starter import copying, remembering
 
 # The imports of all tests make a million objects that live to the end. To search them for garbage again and
 # again takes a third of the collection.
@@ -100,6 +101,14 @@ def stores_are_copied(empty_database):
     with pytest.MonkeyPatch.context() as patch:
         if tracking := sys.modules.get("skin.runs.store"):  # else no test opens a store
             patch.setattr(tracking.Store, "open", copying(empty_database))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def files_are_parsed_once():
+    """Let the hundreds of compositions parse each file of the configuration once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", staticmethod(remembering(OmegaConf.load)))
         yield
 
 

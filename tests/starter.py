@@ -17,12 +17,14 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
+from copy import deepcopy
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from select import select
 from typing import Any, TextIO
 
-__all__ = ["copying", "main"]
+__all__ = ["copying", "main", "remembering"]
 
 WARM = (
     "alembic.command",
@@ -41,9 +43,16 @@ def main() -> None:
     folder = Path(sys.argv[1])
     gc.disable()
     made = _warm()
+    from omegaconf import OmegaConf
+
+    from skin.core.files import CONF
     from skin.runs.store import Store
 
     Store.open = copying(lambda: Path(sys.argv[2]))  # type: ignore[method-assign, assignment]
+    OmegaConf.load = staticmethod(remembering(OmegaConf.load))  # type: ignore[method-assign]
+    for path in CONF.rglob("*.yaml"):
+        with path.open() as file:
+            OmegaConf.load(file)
     assert threading.active_count() == 1, "a fork keeps one thread"
     gc.freeze()  # else every fork would copy what it never changes
     gc.enable()
@@ -108,6 +117,20 @@ def copying(empty: Callable[[], Path]) -> Callable[[Any], Any]:
         return as_it_is(settings)
 
     return opened
+
+
+def remembering(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return ``OmegaConf.load``, which parses the text of an open file once: a third of each composition."""
+    parsed: dict[str, Any] = {}
+
+    def loaded(file: Any) -> Any:
+        if not hasattr(file, "read"):
+            return load(file)
+        if (text := file.read()) not in parsed:
+            parsed[text] = load(StringIO(text))
+        return deepcopy(parsed[text])
+
+    return loaded
 
 
 def _become(job: dict[str, Any], made: dict[str, str]) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.model_of_run import RunModel
@@ -28,13 +29,16 @@ def untrained(configured):
 
 
 @pytest.fixture(scope="session")
-def exported(untrained, tmp_path_factory) -> tuple[RunModel, Path]:
-    """Return the run with features, and its exported file."""
+def exported(untrained, shared) -> tuple[RunModel, Path]:
+    """Return the run with features, and its exported file, which one process writes for all."""
     pytest.importorskip("onnxruntime")
     from skin.runs.onnx_writer import write_model
 
-    of = untrained("experiment=best_fresh")
-    path = tmp_path_factory.mktemp("exported") / "skin.onnx"
-    module = of.learner.pipeline(of.places)
-    write_model(module, of.describe(), of.device.touches("train"), path)
+    of, path = untrained("experiment=best_fresh"), shared / "exported" / "skin.onnx"
+    with FileLock(f"{path.parent}.lock"):
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            new = path.with_name("new.onnx")
+            write_model(of.learner.pipeline(of.places), of.describe(), of.device.touches("train"), new)
+            new.rename(path)
     return of, path

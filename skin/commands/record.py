@@ -25,12 +25,10 @@ def main(config: Config) -> None:
         raise InputError(f"record has no {unknown[0]}: it takes free, finish")
 
     from skin.hardware.recorder import convert_session, record_session
-    from skin.hardware.serial import Serial
+    from skin.hardware.serial import require_port
     from skin.runs.build import build_device
 
-    device = build_device(config)
-    if not isinstance(device, Serial):
-        raise InputError("only a skin at a port can be recorded: leave out device=")
+    device = require_port(build_device(config))
     path = Path(config.out).expanduser()
     if not settings["finish"]:
         with suppress(KeyboardInterrupt):

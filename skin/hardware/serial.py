@@ -46,6 +46,17 @@ def open_source(device: AbstractDevice) -> Source:
     return Source.in_newtons(device.name, play(chain([first], strips)), first.readings.shape[2])
 
 
+def require_port(device: AbstractDevice) -> "Serial":
+    """Return a device that is a skin at a port.
+
+    Raises:
+        InputError: it is another device.
+    """
+    if not isinstance(device, Serial):
+        raise InputError("only a skin at a port can be recorded: leave out device=")
+    return device
+
+
 _LABELS = ("announced", "prompted", "none")
 
 

@@ -144,7 +144,7 @@ SERIAL = ["device=serial", "device.port=/dev/null"]
         (["device.noise=-1"], "device.noise=-1 must be greater than or equal to 0"),
         (["device.clip=0"], "device.clip=0 must be greater than 0"),
         (["device.stuck=0.5"], "device.stuck=0.5 must be a valid integer"),
-        (["device.dead=[4,2]"], "device.dead must be a number from 0 up or a range"),
+        (["device.dead=[4,2]"], r"device.dead=\[4, 2\] must be a range \[least, most\]"),
         (
             ["+device.noize=1"],
             "device has no setting noize: did you mean noise[?] it has .*gain_spread, offset",

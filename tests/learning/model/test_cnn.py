@@ -5,8 +5,8 @@ import torch
 from torch.nn import functional as F
 
 from skin.errors import InputError
+from skin.learning import cnn as module
 from skin.learning.cnn import Cnn, _FirstMaximum
-from skin.learning.model import cnn as module
 
 
 def scattered(channels=1, pixels=64, sensors=25, count=5, seed=0):

@@ -137,6 +137,8 @@ class BoostedTrees(AbstractLearner):
             truth = table["train_labels"][rows, label]
             if len(np.unique(truth)) < 2:
                 raise InputError(f"all training touches have the same label {name}: give more touches")
+            if not held.any():
+                raise InputError(f"no validation touch has a label {name}: give more touches")
             model = _KINDS[name in task.binary](**self._settings)
             validation = {
                 "X_val": table["validation"][held],

@@ -45,6 +45,21 @@ def test_a_label_that_never_changes_is_refused(made_up_device):
         BoostedTrees(rounds=2).fit(TouchData(made_up_device, Readings))
 
 
+def test_a_label_that_no_validation_touch_has_is_refused(made_up_device):
+    touches = made_up_device.touches
+
+    def idle(split, epoch=0):
+        drawn = touches(split)
+        labels = drawn.labels.clone()
+        labels[:, 2:] = 2 * labels[:, 2:] - 1 if split == "train" else 0  # no touch has a direction
+        return Touches(drawn.readings, drawn.valid, drawn.positions, labels, drawn.rate)
+
+    made_up_device.task = Task(("a", "b", "x", "y"), direction=True)
+    made_up_device.touches = idle
+    with pytest.raises(InputError, match="no validation touch has a label x: give more touches"):
+        BoostedTrees(rounds=2).fit(TouchData(made_up_device, Readings))
+
+
 def test_what_is_stored_predicts_the_same_bits_without_a_pickle(made_up_device, tmp_path):
     features, again = BoostedTrees(rounds=20), BoostedTrees()
     data = TouchData(made_up_device, Readings)

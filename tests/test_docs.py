@@ -78,8 +78,9 @@ def test_studies_that_pages_name_exist():
             assert not parts or set(parts.split(",")) <= set(OmegaConf.load(path).parts), (page, parts)
 
 
-def test_tests_that_pages_name_exist():
-    for page in PAGES:
+def test_files_that_pages_and_docstrings_name_exist():
+    sources = [path for folder in ("skin", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    for page in [*PAGES, *sources]:
         text = "" if page.name == "CHANGELOG.md" else page.read_text()
-        for name in re.findall(r"\btests/[\w/]+\.py", text):
+        for name in re.findall(r"\b(?:tests/[\w/]+\.py|docs/results/\w+\.csv)", text):
             assert (ROOT / name).is_file(), (page, name)

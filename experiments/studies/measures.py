@@ -84,7 +84,7 @@ class Measurement:
     Attributes:
         metrics: name -> value; shares are of 1.
         page: what is published; None where the metrics tell everything.
-        outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
+        outcomes: of each test gesture (:func:`skin.evaluation.metrics.encode`); None: not known.
         cannot: why the learner does not accept the touches; empty where it does.
     """
 

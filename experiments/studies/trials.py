@@ -242,7 +242,7 @@ class TrialResult:
         metrics: name -> value.
         line: for a person; empty where there is only a table.
         files: of the measure, name -> content.
-        outcomes: of each test gesture (:func:`skin.evaluation.outcomes.encode`); None: not known.
+        outcomes: of each test gesture (:func:`skin.evaluation.metrics.encode`); None: not known.
         cannot: the columns (``same``, ``unseen_layout``) whose touches the run does not accept.
     """
 

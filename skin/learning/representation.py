@@ -67,7 +67,7 @@ def channels(readings: Tensor, valid: Tensor, scale: float, mask: bool) -> Tenso
         valid: (B, T, S), bool; a reading that is not valid becomes 0, also if it is NaN.
         scale: N; readings are divided by it.
         mask: append a channel that is 1 where the reading is not valid. It is 0 for valid readings, because
-            a constant channel of ones is large beside small readings (docs/results/dead.csv).
+            a constant channel of ones is large beside small readings (docs/results/study_dead.csv).
 
     Returns:
         (B, T, S, C), with C = 2 under ``mask`` and else 1.

@@ -394,6 +394,7 @@ class PlaybackFeed:
         return ()
 
     def open(self) -> None:
-        """Do nothing, as :meth:`close`."""
+        """Do nothing: memory is never disconnected."""
 
-    close = open
+    def close(self) -> None:
+        """Do nothing: there is no port."""

@@ -221,7 +221,7 @@ class Solid(AbstractSimulator):
     summary of each data set).
 
     The reading in the middle of a sheet under 1000 Pa of uniform pressure has an error of 0.2 %; ``make
-    physics`` and tests/simulator/test_solid.py check other cases.
+    physics`` and tests/mechanics/simulator/test_solid.py check other cases.
 
     Args:
         body: sheet or arm.

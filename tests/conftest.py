@@ -350,6 +350,11 @@ def run(begin, stores_are_copied) -> Callable[..., subprocess.CompletedProcess]:
     return run
 
 
+def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    """Print a warning to the standard error stream of the moment, as Python does outside of pytest."""
+    (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
+
+
 def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     """Run ``skin`` with these words in this process; leave its state as it was."""
     from hydra.core.global_hydra import GlobalHydra
@@ -373,6 +378,7 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     try:
         with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
             warnings.simplefilter("default")
+            warnings.showwarning = _print_warning  # pytest collects warnings where a person sees them
             main(words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -378,6 +378,23 @@ class RestoredRun:
         }
 
 
+def log_summary(store: Store, study: Study, trials: Sequence[TrialResult], files: Sequence[Path]) -> None:
+    """Log a study with conditions as one run: its files, and the mean of every metric over its trials.
+
+    The next summary of this study replaces it.
+    """
+    values: dict[str, list[float]] = {}
+    for trial in trials:
+        for metric, value in trial.metrics.items():
+            name = "/".join(part for part in (trial.variant.name, trial.condition, metric) if part)
+            values.setdefault(re.sub(r"[^\w./: -]", "-", name), []).append(value)
+    before = store.find("FINISHED", study=study.name)
+    with store.run(f"study {study.name}", {"study": study.name}, again=next(iter(before), None)) as run:
+        store.log_metrics(run, {name: float(np.mean(numbers)) for name, numbers in values.items()})
+        for path in files:
+            store.client.log_artifact(run.info.run_id, str(path))
+
+
 def read_row(path: Path) -> dict[str, Any] | None:
     """Return the row of a file; None without the file.
 

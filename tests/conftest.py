@@ -126,8 +126,9 @@ def no_thread_survives():
     before = set(threading.enumerate())
     yield
     deadline = monotonic() + 10
-    # MLflow keeps a pool of threads, which end with the interpreter.
-    new = lambda one: one not in before and not one.name.startswith("Mlflow")  # noqa: E731
+    # MLflow keeps a pool of threads and tqdm a monitor, which end with the interpreter.
+    lasting = ("Mlflow", "tqdm_monitor")
+    new = lambda thread: thread not in before and not thread.name.startswith(lasting)  # noqa: E731
     while left := [thread for thread in threading.enumerate() if new(thread)]:
         if monotonic() > deadline:
             pytest.fail(f"still running: {left}")
@@ -360,6 +361,7 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
 
+    import skin.runs.store  # noqa: F401  # it sets variables of the environment, which stay
     from skin.__main__ import main
 
     state, environment, here = Singleton.get_state(), dict(os.environ), Path.cwd()

@@ -117,4 +117,4 @@ def test_the_training_of_the_page_runs(home, run, monkeypatch):
     assert [state for _, state in states] == ["FINISHED", "FINISHED"]
     name = states[0][0]
     assert name.startswith("custom solid body=mine ")
-    assert states[1][0] == f"margins of {name}"
+    assert states[1][0] == "study margins"

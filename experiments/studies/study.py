@@ -318,7 +318,7 @@ def _compare(study: Study, config: Config, folder: Path) -> bool:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
     else:
         paths = _publish(study, [*trials, *votes(study, trials)], config, folder)
-        if any(trial.condition for trial in trials):
+        if study.measure or any(trial.condition for trial in trials):
             log_summary(store, study, trials, paths)
     return any(run.run is None for run in planned)
 

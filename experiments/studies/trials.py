@@ -379,7 +379,7 @@ class RestoredRun:
 
 
 def log_summary(store: Store, study: Study, trials: Sequence[TrialResult], files: Sequence[Path]) -> None:
-    """Log a study with conditions as one run: its files, and the mean of every metric over its trials.
+    """Log what a study measured as one run: its files, and the mean of every metric over its trials.
 
     The next summary of this study replaces it.
     """

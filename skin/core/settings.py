@@ -136,8 +136,6 @@ def check_groups(config: Mapping[str, Any]) -> None:
         InputError: as :func:`check_settings`, or a class that cannot be imported.
     """
     for name, part in _parts(config, ""):
-        if not isinstance(part.get("_partial_", False), bool):
-            raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
         # The model is inside the learner, but is set by the name of its group.
         inner = name.split(".")[-1]
         label = inner if inner in _INNER else name
@@ -168,6 +166,8 @@ def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     if isinstance(value, Mapping):
         for key, entry in value.items():
             yield from _parts(entry, f"{name}.{key}" if name else str(key))
+        if not isinstance(value.get("_partial_", False), bool):
+            raise InputError(f"{name}._partial_={value['_partial_']} must be true or false")
         target = value.get("_target_")
         if target is None and (option := name.rpartition(".")[2]) in _INNER:
             raise InputError(f"{option} chooses no option: leave it out, or give one that --help lists")

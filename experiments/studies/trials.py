@@ -24,7 +24,6 @@ from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
-from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 
 from experiments.studies.measures import Accuracy, StudyMeasure, Subject
@@ -183,11 +182,7 @@ def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
     if OUTCOMES not in {file.path for file in store.client.list_artifacts(run.info.run_id)}:
         return None
     with TemporaryDirectory() as folder:
-        path = download_artifacts(
-            run_id=run.info.run_id, artifact_path=OUTCOMES, dst_path=folder, tracking_uri=store.uri
-        )
-        outcomes: np.ndarray = np.load(path)
-        return outcomes
+        return np.load(FinishedRun(store, run).fetch(OUTCOMES, folder))
 
 
 def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:

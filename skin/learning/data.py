@@ -15,13 +15,13 @@ from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
-from skin.learning.classifier import Batch
 from skin.learning.representation import AbstractRepresentation, Frames, idle_level
 from skin.touch.labels import Task
 
 # Data augmentation: changes of a touch that keep its labels.
 
 
+Batch = tuple[Frames, Tensor]
 _MARGIN = 2  # frames that a touch may last beyond what stands out
 
 

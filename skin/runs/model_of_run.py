@@ -295,8 +295,7 @@ class RunModel(TrainedModel):
             )
         streams = self.device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY)
         touches = streams.touches("validation")
-        assert touches.labels is not None
-        return ContactThreshold.tuned(rise(touches), touches.labels[:, -1] > 0.5).least
+        return ContactThreshold.tuned(rise(touches), touches.known_labels[:, -1] > 0.5).least
 
     @property
     def longest(self) -> float:

@@ -88,7 +88,7 @@ def test_a_blank_has_labelled_touches_of_the_same_shape(device):
 
 def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     settings = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
-    assert list(touch_sets(made_up_device, settings)) == ["same", "holdout"]
+    assert list(touch_sets(made_up_device, settings)) == ["holdout"]
     assert torch.equal(
         threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )

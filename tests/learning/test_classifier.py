@@ -9,9 +9,9 @@ from hydra.utils import instantiate
 from skin.body.layout import Scattered
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
-from skin.learning.classifier import TouchClassifier, probabilities
 from skin.learning.data import TouchData
 from skin.learning.fusion import AbstractFusion
+from skin.learning.network import TouchClassifier, probabilities
 from skin.learning.representation import Frames
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 

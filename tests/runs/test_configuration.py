@@ -279,6 +279,7 @@ def built(word):
         "evaluation=null",
         "trainer=null",
         "contact._partial_=../x",
+        "optimizer._partial_=2",
         "device.contact=''",
         "representation=2147483648",
         "layout=[[1]]",

@@ -29,7 +29,7 @@ from skin.hardware.wire.segmentation import (
     label_text,
 )
 from skin.hardware.wire.skin import SerialSource, Source, play
-from skin.touch.gesture import GestureSettings, model_window
+from skin.touch.gesture import TouchSettings, model_window
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 
 
@@ -75,7 +75,7 @@ class Serial(PortSettings, AbstractDevice):
         gestures: number of gestures.
         seed: of the order of prompts.
         trigger: force above which a window begins with ``labels=none``, N.
-        touch: rate and window of the model (``conf/touch.yaml``).
+        touch: rate and window of the model (``conf/touch``).
         stream: add the label ``touch``.
 
     Raises:
@@ -90,7 +90,7 @@ class Serial(PortSettings, AbstractDevice):
     gestures: int = 16
     seed: int = 0
     trigger: float = 0.3
-    touch: Mapping[str, Any] | GestureSettings | None = None
+    touch: Mapping[str, Any] | TouchSettings | None = None
     stream: bool = False
 
     def __post_init__(self) -> None:

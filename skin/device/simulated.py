@@ -342,8 +342,15 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        known = {"geometry": self.geometry, "contacts": movie.contacts}
-        touches = Touches(readings, valid, positions, labels, self.model_rate, **known)
+        touches = Touches(
+            readings,
+            valid,
+            positions,
+            labels,
+            self.model_rate,
+            geometry=self.geometry,
+            contacts=movie.contacts,
+        )
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.

@@ -234,7 +234,8 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
 
 def pressed_peaks(body: AbstractBody, gauge: Gauge) -> np.ndarray:
     """Return the highest pressure of each press under 1 N, (P,), Pa, by the picture of its indenter."""
-    return peak_per_newton(*_indenters(body, gauge))
+    shapes, kind, _ = _indenters(body, gauge)
+    return peak_per_newton(shapes, kind, gauge.radius[gauge.first])
 
 
 def _indenters(body: AbstractBody, gauge: Gauge) -> tuple[Shapes, np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ from skin.touch.gesture import (
     draw_times,
     sample_paths,
 )
+from skin.touch.images import load_image
 from skin.touch.labels import TOUCH
 from skin.touch.movie import Movie, join_movies, measure_gestures
 from skin.touch.sampler import AbstractSampler, ContactModel, describe_touches, steer
@@ -184,17 +185,20 @@ def half_extents(shapes: Shapes) -> np.ndarray:
     return np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
 
 
-def peak_per_newton(shapes: Shapes, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return the highest pressure of shapes under 1 N, Pa; it does not depend on the cells.
+def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return the highest pressure of shapes under 1 N, Pa; of the whole pictures, whatever the cells.
 
     Args:
         shapes: the pictures.
         shape: indices.
-        scale: of each, m.
+        radius: half the larger extent of each, m.
     """
-    pictures = shapes.levels[0][:, 0].double()
-    cover = 4 * pictures.mean((1, 2)) / pictures.amax((1, 2))  # in squares of the scale
-    return 1 / (cover.numpy()[shape] * scale**2)
+    covers = []  # in squares of the radius
+    for name in shapes.names:
+        picture = load_image(name)
+        extents = [np.ptp(places) + 1 for places in np.nonzero(picture > shapes.contact)]
+        covers.append(picture.sum() / (max(extents) / 2) ** 2)
+    return 1 / (np.array(covers)[shape] * radius**2)
 
 
 @final
@@ -313,7 +317,7 @@ class FingertipSampler(AbstractSampler):
         values = peak, (group.force * present).sum(axis=1), drawn["draws"]
         parameters = describe_touches(drawn, paths, values, measures)
         parameters["contacts"] = torch.from_numpy(group.number).float()
-        highest = group.force * peak_per_newton(self.shapes, group.shape, scale)
+        highest = group.force * peak_per_newton(self.shapes, group.shape, group.radius)
         contacts = _contacts(paths, group, highest, present)
         labels = measures.labels(settings.thresholds, settings.rate)
         return Movie(frames, index, profile, labels, parameters, steer(paths, settings.shear), contacts)

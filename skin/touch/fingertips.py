@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Annotated, Any, NamedTuple, final
 
 import numpy as np
@@ -193,12 +194,16 @@ def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np
         shape: indices.
         radius: half the larger extent of each, m.
     """
-    covers = []  # in squares of the radius
-    for name in shapes.names:
-        picture = load_image(name)
-        extents = [np.ptp(places) + 1 for places in np.nonzero(picture > shapes.contact)]
-        covers.append(picture.sum() / (max(extents) / 2) ** 2)
-    return 1 / (np.array(covers)[shape] * radius**2)
+    covers = np.array([_cover(name, shapes.contact) for name in shapes.names])
+    return 1 / (covers[shape] * radius**2)
+
+
+@cache
+def _cover(name: str, contact: float) -> float:
+    """Return the force of a picture of 1 Pa by the square of its radius: pi for a disc."""
+    picture = load_image(name)
+    extents = [np.ptp(places) + 1 for places in np.nonzero(picture > contact)]
+    return picture.sum() / (max(extents) / 2) ** 2
 
 
 @final

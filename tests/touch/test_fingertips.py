@@ -72,7 +72,7 @@ def test_contacts_are_within_their_ranges(sampled):
     assert radius.max() <= settings.radius[1] * (1 + 1e-6)
     mean = force / (torch.pi * radius**2)
     assert mean.max() <= settings.pressure * (1 + 1e-5)
-    # The rim of the disc is softened over one of the picture's 128 pixels.
+    # The rim of the disc is softened over one of the picture's 96 pixels.
     assert (peak / mean).numpy() == pytest.approx(1.0, abs=0.02)
     full = (contacts[..., 3] / movie.scale[..., None]).nan_to_num(1e9)
     assert full.min() >= settings.force * (1 - 1e-5)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skin.device.imperfection import Constants, Imperfection
     from skin.device.touches import TouchStream
     from skin.mechanics.simulator.base import AbstractSimulator
-    from skin.touch.sampler import TouchSampler
+    from skin.touch.sampler import AbstractSampler
 
 
 Split = Literal["train", "validation", "holdout", "test"]
@@ -127,7 +127,7 @@ class AbstractSimulated(AbstractDevice):
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
         sensors: S sensors, at the positions that touches report.
         model: maps pressure to the true readings of the sensors at their true positions.
-        sampler: draws the gestures.
+        sampler: draws the touches.
         window: frames per touch.
         model_rate: frames per second of touches, Hz.
         rate: frames per second of the sensors, Hz; touches are resampled to ``model_rate``.
@@ -144,7 +144,7 @@ class AbstractSimulated(AbstractDevice):
     simulator: Callable[[AbstractBody, Sensors], "AbstractSimulator"]
     sensors: Sensors
     model: "AbstractSimulator"
-    sampler: "TouchSampler"
+    sampler: "AbstractSampler"
     window: int
     model_rate: float
     rate: float

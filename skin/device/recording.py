@@ -19,7 +19,7 @@ from skin.device.touches import Part, Recording, Touches, concatenate
 from skin.errors import InputError
 
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
-_BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated
+_BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated; of a number of a contact
 
 
 @checked("device")
@@ -117,9 +117,10 @@ class Recorded(AbstractDevice):
         parts = self._parts(split, complete)
         if self._whole:
             return parts[0].make()
-        count = sum(part.count for part in parts)
+        count, example = sum(part.count for part in parts), self._example.touches
+        numbers = example.readings.numel() + (0 if example.contacts is None else example.contacts.numel())
         require_memory(
-            2.0 * _BYTES * count * self._example.touches.readings.numel(),  # joining shards copies them
+            2.0 * _BYTES * count * numbers,  # joining shards copies them
             f"{self.path}, {count} gestures at once,",
             "train a network, which reads shard by shard, or generate fewer gestures",
         )

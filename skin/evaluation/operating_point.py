@@ -27,7 +27,6 @@ from skin.evaluation.decisions import DECISIONS, RELEASE, as_press, held_frames,
 from skin.evaluation.settings import ENOUGH, Evaluation, check_evaluation
 from skin.touch.labels import TOUCH, Task
 from skin.touch.movie import Movie
-from skin.touch.sampler import balanced
 
 LABEL = "dangerous"
 _APART = 1e-6  # scores closer than this may have another order on another processor
@@ -312,7 +311,7 @@ def choose_for_touches(
         target: largest share of safe touches that raise the alarm.
         count: number of safe touches.
     """
-    labels = balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
+    labels = device.sampler.balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
     safe = labels[~labels[:, TOUCH.names.index(LABEL)]][:count]
     scores = touch_scores(learner, device, watching, safe, device.data_seed)
     point = OperatingPoint(lowest_threshold(scores, target), target, len(scores), 0, device.data_seed)

@@ -23,6 +23,7 @@ from skin.device.base import AbstractSimulated
 from skin.errors import InputError
 from skin.hardware.emulator import Converter
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.fingertips import half_extents, peak_per_newton
 from skin.touch.shapes import Shapes
 
 _KEY = b"skin_session"
@@ -138,6 +139,21 @@ class Gauge:
         press[(time < self.time[0]) | (time > self.time[-1])] = -1
         return np.where(press >= 0, np.interp(time, self.time, self.force), 0.0), press
 
+    def contacts(self, time: np.ndarray, peaks: np.ndarray) -> np.ndarray:
+        """Return the presses as contacts at times (T,), s, (T, 1, 5), NaN without force.
+
+        Args:
+            time: s.
+            peaks: (P,), highest pressure of each press under 1 N, Pa (:func:`pressed_peaks`).
+
+        Returns:
+            The columns :data:`skin.touch.fingertips.CONTACT`.
+        """
+        force, press = self.at(time)
+        rows = self.first[np.maximum(press, 0)]
+        values = np.column_stack([self.place[rows], self.radius[rows], force, force * peaks[press]])
+        return np.where((force > 0)[:, None], values, np.nan)[:, None]
+
 
 def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
     """Read a gauge file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
@@ -209,14 +225,24 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
         )
     if not (radius > 0).all():
         raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
-    names, kind = np.unique(gauge.indenter[rows], return_inverse=True)
-    shapes = Shapes(names.tolist(), body)
-    # The image has a black border, so its outline is smaller than its texture.
-    reach = np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
-    scale, area = radius / reach[kind], float(np.prod(body.cell))
+    shapes, kind, scale = _indenters(body, gauge)
+    area = float(np.prod(body.cell))
     pieces = [slice(number, number + 1) for number in range(len(kind))]
     images = (shapes.render(kind[n], angle[n], scale[n], place[n]) / area for n in pieces)
     return torch.cat([simulator(image).readings for image in images]).double().numpy()
+
+
+def pressed_peaks(body: AbstractBody, gauge: Gauge) -> np.ndarray:
+    """Return the highest pressure of each press under 1 N, (P,), Pa, by the picture of its indenter."""
+    shapes, kind, _ = _indenters(body, gauge)
+    return peak_per_newton(shapes, kind, gauge.radius[gauge.first])
+
+
+def _indenters(body: AbstractBody, gauge: Gauge) -> tuple[Shapes, np.ndarray, np.ndarray]:
+    """Return the shapes that press, and of each press the shape's index and the scale, m."""
+    names, kind = np.unique(gauge.indenter[gauge.first], return_inverse=True)
+    shapes = Shapes(names.tolist(), body)
+    return shapes, kind, gauge.radius[gauge.first] / half_extents(shapes)[kind]
 
 
 @checked("session")

@@ -166,6 +166,8 @@ class Movie:
             unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
+        contacts: (B, T, K, 5), of fingertips: x, y, radius (m), force (N) and peak pressure (Pa) of each at
+            each time, NaN where there is none; None: unknown.
     """
 
     frames: Tensor
@@ -174,6 +176,7 @@ class Movie:
     labels: Tensor
     parameters: dict[str, Tensor]
     shear: Tensor | None = None
+    contacts: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -190,6 +193,7 @@ class Movie:
             self.labels[rows],
             {name: values[rows] for name, values in self.parameters.items()},
             None if self.shear is None else self.shear[used],
+            None if self.contacts is None else self.contacts[rows],
         )
 
     @property
@@ -213,6 +217,7 @@ def join_movies(movies: Sequence[Movie]) -> Movie:
     """Return one movie of all gestures of ``movies``, in order."""
     starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
     shears = [movie.shear for movie in movies if movie.shear is not None]
+    contacts = [movie.contacts for movie in movies if movie.contacts is not None]
     return Movie(
         torch.cat([movie.frames for movie in movies]),
         torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
@@ -220,4 +225,5 @@ def join_movies(movies: Sequence[Movie]) -> Movie:
         torch.cat([movie.labels for movie in movies]),
         {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
         torch.cat(shears) if shears else None,
+        torch.cat(contacts) if contacts else None,
     )

@@ -8,7 +8,8 @@ u16 seq, u32 t_us, u16 n, n values, u16 CRC-16/CCITT-FALSE of all before it. A c
 u8 0xA5, u8 type 35 (``#``), a comment line of the text protocol without its checksum, u16 CRC. COBS: Cheshire
 and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7 (1999).
 
-Announcements: comments of the text protocol in which an emulated skin describes its next gesture.
+Announcements: comments of the text protocol in which an emulated skin describes its next gesture; for its
+contacts see :mod:`skin.hardware.wire.contact_lines`.
 """
 
 import binascii

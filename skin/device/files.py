@@ -3,7 +3,8 @@
 Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
 (N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
 rows, then ``saturated_00`` ...: 1 where a sensor is at its limit. What is unknown has no column; a reading
-that means nothing (a dead sensor) is empty and is read back as 0 and invalid. Everything else (units,
+that means nothing (a dead sensor) is empty and is read back as 0 and invalid; an empty label or parameter is
+unknown, NaN. Everything else (units,
 layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in
 ``x.csv.json``.
 
@@ -249,8 +250,8 @@ def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
     touches = recording.touches
     batch, time, sensors = touches.readings.shape
 
-    def per_gesture(values: Tensor) -> np.ndarray:
-        return np.repeat(values.cpu().numpy(), time)
+    def per_gesture(values: Tensor) -> np.ma.MaskedArray:
+        return np.ma.masked_invalid(np.repeat(values.cpu().numpy(), time))
 
     arrays = [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)]
     arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
@@ -317,6 +318,10 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     def column(name: str) -> Tensor:
         return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
 
+    def per_gesture(name: str) -> Tensor:
+        values = np.array(table[name].cast(pa.float32()).to_numpy())  # null becomes NaN
+        return torch.from_numpy(values).view(batch, time)[:, 0].clone()
+
     def columns(name: str) -> Tensor:
         return torch.stack([column(column_name) for column_name in numbered(name, sensors)], dim=-1)
 
@@ -325,7 +330,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         columns("reading"),
         torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),
         torch.tensor(about["positions"], dtype=torch.float32),
-        torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
+        torch.stack([per_gesture(name) for name in task.names], dim=1) if about["labelled"] else None,
         about["rate"],
         saturated=columns("saturated") > 0.5 if about["saturated"] else None,
     )
@@ -336,7 +341,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         tuple(about["footprint"]),
         column("force") if about["force"] else None,
         torch.stack([columns("D_s"), columns("D_t")], dim=-1) if about["displacement"] else None,
-        {name: column(f"gesture_{name}")[:, 0] for name in about["parameters"]},
+        {name: per_gesture(f"gesture_{name}") for name in about["parameters"]},
         about["metadata"],
     )
 

@@ -106,7 +106,7 @@ def _add(content: _Content, mapping: ForeignFormat, table: pd.DataFrame, path: P
         values = values - _mean(values[: mapping.baseline.rows])
     targets = [_target(mapping, name, table, path) for name in mapping.targets or ()]
     sources = [_source(rule, table, path, name) for name, rule in _rules(mapping).items()]
-    groups = [_group(columns, table, path) for columns in mapping.grouping.values()]
+    groups = [_joined(columns, table, path, "groups") for columns in mapping.grouping.values()]
     for rows in _segments(mapping, table, values, path):
         content.readings.append(_frames(mapping, values[rows]))
         measured = [
@@ -121,7 +121,8 @@ def _add(content: _Content, mapping: ForeignFormat, table: pd.DataFrame, path: P
             ]
         )
         content.groups.append([_single(column[rows], f"{path}: groups") for column in groups])
-        content.rates.append(rate)
+        stretch = (mapping.segments.frames - 1) / max(1, rows.stop - rows.start - 1)
+        content.rates.append(rate * (stretch if mapping.segments.fit == "stretch" else 1))
 
 
 def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.ndarray:
@@ -140,7 +141,9 @@ def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.nda
     factor = np.asarray(its.scale if its.scale is not None else FORCES[its.unit], dtype=float)
     if factor.ndim and len(factor) != len(names):
         raise InputError(f"channels.scale has {len(factor)} numbers, {path} has {len(names)} channels")
-    values = np.stack([numbers(table, name, path) for name in names], axis=1) * factor
+    values = np.empty((len(table), len(names)), dtype=np.float32)
+    for number, (name, scale) in enumerate(zip(names, np.broadcast_to(factor, len(names)), strict=True)):
+        values[:, number] = scale * numbers(table, name, path)
     if len(names) % (its.per_sensor * its.frames):
         raise InputError(
             f"{path} has {len(names)} channels, not {its.frames} frames of sensors with {its.per_sensor} each"
@@ -148,7 +151,7 @@ def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.nda
     if its.combine != "plain":
         axes = values.reshape(len(values), -1, 3)
         values = axes[..., 2] if its.combine == "normal" else np.linalg.norm(axes, axis=2)
-    return values.astype(np.float32)
+    return values
 
 
 def _rate(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> tuple[float, np.ndarray | None]:
@@ -196,8 +199,7 @@ def _segments(mapping: ForeignFormat, table: pd.DataFrame, values: np.ndarray, p
     begins = np.zeros(count, dtype=bool)
     begins[0] = True
     for name in its.columns:
-        texts = _texts(table[str(name)])
-        begins[1:] |= texts[1:] != texts[:-1]
+        begins[1:] |= np.diff(pd.factorize(table[str(name)])[0]) != 0
     for name in counter:
         begins[1:] |= np.diff(numbers(table, name, path)) <= 0
     edges = [*np.flatnonzero(begins), count]
@@ -226,12 +228,13 @@ def _frames(mapping: ForeignFormat, values: np.ndarray) -> np.ndarray:
         values = values - _mean(values[: mapping.baseline.rows])
     if its.fit == "stretch" and its.by != "row":
         times = np.linspace(0, len(values) - 1, its.frames)
-        stretched = [np.interp(times, np.arange(len(values)), column) for column in values.T]
-        return np.stack(stretched, axis=1).astype(np.float32)
-    before = its.before if its.by == "row" and channels.frames == 1 else 0
+        before = np.minimum(times.astype(int), max(len(values) - 2, 0))
+        share = (times - before)[:, None].astype(np.float32)
+        return values[before] * (1 - share) + values[np.minimum(before + 1, len(values) - 1)] * share
+    idle = its.before if its.by == "row" and channels.frames == 1 else 0
     frames = np.zeros((its.frames, values.shape[1]), dtype=np.float32)
-    part = values[: its.frames - before]
-    frames[before : before + len(part)] = part
+    part = values[: its.frames - idle]
+    frames[idle : idle + len(part)] = part
     return frames
 
 
@@ -240,9 +243,9 @@ def _frames(mapping: ForeignFormat, values: np.ndarray) -> np.ndarray:
 
 def _texts(column: pd.Series) -> np.ndarray:
     """Return a column as texts, (R,), None where there is no value; whole numbers have no decimals."""
-    if pd.api.types.is_float_dtype(column):
-        return np.array([None if np.isnan(value) else f"{value:.12g}" for value in column], dtype=object)
-    return np.array([None if pd.isna(value) else str(value).strip() for value in column], dtype=object)
+    codes, values = pd.factorize(column)  # -1 where there is no value
+    texts = [f"{value:.12g}" if isinstance(value, float) else str(value).strip() for value in values]
+    return np.array([*texts, None], dtype=object)[codes]
 
 
 def _target(mapping: ForeignFormat, name: str, table: pd.DataFrame, path: Path) -> np.ndarray:
@@ -274,8 +277,8 @@ def _source(rule: LabelRule, table: pd.DataFrame, path: Path, name: str) -> np.n
     """Return the texts of the column of a label, (R,)."""
     if rule.column is None:
         return None
-    require_columns(table, [rule.column], path, name if name == "classes" else f"labels.{name}")
-    return _texts(table[str(rule.column)])
+    columns = (rule.column,) if isinstance(rule.column, str | int) else rule.column
+    return _joined(columns, table, path, name if name == "classes" else f"labels.{name}")
 
 
 def _label(
@@ -311,11 +314,14 @@ def _lookup(values: Mapping[Any, int], text: str) -> int | None:
     return next((value for key, value in values.items() if str(key) == text), None)
 
 
-def _group(columns: Sequence[Column], table: pd.DataFrame, path: Path) -> np.ndarray:
-    """Return the group of each row, (R,), as text."""
-    require_columns(table, columns, path, "groups")
-    texts = np.stack([_texts(table[str(name)]) for name in columns], axis=1)
-    return np.array([None if None in row else " ".join(row) for row in texts.tolist()], dtype=object)
+def _joined(columns: Sequence[Column], table: pd.DataFrame, path: Path, what: str) -> np.ndarray:
+    """Return the texts of columns, joined by a blank, of each row, (R,); None where one has no value."""
+    require_columns(table, columns, path, what)
+    texts = [_texts(table[str(name)]) for name in columns]
+    if len(texts) == 1:
+        return texts[0]
+    rows = zip(*texts, strict=True)
+    return np.array([None if None in row else " ".join(row) for row in rows], dtype=object)
 
 
 def _single(texts: np.ndarray, where: str) -> str:
@@ -346,7 +352,7 @@ def _classes(mapping: ForeignFormat, texts: Sequence[str | None]) -> tuple[Task,
     assert its is not None
     names = {str(key): str(name) for key, name in its.names.items()} if its.names else {}
     found = [names.get(text) if names and text is not None else text for text in texts]
-    order = list(dict.fromkeys(names.values())) or sorted({text for text in found if text is not None})
+    order = list(names.values()) or sorted({text for text in found if text is not None})
     present = [name for name in order if name in found]
     if len(present) < 2:
         raise InputError(

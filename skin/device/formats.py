@@ -167,13 +167,13 @@ class LabelRule:
     """Where a label is 0, 1 or unknown: by the values of a column, or by a target.
 
     Attributes:
-        column: of the file or of its path.
+        column: of the file or of its path; values of several columns are joined by a blank.
         values: value -> 0 or 1; others, and none, are unknown.
         target: whose value decides.
         above: the label is 1 above it, N or m, else 0.
     """
 
-    column: Column | None = None
+    column: Column | Sequence[Column] | None = None
     values: dict[str | int | bool, int] | None = None
     target: str | None = None
     above: float | None = None
@@ -181,9 +181,9 @@ class LabelRule:
 
 @dataclass(frozen=True)
 class ClassRule:
-    """Exclusive classes by a column; ``names`` maps its values to names, and others are unknown."""
+    """Exclusive classes by the values of columns; ``names`` maps them to names, and others are unknown."""
 
-    column: Column
+    column: Column | Sequence[Column]
     names: dict[str | int, str] | None = None
 
 

@@ -9,7 +9,7 @@ import platform
 import re
 import socket
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from keyword import iskeyword
@@ -278,6 +278,8 @@ def validate_config(config: Any) -> Config:
 
 def _without_keywords(config: Any) -> Any:
     """Return a configuration whose keys are names in Python, as ``from_`` is for ``from``."""
+    if not isinstance(config, Mapping) or not any(iskeyword(str(name)) for name in config):
+        return config
     plain: Any = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
     return {f"{name}_" if iskeyword(str(name)) else name: value for name, value in plain.items()}
 

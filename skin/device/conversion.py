@@ -74,7 +74,7 @@ def convert_files(
     readings = np.stack(content.readings)
     task, labels = _labels(mapping, content.labels)
     parameters, groups = _parameters(mapping, content)
-    placed = _place(mapping, readings.shape[2], sensors, size)
+    placed, extent = _place(mapping, readings.shape[2], sensors, size)
     touches = Touches(
         torch.from_numpy(np.nan_to_num(readings)),
         torch.from_numpy(~np.isnan(readings)),
@@ -83,7 +83,6 @@ def convert_files(
         float(np.median(content.rates)),
     )
     about = {"about": mapping.about, "positions": _positions_word(mapping), "groups": groups}
-    extent = mapping.size or size or _extent(placed)
     return Recording(touches, task, extent, placed.footprint, parameters=parameters, metadata=about)
 
 
@@ -116,7 +115,7 @@ def _add(content: _Content, mapping: ForeignFormat, table: pd.DataFrame, path: P
         drawn = dict(zip(mapping.targets or (), measured, strict=True))
         content.labels.append(
             [
-                _label(rule, drawn, source, rows, mapping, f"{path}: {name}")
+                _label(rule, drawn, source, rows, mapping, f"{path}: label {name}")
                 for (name, rule), source in zip(_rules(mapping).items(), sources, strict=True)
             ]
         )
@@ -403,20 +402,23 @@ def summarise_conversion(recording: Recording) -> str:
 
 def _place(
     mapping: ForeignFormat, count: int, sensors: Sensors | None, size: tuple[float, float] | None
-) -> Sensors:
-    """Return the sensors of S readings; those of unknown places stand in a row."""
+) -> tuple[Sensors, tuple[float, float]]:
+    """Return the sensors of S readings, in a row where places are unknown, and the sheet's extent, m."""
+    extent = size if mapping.size is None else (mapping.size[0], mapping.size[1])
     its = mapping.channels
     channels = its.per_sensor if its.combine == "plain" else 1
     if mapping.positions == "unknown":
-        places = np.zeros((count // channels, 3))
-        places[:, 0] = _NOMINAL_PITCH * (np.arange(len(places)) + 0.5)
-        places[:, 1] = 0.5 * _NOMINAL_PITCH
+        number = count // channels
+        width, height = extent or (number * _NOMINAL_PITCH, _NOMINAL_PITCH)
+        places = np.zeros((number, 3))
+        places[:, 0] = width * (np.arange(number) + 0.5) / number
+        places[:, 1] = 0.5 * height
     elif mapping.positions == "layout":
         if sensors is None:
             raise InputError("positions: layout needs a skin: give layout=file layout.path=FILE.csv")
         places = sensors.positions
     else:
-        if mapping.size is None:
+        if extent is None:
             raise InputError("positions need size, the extent [x, y] of the sheet, m")
         places = np.array([[*place, 0.0][:3] for place in mapping.positions])
     if len(places) * channels != count:
@@ -424,10 +426,6 @@ def _place(
             f"the files have {count} readings of {channels} per sensor, positions are {len(places)}: correct "
             "channels.columns, or positions"
         )
-    footprint = mapping.footprint if sensors is None else sensors.footprint
-    return Sensors(np.repeat(places, channels, axis=0), footprint)
-
-
-def _extent(placed: Sensors) -> tuple[float, float]:
-    """Return the extent of a row of sensors whose places are unknown, m."""
-    return float(placed.positions[:, 0].max() + 0.5 * _NOMINAL_PITCH), _NOMINAL_PITCH
+    footprint = (mapping.footprint[0], mapping.footprint[1]) if sensors is None else sensors.footprint
+    extent = extent or (len(places) * _NOMINAL_PITCH, _NOMINAL_PITCH)
+    return Sensors(np.repeat(places, channels, axis=0), footprint), extent

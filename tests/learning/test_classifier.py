@@ -205,3 +205,27 @@ def test_a_batch_of_one_touch_can_be_learnt_from():
     logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))
     network.loss(logits, torch.ones(1, 4)).backward()
     assert torch.isfinite(logits).all()
+
+
+@pytest.mark.parametrize("task", [TOUCH, TOUCH_OR_NOT, GESTURES])
+def test_unknown_labels_have_no_loss_and_no_gradient(task):
+    """The loss is that of the touches whose labels are known; without any, it is 0."""
+    network = classifier(task)
+    frames = Frames(torch.randn(6, 3, 2, generator=torch.Generator().manual_seed(1)), None)
+    labels = torch.nn.functional.one_hot(torch.arange(6) % len(task), len(task)).float()
+    if task.gate:
+        labels[:, task.names.index(task.gate)] = 1.0
+    unknown = labels.clone()
+    unknown[4:] = torch.nan
+    known = Frames(frames.x[:4], None)
+    assert network.loss(network(frames), unknown) == pytest.approx(
+        float(network.loss(network(known), labels[:4]))
+    )
+    nothing = network.loss(network(frames), torch.full_like(labels, torch.nan))
+    nothing.backward()
+    assert nothing == 0
+    assert all(not parameter.grad.any() for parameter in network.parameters())
+    accuracy = network._accuracy(network(frames), unknown)
+    assert accuracy["accuracy"] == pytest.approx(
+        float(network._accuracy(network(known), labels[:4])["accuracy"])
+    )

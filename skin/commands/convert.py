@@ -28,8 +28,8 @@ def main(config: Config) -> None:
     from skin.runs.build import build_skin
 
     mapping = read_format(config.from_)
-    own = config.from_.endswith((".yaml", ".yml"))
-    if config.path is None and not own:
+    written = config.from_.endswith((".yaml", ".yml"))
+    if config.path is None and not written:
         raise InputError(f"from={config.from_} needs path=FOLDER, where the recordings are")
     folder = Path(config.path if config.path is not None else Path(config.from_).parent).expanduser()
     if mapping.positions == "layout":

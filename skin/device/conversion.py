@@ -20,7 +20,7 @@ from skin.device.formats import (
     ForeignFormat,
     LabelRule,
     find_files,
-    numbers,
+    parse_numbers,
     read_table,
     require_columns,
 )
@@ -142,7 +142,7 @@ def _readings(mapping: ForeignFormat, table: pd.DataFrame, path: Path) -> np.nda
         raise InputError(f"channels.scale has {len(factor)} numbers, {path} has {len(names)} channels")
     values = np.empty((len(table), len(names)), dtype=np.float32)
     for number, (name, scale) in enumerate(zip(names, np.broadcast_to(factor, len(names)), strict=True)):
-        values[:, number] = scale * numbers(table, name, path)
+        values[:, number] = scale * parse_numbers(table, name, path)
     if len(names) % (its.per_sensor * its.frames):
         raise InputError(
             f"{path} has {len(names)} channels, not {its.frames} frames of sensors with {its.per_sensor} each"
@@ -200,7 +200,7 @@ def _segments(mapping: ForeignFormat, table: pd.DataFrame, values: np.ndarray, p
     for name in its.columns:
         begins[1:] |= np.diff(pd.factorize(table[str(name)])[0]) != 0
     for name in counter:
-        begins[1:] |= np.diff(numbers(table, name, path)) <= 0
+        begins[1:] |= np.diff(parse_numbers(table, name, path)) <= 0
     edges = [*np.flatnonzero(begins), count]
     return [slice(first, last) for first, last in pairwise(edges)]
 
@@ -251,7 +251,7 @@ def _target(mapping: ForeignFormat, name: str, table: pd.DataFrame, path: Path) 
     """Return a measured quantity of each row, (R,), m or N, NaN where unknown."""
     its = (mapping.targets or {})[name]
     require_columns(table, [its.column], path, f"targets.{name}")
-    values = numbers(table, its.column, path)
+    values = parse_numbers(table, its.column, path)
     if its.missing is not None:
         values = np.where(values == its.missing, np.nan, values)
     return (values - its.offset) * TARGETS[name][its.unit]
@@ -350,17 +350,17 @@ def _classes(mapping: ForeignFormat, texts: Sequence[str | None]) -> tuple[Task,
     its = mapping.classes
     assert its is not None
     names = {str(key): str(name) for key, name in its.names.items()} if its.names else {}
-    found = [names.get(text) if names and text is not None else text for text in texts]
-    order = list(names.values()) or sorted({text for text in found if text is not None})
-    present = [name for name in order if name in found]
+    assigned = [names.get(text) if names and text is not None else text for text in texts]
+    order = list(names.values()) or sorted({text for text in assigned if text is not None})
+    present = [name for name in order if name in assigned]
     if len(present) < 2:
         raise InputError(
             f"classes: column {its.column} has fewer than two of the classes {', '.join(order) or '-'}"
         )
-    labels = np.full((len(found), len(present)), np.nan, dtype=np.float32)
-    for row, name in zip(labels, found, strict=True):
+    labels = np.full((len(assigned), len(present)), np.nan, dtype=np.float32)
+    for row, name in zip(labels, assigned, strict=True):
         if name is not None:
-            row[:] = [name == other for other in present]
+            row[:] = [name == entry for entry in present]
     return Task(tuple(present), "exclusive"), labels
 
 

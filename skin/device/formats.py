@@ -405,7 +405,7 @@ def read_table(mapping: ForeignFormat, path: Path, folder: Path) -> pd.DataFrame
     table, named = _read(path, mapping.table), _fields(mapping, path, folder)
     if mapping.time is not None:
         require_columns(table, [mapping.time.column], path, "time")
-        times = numbers(table, mapping.time.column, path) * TIMES[mapping.time.unit]
+        times = parse_numbers(table, mapping.time.column, path) * TIMES[mapping.time.unit]
         if (back := np.flatnonzero(~(np.diff(times) >= 0))).size:
             raise InputError(
                 f"{path}: time goes backwards at row {back[0] + 2}, from {times[back[0]]:.6f} to "
@@ -434,9 +434,7 @@ def _read(path: Path, its: TableFormat) -> pd.DataFrame:
                 path, sep=delimiter, skipinitialspace=True, low_memory=False, **text, **settings
             )
     except ImportError as error:
-        raise InputError(
-            f"{path}: spreadsheets need openpyxl: pip install 'tactile-skin[spreadsheet]'"
-        ) from error
+        raise InputError(f"{path}: spreadsheets need openpyxl: pip install 'tactile-skin[data]'") from error
     except (
         OSError,
         ValueError,
@@ -478,20 +476,20 @@ def _join(mapping: ForeignFormat, table: pd.DataFrame, path: Path, named: Mappin
         beside = path.parent / join.file.format(**named)
     except (LookupError, ValueError) as error:
         raise InputError(f"join.file={join.file}: fields gives {', '.join(named) or 'no names'}") from error
-    other = _read(beside, join.table)
-    if shared := [name for name in other.columns if name in table.columns]:
+    second = _read(beside, join.table)
+    if shared := [name for name in second.columns if name in table.columns]:
         raise InputError(f"{path.name} and {beside} both have a column {shared[0]}: give join.table.names")
     if join.by == "row":
-        if len(other) != len(table):
-            raise InputError(f"{path} has {len(table)} rows, {beside} has {len(other)}: join them by time")
-        return pd.concat([table, other], axis=1)
+        if len(second) != len(table):
+            raise InputError(f"{path} has {len(table)} rows, {beside} has {len(second)}: join them by time")
+        return pd.concat([table, second], axis=1)
     assert join.clock is not None
     assert mapping.time is not None
-    require_columns(other, [join.clock], beside, "join.clock")
-    other[TIME] = numbers(other, join.clock, beside) * TIMES[mapping.time.unit]
-    if not other[TIME].is_monotonic_increasing:
+    require_columns(second, [join.clock], beside, "join.clock")
+    second[TIME] = parse_numbers(second, join.clock, beside) * TIMES[mapping.time.unit]
+    if not second[TIME].is_monotonic_increasing:
         raise InputError(f"{beside}: time goes backwards: correct join.clock")
-    joined = pd.merge_asof(table, other, on=TIME, direction="nearest", tolerance=join.tolerance)
+    joined = pd.merge_asof(table, second, on=TIME, direction="nearest", tolerance=join.tolerance)
     if joined[str(join.clock)].isna().all():
         raise InputError(f"{beside} has no row within join.tolerance={join.tolerance:g} s of {path.name}")
     return joined
@@ -501,16 +499,14 @@ def require_columns(table: pd.DataFrame, names: Sequence[Column], path: Path, wh
     """Raise InputError where a table lacks a column; ``what`` is the setting that names it."""
     if missing := [str(name) for name in names if str(name) not in table.columns]:
         columns = [name for name in table.columns if name != TIME]
-        more = f" ... {columns[-1]}" if len(columns) > _FEW else ""
-        raise InputError(
-            f"{path} has no column {missing[0]}, which {what} names: it has {', '.join(columns[:_FEW])}{more}"
-        )
+        named = ", ".join(columns[:_FEW]) + (f" ... {columns[-1]}" if len(columns) > _FEW else "")
+        raise InputError(f"{path} has no column {missing[0]}, which {what} names: it has {named}")
 
 
 _FEW = 12
 
 
-def numbers(table: pd.DataFrame, name: Column, path: Path) -> np.ndarray:
+def parse_numbers(table: pd.DataFrame, name: Column, path: Path) -> np.ndarray:
     """Return a column as numbers, (R,), float64, NaN where there is none.
 
     Raises:

@@ -129,7 +129,7 @@ class Cost(AbstractDevice):
         self._subject = subjects[recording.parameters["group_subject"].long().numpy()][chosen.numpy()]
         self.subjects = self._divide(np.unique(self._subject))
         counts = ", ".join(f"{len(part)} {name}" for name, part in self.subjects.items())
-        self.split = f"by subject: {counts}"
+        self.split, self.configured = f"by subject: {counts}", False
 
     def _read(self, path: Path, names: tuple[str, ...], variants: bool) -> Recording:
         """Return the captures of a file; those of other gestures have unknown labels."""

@@ -174,7 +174,9 @@ class Recorded(AbstractDevice):
 
     def blank(self) -> AbstractDevice:
         """Return a device that has labels, which the file may lack."""
-        return Blank.of(self.task, self.size, self._example.touches)
+        blank = Blank.of(self.task, self.size, self._example.touches)
+        blank.configured = self.configured
+        return blank
 
     def strips(self) -> Iterator[Touches]:
         """Yield the touches of the file, or of the first shard."""

@@ -5,8 +5,8 @@ Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the
 rows, then ``saturated_00`` ...: 1 where a sensor is at its limit, then ``contact_00_x``, ``_y``, ``_radius``
 (m), ``_force`` (N), ``_peak`` (Pa), ``contact_01_x`` ...: fingertips, empty where there is none. What is
 unknown has no column; a reading that means nothing (a dead sensor) is empty and is read back as 0 and
-invalid. Everything else (units, layout, rate, seeds, versions) is JSON: in the Parquet file's schema under
-``skin``, beside ``x.csv`` in ``x.csv.json``.
+invalid; an empty label or parameter is unknown, NaN. Everything else (units, layout, rate, seeds, versions)
+is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in ``x.csv.json``.
 
 Both have checksums of everything: a Parquet file as of :mod:`skin.core.safe_loading`, and ``x.csv.json``
 under ``sha256`` of the table and of itself. What has none, of older versions or made by hand, is read
@@ -262,8 +262,8 @@ def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
     touches = recording.touches
     batch, time, sensors = touches.readings.shape
 
-    def per_gesture(values: Tensor) -> np.ndarray:
-        return np.repeat(values.cpu().numpy(), time)
+    def per_gesture(values: Tensor) -> np.ma.MaskedArray:
+        return np.ma.masked_invalid(np.repeat(values.cpu().numpy(), time))
 
     arrays = [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)]
     arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
@@ -332,6 +332,10 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     def column(name: str) -> Tensor:
         return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
 
+    def per_gesture(name: str) -> Tensor:
+        values = np.array(table[name].cast(pa.float32()).to_numpy())  # null becomes NaN
+        return torch.from_numpy(values).view(batch, time)[:, 0].clone()
+
     def columns(name: str) -> Tensor:
         return torch.stack([column(column_name) for column_name in numbered(name, sensors)], dim=-1)
 
@@ -344,7 +348,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         columns("reading"),
         torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),
         torch.tensor(about["positions"], dtype=torch.float32),
-        torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
+        torch.stack([per_gesture(name) for name in task.names], dim=1) if about["labelled"] else None,
         about["rate"],
         saturated=columns("saturated") > 0.5 if about["saturated"] else None,
         contacts=torch.stack(contacts, dim=-1).unflatten(-1, (-1, len(CONTACT))) if contacts else None,
@@ -356,7 +360,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         tuple(about["footprint"]),
         column("force") if about["force"] else None,
         torch.stack([columns("D_s"), columns("D_t")], dim=-1) if about["displacement"] else None,
-        {name: column(f"gesture_{name}")[:, 0] for name in about["parameters"]},
+        {name: per_gesture(f"gesture_{name}") for name in about["parameters"]},
         about["metadata"],
     )
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -49,6 +50,7 @@ class Report:
         reached: the alarms on the gestures of ``same``; None without ``point``.
         outcomes: of the gestures of ``same`` (:func:`skin.evaluation.metrics.encode`); None where the labels
             have none.
+        split: in words, what training and test keep apart.
     """
 
     metrics: dict[str, float]
@@ -58,6 +60,7 @@ class Report:
     point: OperatingPoint | None = None
     reached: Reached | None = None
     outcomes: np.ndarray | None = None
+    split: str = ""
 
 
 def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
@@ -100,7 +103,8 @@ def evaluate(
     table = count_confusions(chances, same.known_labels, task) if task.kind == "binary" else None
     reached = None if point is None else point.reached(chances, same.known_labels, task)
     outcomes = encode(chances, same.known_labels, task, point)
-    return Report(metrics, cannot, table, _predictions(chances, same, task, drawn), point, reached, outcomes)
+    predictions = _predictions(chances, same, task, drawn)
+    return Report(metrics, cannot, table, predictions, point, reached, outcomes, device.split)
 
 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
@@ -163,10 +167,11 @@ def _add_prefix(column: str, values: dict[str, float]) -> dict[str, float]:
 
 
 def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
-    columns: dict[str, np.ndarray] = {}
+    columns: dict[str, Any] = {}
     for name, label, chance in zip(task.names, touches.known_labels.T, chances.T, strict=True):
-        truth = label.to(torch.int8) if name in task.binary else label
-        columns |= {name: truth.numpy(), f"p_{name}": chance.numpy()}
+        kind = pa.int8() if name in task.binary else pa.float32()
+        truth = pa.array(label.numpy(), kind, mask=label.isnan().numpy(), safe=False)  # null where unknown
+        columns |= {name: truth, f"p_{name}": chance.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)
 
@@ -181,6 +186,8 @@ def print_report(report: Report, title: str, console: Console | None = None) -> 
     """
     console = console or Console()
     console.print(metrics_table(report.metrics, title))
+    if report.split:
+        console.print(f"split: {report.split}", markup=False, highlight=False, soft_wrap=True)
     if report.point is not None and report.reached is not None:
         sentence = f"{report.point.sentence()}; {report.reached.sentence()}"
         console.print(sentence, markup=False, highlight=False, soft_wrap=True)
@@ -224,7 +231,8 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
         about: a sentence on where the touches came from.
     """
     (_, *columns), *rows = metric_rows(report.metrics, "°")
-    lines = [f"# {title}", "", about, "", "Per cent:", "", f"| | {' | '.join(columns)} |"]
+    lines = [f"# {title}", "", about, "", *([f"Split {report.split}.", ""] if report.split else [])]
+    lines += ["Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
     lines += [f"| {' | '.join(row)} |" for row in rows]
     if report.point is not None and report.reached is not None:

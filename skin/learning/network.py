@@ -109,14 +109,16 @@ class TouchClassifier(LightningModule):
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         """Return the mean loss of logits (B, L) given labels (B, L), 0 or 1, or the cosines of a direction.
 
-        Where the task has a gate (report, 4.2) or a direction, the mean is over the labels that are
-        defined: without touch, only the gate itself has a loss and a gradient.
+        The mean is over the labels that are known and, where the task has a gate (report, 4.2) or a
+        direction, defined: without touch, only the gate itself has a loss and a gradient.
         """
-        if self.task.kind == "exclusive":
-            return F.cross_entropy(logits, labels)
-        if self.task.gate is None and not self.task.direction:
-            return F.binary_cross_entropy_with_logits(logits, labels)
         counts = self.task.counts(labels)
+        if not counts.any():
+            return 0.0 * logits.sum()
+        if self.task.kind == "exclusive":
+            return F.cross_entropy(logits[counts[:, 0]], labels[counts[:, 0]])
+        if counts.all():
+            return F.binary_cross_entropy_with_logits(logits, self.task.shares(labels))
         return F.binary_cross_entropy_with_logits(logits[counts], self.task.shares(labels)[counts])
 
     def _step(self, batch: "Batch", stage: str) -> Tensor:
@@ -136,9 +138,10 @@ class TouchClassifier(LightningModule):
             self.log(f"{stage}_{name}", mean, sync_dist=True)  # the mean over processes that train together
 
     def _accuracy(self, logits: Tensor, labels: Tensor) -> dict[str, Tensor]:
-        if self.task.kind == "exclusive":
-            return {"accuracy": (logits.argmax(dim=-1) == labels.argmax(dim=-1)).float().mean()}
         counts = self.task.counts(labels)
+        if self.task.kind == "exclusive":
+            right = (logits.argmax(dim=-1) == labels.argmax(dim=-1)) & counts[:, 0]
+            return {"accuracy": right.sum() / counts[:, 0].sum().clamp(min=1)}
         right = ((logits > 0) == (labels > 0.5)) & counts
         shares = right.sum(dim=0) / counts.sum(dim=0).clamp(min=1)
         label_shares = dict(zip(self.task.binary, shares, strict=False))

@@ -9,9 +9,10 @@ import platform
 import re
 import socket
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from keyword import iskeyword
 from math import isnan
 from pathlib import Path
 from typing import Any, cast
@@ -191,6 +192,8 @@ class Config:
     shape: str | None = None
     index: int | None = None
     session: str | None = None
+    from_: str | None = None  # a Python keyword: from= on the command line
+    path: str | None = None
     presses: str | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
@@ -255,7 +258,7 @@ def validate_config(config: Any) -> Config:
         InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
-        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+        whole = OmegaConf.merge(OmegaConf.structured(Config), _without_keywords(config))
         # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
         for path, value in walk_settings(OmegaConf.to_container(whole)):
             unfit = isinstance(value, int) and abs(value) >= _TOO_LARGE
@@ -265,6 +268,14 @@ def validate_config(config: Any) -> Config:
         return cast(Config, OmegaConf.to_object(whole))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
+
+
+def _without_keywords(config: Any) -> Any:
+    """Return a configuration whose keys are names in Python, as ``from_`` is for ``from``."""
+    if not isinstance(config, Mapping) or not any(iskeyword(str(name)) for name in config):
+        return config
+    plain: Any = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
+    return {f"{name}_" if iskeyword(str(name)) else name: value for name, value in plain.items()}
 
 
 def refuse_null_groups(config: DictConfig) -> None:

@@ -102,6 +102,10 @@ class AnnouncementListener:
         self.announcements.extend(filter(None, map(parse_announcement, lines)))
         return data
 
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._stream.write(data)
+
     def close(self) -> None:
         """Close the stream."""
         self._stream.close()

@@ -203,6 +203,7 @@ class Config:
     presses: str | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
+    adapter: str | None = None
     link: str | None = None
     seconds: float | None = None
     web: bool | None = None

@@ -170,17 +170,13 @@ class Adapter:
         import yaml
 
         settings = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        changed = {
-            entry.name: settings[entry.name]
-            for entry in fields(self)
-            if settings[entry.name] != entry.default
-        }
-        plain = {"kind": self.kind} | {
-            name: list(value) if isinstance(value, tuple) else value for name, value in changed.items()
-        }
-        return yaml.safe_dump(
-            plain, sort_keys=False, default_flow_style=None, width=10_000, allow_unicode=True
-        )
+        changed = [entry.name for entry in fields(self) if settings[entry.name] != entry.default]
+        lines = []
+        for name in dict.fromkeys(["kind", *changed]):
+            value = list(settings[name]) if isinstance(settings[name], tuple) else settings[name]
+            text = yaml.safe_dump(value, sort_keys=False, default_flow_style=True, width=10_000)
+            lines.append(f"{name}: {text.replace('...', '').strip()}")
+        return "\n".join(lines)
 
     def may_end(self, data: bytes) -> bool:
         """Return whether a frame may end in ``data``."""

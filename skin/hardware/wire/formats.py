@@ -157,7 +157,7 @@ class RowsFormat:
     name: ClassVar[str] = "rows"
 
     def __init__(self, line: TextFormat, rows: int, index: int | None, first: int) -> None:
-        self._line, self._rows, self._index, self._first = line, rows, index, first
+        self._line, self.rows, self._index, self._first = line, rows, index, first
         self._partial: list[Line] = []
         self._open, self._told = False, True
         self.sensors, self.check = rows * line.sensors, line.check
@@ -189,7 +189,7 @@ class RowsFormat:
         self._partial.append(row)
         if broken:
             raise FrameError("rows")
-        if len(self._partial) < self._rows:
+        if len(self._partial) < self.rows:
             return b""
         self._open = self._told = False
         return self._join()

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,8 +38,7 @@ from skin.hardware.wire.lines import (
 )
 from skin.hardware.wire.protocol import INVALID, Format, Line, parse_header
 
-_RUN = 12  # lines alike that show a format: that noise rises as often by chance is improbable
-_FRAMES = 3  # frames of several rows or of a fixed length that do
+_RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 _MOST_REPEATS = 256
 _ORDERLY = 0.9  # share of the lines whose index is one more than that before
 _NUMBER = rb"[-+.\d ]"
@@ -263,20 +263,18 @@ class Adapter:
         width = counts.most_common(1)[0][0]
         reads = [read if read and len(read.fields) == width else None for read in reads]
         rows = [read.fields for read in reads if read]
-        index, first, count = _find_index(rows, reader.names(width), self.index), 0, 0
+        index, first = _find_index(rows, reader.names(width), self.index), 0
         if index is not None:
             numbers = [row[index] for row in rows]
             first, count = int(min(numbers)), int(max(numbers) - min(numbers)) + 1
+            starts = [row for row in rows if row[index] == first]
         else:
-            runs = [len(run) for run in "".join("x" if read else " " for read in reads).split()[1:-1]]
-            count = Counter(runs).most_common(1)[0][0] if runs else 0
-        count = self.rows or count
-        if count < 1 or len(rows) < (_FRAMES + 1) * count:
+            blocks = [list(block) for filled, block in groupby(reads, bool) if filled][1:-1]
+            count = Counter(map(len, blocks)).most_common(1)[0][0] if blocks else 0
+            starts = [block[0].fields for block in blocks if block[0] and len(block) == count]
+        if count < 1 or len(starts) < _RUN or self.rows not in (None, 0, count):
             return Detection()
-        described = replace(self, drop=(*self.drop, *([index] if index is not None else ())))
-        starts = [row for row in rows if index is None or row[index] == first][
-            :: count if index is None else 1
-        ]
+        described = replace(self, drop=(*self.drop, *([] if index is None else [index])))
         columns = find_roles(np.array(starts), reader.names(width), None, described)
         if isinstance(columns, int):
             return Detection(count_seen=columns)
@@ -293,7 +291,7 @@ class Adapter:
             size = repeat * self._record.itemsize
             length = len(head) + size + len(tail)
             pattern = re.escape(head) + b".{%d}" % size + re.escape(tail)
-            match = re.search(b"(?:" + pattern + b"){%d}" % _FRAMES, data, re.DOTALL)
+            match = re.search(b"(?:" + pattern + b"){%d}" % _RUN, data, re.DOTALL)
             if not match:
                 continue
             parse = _struct_parser(self._record, repeat, len(head))
@@ -318,13 +316,13 @@ class Adapter:
         if odd or width < 1 or count < 2:
             return Detection()
         pattern = re.escape(separator).join([_NUMBER + b"{%d}" % width] * count)
-        match = re.search(b"(?:" + pattern + b"){%d}" % _FRAMES, data)
+        match = re.search(b"(?:" + pattern + b"){%d}" % _RUN, data)
         if not match:
             return Detection()
         cut = range(match.start(), match.end(), length)
         reads = [_try(split, data[place : place + length]) for place in cut]
         table = np.array([read.fields for read in reads if read])
-        columns = find_roles(table, (), sensors, self) if len(table) == _FRAMES else 0
+        columns = find_roles(table, (), sensors, self) if len(table) == _RUN else 0
         if isinstance(columns, int):
             return Detection(count_seen=columns or None)
         follow = _NUMBER + b"{%d}" % width + re.escape(separator)

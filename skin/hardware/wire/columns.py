@@ -119,8 +119,8 @@ def runs(column: np.ndarray) -> bool:
 
 def _recognise(table: np.ndarray, names: Sequence[str], free: Sequence[int], behaves, pattern) -> int | None:  # type: ignore[no-untyped-def]
     """Return the field that behaves as a counter or a clock: with its name, or before the values."""
-    named = [place for place in free if names and pattern.fullmatch(names[place])]
-    leading = [place for place in free if place < _LEADING and not names]
+    named = [place for place in free if names and pattern.fullmatch(names[place].rpartition(".")[2])]
+    leading = [place for place in free if place < _LEADING and (not names or names[place].isdigit())]
     for place in [*named, *leading]:
         if behaves(table[:, place]):
             return place
@@ -137,7 +137,8 @@ def _unit(
         return None, "; ".join(words)
     steps = np.diff(table[:, place])
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    hinted = [unit for unit, pattern in _NAMED_UNITS.items() if names and pattern.fullmatch(names[place])]
+    name = names[place].rpartition(".")[2] if names else ""
+    hinted = [unit for unit, pattern in _NAMED_UNITS.items() if name and pattern.fullmatch(name)]
     unit: str | None = adapter.time_unit
     source = "the adapter"
     if unit is None and hinted:

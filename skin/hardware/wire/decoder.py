@@ -350,6 +350,7 @@ class Stats:
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
+_MANY, _LONG = 65536, 4.0  # the same of an adapter, which may need a dozen frames of many lines
 _PAUSE = 0.2  # s that a silence counts for at most, because a board may take seconds to start
 _PER_FIELD = 12  # bytes
 _SPAN = 2.0  # s over which good frames are compared with bad ones
@@ -447,13 +448,20 @@ class Decoder:
         """
         if self.frame_format is not None and self._unit.error is not None:
             return self._unit.error
-        if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
+        patience = _PATIENCE if self.adapter.kind == "protocol" else _LONG
+        if self.frame_format or (self._receiving < patience and len(self._buffer) < self._enough):
             return None
+        return self.explain()
+
+    def explain(self) -> InputError:
+        """Return why no format was detected so far."""
         return self.adapter.explain(self._buffer, self._count_seen, self.sensors)
 
     @property
     def _enough(self) -> int:
         """Bytes in which the format must show: 4 kB, or four frames."""
+        if self.adapter.kind != "protocol":
+            return _MANY
         return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
 
     def _recognise(self, data: bytes, now: float) -> bool:

@@ -23,7 +23,9 @@ _MOST_ROWS = 64
 _LONGEST = 512  # bytes of a frame without an end
 _SAME = 0.98  # share of the characters that repeat from frame to frame
 _SIZE = 1e-4, 1e7  # of floats that are readings
+_LONGEST_MARK = 8  # bytes
 _MARKED = 0.01  # that a byte of a mark counts against the spread of readings
+_NARROW, _CONSTANT = 0.1, 0.05  # that a counter of 8 bits and a constant channel count for it
 _SINGLE = (0xA5, 0xAA, 0x55, 0xFF, 0xFE, 0x7E, 0x02)
 """Bytes that mark a frame alone."""
 _NUMBER = re.compile(rb"(?<![\w.])(?:\d{1,2}:\d\d:\d\d(?:\.\d+)?|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
@@ -128,7 +130,7 @@ def _candidates(data: bytes) -> Iterator[Adapter]:
     mark = b"\n" if b"\n" in data else b"\r"
     lines = [line.strip(b"\r\n ") for line in data.split(mark)[1:-1]]
     lines = [line for line in lines if line and not line.startswith(b"#")]
-    yield Adapter(kind="json")
+    yield from _named(Adapter(kind="json"), data, lines)
     plain = [Adapter(kind="text", decimal=".")]
     plain += [Adapter(kind="text", decimal=",")]
     labelled = [Adapter(kind="text", label=mark, decimal=sign) for mark in (":", "=") for sign in (".", ",")]
@@ -167,7 +169,7 @@ def _named(adapter: Adapter, data: bytes, lines: Sequence[bytes]) -> Iterator[Ad
         if heads:
             names = tuple(word.decode("ascii", "replace").strip(' "') for word in heads[0])
             adapter = replace(adapter, names=names)
-    aside = tuple(name for name in dict.fromkeys(names) if _ASIDE.fullmatch(name))
+    aside = tuple(name for name in dict.fromkeys(names) if _ASIDE.fullmatch(name.rpartition(".")[2]))
     if aside and len(aside) < len(names):
         yield replace(adapter, drop=aside)
     yield adapter
@@ -280,10 +282,12 @@ def _marks(constant: bytes) -> Iterator[tuple[int, str, bytes]]:
         if constant.endswith(ending):
             yield len(constant) - len(ending), "tail", ending
             return
-    for size in range(len(constant), 0, -1):
-        mark = constant[:size]
-        if mark[-1] and (size > 1 or mark[0] in _SINGLE):
-            yield 0, "head", mark
+    # Constant bytes of the values may stand beside the mark.
+    for skip in range(min(len(constant), _LONGEST_MARK)):
+        for size in range(1, min(len(constant) - skip, _LONGEST_MARK) + 1):
+            mark = constant[skip : skip + size]
+            if mark[-1] and (size > 1 or mark[0] in _SINGLE):
+                yield skip, "head", mark
 
 
 def _longest(constant: np.ndarray) -> tuple[int, int]:
@@ -313,9 +317,11 @@ def _structs(frames: np.ndarray) -> Iterator[tuple[float, dict[str, str], tuple[
             if left <= 0 or left % item.itemsize:
                 continue
             body = np.ascontiguousarray(frames[:, used : used + left])
-            values = body.view(item).astype(np.float64)
+            with np.errstate(invalid="ignore"):
+                values = body.view(item).astype(np.float64)
             struct = head | {"force": f"({values.shape[1]},){kind}"} | end
-            yield _spread(values, item) - len(head), struct, drop
+            narrow = _NARROW * ("u1" in head.values()) + _CONSTANT * np.sum(np.ptp(values, axis=0) == 0)
+            yield _spread(values, item) + narrow - len(head), struct, drop
 
 
 _HEADERS = tuple(
@@ -349,10 +355,11 @@ def _headers(frames: np.ndarray) -> Iterator[dict[str, str]]:
 
 def _spread(values: np.ndarray, item: np.dtype) -> float:
     """Return how unlikely values (F, S) of a type are readings, 0 to 2: these keep to a part of the range."""
+    turned = 0.03 * (item.str[0] == ">")
     if item.kind == "f":
         size = np.abs(values[values != 0])
         sound = np.isfinite(values).all() and bool(((size >= _SIZE[0]) & (size <= _SIZE[1])).all())
-        return 0.0 if sound else 2.0
+        return turned if sound else 2.0
     low, high = np.percentile(values, [5, 95], axis=0)
     wide = float(np.max((high - low) / 256**item.itemsize))
     # Of types that hold the same, the one that needs fewer bytes of zeros per value, and no sign.

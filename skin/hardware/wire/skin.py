@@ -205,6 +205,8 @@ class Skin:
             raise SkinTimeout(f"{message}: {unanswered}", frames)
         if not stats.bytes and not stats.frames:
             raise SkinTimeout(f"{message}: port open, nothing received; is the device sending?", frames)
+        if not stats.frames and self._decoder is not None and self._decoder.adapter.kind != "protocol":
+            raise SkinTimeout(f"{message}: {self._decoder.explain()}", frames)
         if not stats.frames:
             reason = stats.trouble or "no format shows yet; wrong baud rate?"
             raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)

@@ -2,7 +2,7 @@
 
     skin listen device.port=/dev/ttyACM0
     skin listen device.port=/dev/ttyACM0 adapter=auto > board.yaml
-    skin listen device.port=/dev/ttyACM0 adapter=board.yaml
+    skin listen device.port=/dev/ttyACM0 device.adapter=board.yaml
 
 Listens for seconds=, or until Ctrl-C.
 """
@@ -35,11 +35,12 @@ def main(config: Config) -> None:
     from skin.hardware.wire.skin import PortMonitor, open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if device["adapter"] == "auto":
-        _propose(PortSettings.select({**device, "adapter": "protocol"}), config.seconds)
+    settings = PortSettings.select(device)
+    if settings.frames.kind == "auto":
+        _propose(settings, config.seconds)
         return
     sensors = None if config.n is None else range(config.n)
-    with open_skin(PortSettings.select(device), sensors) as skin:
+    with open_skin(settings, sensors) as skin:
         listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):

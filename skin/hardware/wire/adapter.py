@@ -20,7 +20,7 @@ from skin.device.resampling import FrameError
 from skin.errors import InputError
 from skin.hardware.wire.columns import find_roles, resolve
 from skin.hardware.wire.formats import (
-    Detection,
+    DetectedFormat,
     FixedFormat,
     RowsFormat,
     TextFormat,
@@ -49,7 +49,8 @@ class Adapter:
     """What a board sends, and what it must be told.
 
     Attributes:
-        kind: ``protocol`` (ours, docs/hardware.md), ``text``, ``json`` (one value per line) or ``binary``.
+        kind: ``protocol`` (ours, docs/hardware.md), ``text``, ``json`` (one value per line), ``binary``, or
+            ``auto``: to be proposed by ``skin listen``.
         format: of our protocol: ``auto``, ``text`` or ``binary``.
         separator: text between fields; None: comma, semicolon, tab or blanks.
         decimal: ``.`` or ``,``.
@@ -76,7 +77,7 @@ class Adapter:
         stop: text sent at the end.
     """
 
-    kind: Literal["protocol", "text", "json", "binary"] = "protocol"
+    kind: Literal["protocol", "text", "json", "binary", "auto"] = "protocol"
     format: Format = "auto"
     separator: str | None = None
     decimal: Literal[".", ","] = "."
@@ -187,7 +188,7 @@ class Adapter:
     def _delimiter(self, data: bytes) -> bytes:
         return self.end.encode() if self.end else b"\n" if b"\n" in data else b"\r"
 
-    def detect(self, data: bytes, sensors: int | None) -> Detection:
+    def detect(self, data: bytes, sensors: int | None) -> DetectedFormat:
         """Return the format of the first bytes of a connection.
 
         Args:
@@ -219,7 +220,7 @@ class Adapter:
         """Return the complete lines; the first may be half of one."""
         return [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
 
-    def _detect_lines(self, data: bytes, sensors: int | None) -> Detection:
+    def _detect_lines(self, data: bytes, sensors: int | None) -> DetectedFormat:
         lines, header, count_seen = self._lines(data), None, None
         for line in lines:
             header = parse_header(line) or header if line.startswith(b"#") else header
@@ -250,16 +251,18 @@ class Adapter:
                 reader.padded,
                 self.kind,
             )
-            return Detection(layout, None, header, columns.unit, self.time_unit is not None, columns.summary)
-        return Detection(count_seen=count_seen, header=header)
+            return DetectedFormat(
+                layout, None, header, columns.unit, self.time_unit is not None, columns.summary
+            )
+        return DetectedFormat(count_seen=count_seen, header=header)
 
-    def _detect_rows(self, data: bytes, sensors: int | None) -> Detection:
+    def _detect_rows(self, data: bytes, sensors: int | None) -> DetectedFormat:
         lines = self._lines(data)
         reader = self._reader([line for line in lines if line and not line.startswith(b"#")])
         reads = [None if line.startswith(b"#") or not line else _try(reader, line) for line in lines]
         counts = Counter(len(read.fields) for read in reads if read)
         if not counts:
-            return Detection()
+            return DetectedFormat()
         width = counts.most_common(1)[0][0]
         reads = [read if read and len(read.fields) == width else None for read in reads]
         rows = [read.fields for read in reads if read]
@@ -273,19 +276,19 @@ class Adapter:
             count = Counter(map(len, blocks)).most_common(1)[0][0] if blocks else 0
             starts = [block[0].fields for block in blocks if block[0] and len(block) == count]
         if count < 1 or len(starts) < _RUN or self.rows not in (None, 0, count):
-            return Detection()
+            return DetectedFormat()
         described = replace(self, drop=(*self.drop, *([] if index is None else [index])))
         columns = find_roles(np.array(starts), reader.names(width), None, described)
         if isinstance(columns, int):
-            return Detection(count_seen=columns)
+            return DetectedFormat(count_seen=columns)
         total = count * len(columns.roles.values)
         if sensors not in (None, total):
-            return Detection(count_seen=total)
+            return DetectedFormat(count_seen=total)
         line = TextFormat(columns.roles, "none", reader.trailing, reader, self._delimiter(data), False)
         layout = RowsFormat(line, count, index, first)
-        return Detection(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
+        return DetectedFormat(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
 
-    def _detect_struct(self, data: bytes, sensors: int | None) -> Detection:
+    def _detect_struct(self, data: bytes, sensors: int | None) -> DetectedFormat:
         head, tail, seen = self._mark(self.head), self._mark(self.tail), None
         for repeat in [self.repeat] if self.repeat else range(1, _MOST_REPEATS):
             size = repeat * self._record.itemsize
@@ -305,31 +308,33 @@ class Adapter:
             layout = FixedFormat(
                 columns.roles, parse, length, re.compile(pattern, re.DOTALL), follow, 0 if tail else len(head)
             )
-            return Detection(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
-        return Detection(count_seen=seen)
+            return DetectedFormat(
+                layout, None, None, columns.unit, self.time_unit is not None, columns.summary
+            )
+        return DetectedFormat(count_seen=seen)
 
-    def _detect_endless(self, data: bytes, sensors: int | None, length: int) -> Detection:
+    def _detect_endless(self, data: bytes, sensors: int | None, length: int) -> DetectedFormat:
         split = SeparatedReader.learn([data], self.separator, self.decimal, self._words, self.names)
         separator = split.separator or b" "
         count = data[:length].count(separator) + 1
         width, odd = divmod(length - (count - 1) * len(separator), count)
         if odd or width < 1 or count < 2:
-            return Detection()
+            return DetectedFormat()
         pattern = re.escape(separator).join([_NUMBER + b"{%d}" % width] * count)
         match = re.search(b"(?:" + pattern + b"){%d}" % _RUN, data)
         if not match:
-            return Detection()
+            return DetectedFormat()
         cut = range(match.start(), match.end(), length)
         reads = [_try(split, data[place : place + length]) for place in cut]
         table = np.array([read.fields for read in reads if read])
         columns = find_roles(table, (), sensors, self) if len(table) == _RUN else 0
         if isinstance(columns, int):
-            return Detection(count_seen=columns or None)
+            return DetectedFormat(count_seen=columns or None)
         follow = _NUMBER + b"{%d}" % width + re.escape(separator)
         layout = FixedFormat(
             columns.roles, split, length, re.compile(pattern), follow, width + len(separator), "text"
         )
-        return Detection(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
+        return DetectedFormat(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
 
     def explain(self, data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
         """Return the error for data in which no frame was found."""

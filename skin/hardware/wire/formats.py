@@ -293,7 +293,7 @@ class BinaryFormat:
         return frame
 
 
-class Detection(NamedTuple):
+class DetectedFormat(NamedTuple):
     """What the first bytes of a connection show.
 
     Attributes:
@@ -325,7 +325,7 @@ def protocol_roles(sensors: int, counted: bool) -> Roles:
     return Roles(sensors + 2, tuple(range(2, sensors + 2)), 0, 1)
 
 
-def detect_format(data: bytes, sensors: int | None, format: Format) -> Detection:
+def detect_format(data: bytes, sensors: int | None, format: Format) -> DetectedFormat:
     """Return the format of the first bytes of a connection, in our protocol.
 
     Args:
@@ -341,10 +341,10 @@ def detect_format(data: bytes, sensors: int | None, format: Format) -> Detection
                 counts.append(len(decode_frame(piece).values))
         for count in counts:
             if counts.count(count) >= _FRAMES and sensors in (None, count):
-                return Detection(BinaryFormat(count))
+                return DetectedFormat(BinaryFormat(count))
             count_seen = count
     if format == "binary":
-        return Detection(count_seen=count_seen)
+        return DetectedFormat(count_seen=count_seen)
     return _detect_text(data, sensors, count_seen)
 
 
@@ -399,7 +399,7 @@ def _has_constant_time(run: Sequence[Line]) -> bool:
     return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
 
 
-def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> Detection:
+def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> DetectedFormat:
     header, run = None, list[Line]()
     for piece in data.split(b"\n")[:-1]:
         line = piece.removesuffix(b"\r")
@@ -414,10 +414,10 @@ def _detect_text(data: bytes, sensors: int | None, count_seen: int | None) -> De
         run = [*run[1 - _LINES_UNKNOWN :], read]
         expected = sensors or (header.n if header else None)
         if frame_format := _judge(run, expected, learn=sensors is None):
-            return Detection(replace(frame_format, trailing=ends_with_separator(line)), None, header)
+            return DetectedFormat(replace(frame_format, trailing=ends_with_separator(line)), None, header)
         if len(run) >= _LINES:
             count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
-    return Detection(None, count_seen, header)
+    return DetectedFormat(None, count_seen, header)
 
 
 def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:

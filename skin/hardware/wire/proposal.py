@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from skin.device.resampling import Frame
 from skin.errors import InputError
 from skin.hardware.wire.adapter import Adapter
 from skin.hardware.wire.columns import counts, runs
@@ -99,22 +100,24 @@ def _is_text(data: bytes) -> bool:
 
 def _try(adapter: Adapter, pieces: Sequence[tuple[float, bytes]]) -> Proposal | None:
     """Return a proposal if an adapter reads nearly all of a stream."""
-    decoder, frames = Decoder(adapter=adapter), 0
+    decoder, frames = Decoder(adapter=adapter), list[Frame]()
     try:
         for now, data in pieces:
-            frames += len(decoder.feed(data, now))
+            frames += decoder.feed(data, now)
         if decoder.frame_format is None or decoder.error() is not None:
             return None
     except InputError:
         return None
-    if frames < _FRAMES or frames < _SHARE * (frames + decoder.stats.bad_frames):
+    if len(frames) < max(_FRAMES, _SHARE * (len(frames) + decoder.stats.bad_frames)):
         return None
     if adapter.kind == "protocol" and decoder.stats.check == "none" and decoder.header is None:
         return None
-    passed = pieces[-1][0] - pieces[0][0]
-    rate = f" at {frames / passed:.3g} Hz" if passed > 0 else ""
+    passed = frames[-1].t_host - frames[0].t_host
+    rate = f" at {(len(frames) - 1) / passed:.3g} Hz" if passed > 0 else ""
     detected = adapter.detect(b"".join(data for _, data in pieces), None)
-    words = [f"{decoder.sensors} values{rate}", detected.summary, decoder.stats.clock]
+    middle = np.median([frame.values for frame in frames], axis=0)[:_MOST_ROWS]
+    levels = ", ".join(f"{value:.4g}" for value in middle)
+    words = [f"{decoder.sensors} values{rate}", detected.summary, decoder.stats.clock, f"medians {levels}"]
     summary = "; ".join(word for word in words if word)
     return Proposal(adapter, summary, decoder.sensors or 0)
 

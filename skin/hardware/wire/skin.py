@@ -328,6 +328,8 @@ def open_skin(
         return play(device.strips(), baseline, queue, realtime, about)
     if opener is None and address.endswith((".parquet", ".csv")):
         return play([_read_touches(address, sensors)], baseline, queue, realtime, about)
+    if about.frames.kind == "auto":
+        raise InputError("skin listen adapter=auto proposes an adapter: give device.adapter=FILE.yaml of it")
     decoder = Decoder(sensors, channels=channels, polarity=polarity, adapter=about.frames)
     watched = reconnect and address.startswith("socket://")
     opener = opener or partial(open_stream, address, about.baudrate)

@@ -18,10 +18,11 @@ from skin.core.safe_loading import load_yaml
 from skin.core.settings import check_settings
 from skin.device.resampling import FrameError
 from skin.errors import InputError
-from skin.hardware.wire.columns import find_roles, resolve
+from skin.hardware.wire.columns import Columns, find_roles, resolve
 from skin.hardware.wire.formats import (
     DetectedFormat,
     FixedFormat,
+    FrameFormat,
     RowsFormat,
     TextFormat,
     detect_format,
@@ -36,7 +37,7 @@ from skin.hardware.wire.lines import (
     PatternReader,
     SeparatedReader,
 )
-from skin.hardware.wire.protocol import INVALID, Format, Line, parse_header
+from skin.hardware.wire.protocol import INVALID, Format, Header, Line, parse_header
 
 _RUN = 12  # frames alike that show a format: that noise rises as often by chance is improbable
 _MOST_REPEATS = 256
@@ -220,6 +221,13 @@ class Adapter:
         """Return the complete lines; the first may be half of one."""
         return [line.strip(b"\r\n") for line in data.split(self._delimiter(data))[:-1]][1:]
 
+    def _detected(
+        self, layout: FrameFormat, columns: Columns, header: Header | None = None
+    ) -> DetectedFormat:
+        """Return a format with what its columns show of the clock."""
+        fixed = self.time_unit is not None
+        return DetectedFormat(layout, None, header, columns.unit, fixed, columns.summary)
+
     def _detect_lines(self, data: bytes, sensors: int | None) -> DetectedFormat:
         lines, header, count_seen = self._lines(data), None, None
         for line in lines:
@@ -286,7 +294,7 @@ class Adapter:
             return DetectedFormat(count_seen=total)
         line = TextFormat(columns.roles, "none", reader.trailing, reader, self._delimiter(data), False)
         layout = RowsFormat(line, count, index, first)
-        return DetectedFormat(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
+        return self._detected(layout, columns)
 
     def _detect_struct(self, data: bytes, sensors: int | None) -> DetectedFormat:
         head, tail, seen = self._mark(self.head), self._mark(self.tail), None
@@ -308,9 +316,7 @@ class Adapter:
             layout = FixedFormat(
                 columns.roles, parse, length, re.compile(pattern, re.DOTALL), follow, 0 if tail else len(head)
             )
-            return DetectedFormat(
-                layout, None, None, columns.unit, self.time_unit is not None, columns.summary
-            )
+            return self._detected(layout, columns)
         return DetectedFormat(count_seen=seen)
 
     def _detect_endless(self, data: bytes, sensors: int | None, length: int) -> DetectedFormat:
@@ -334,7 +340,7 @@ class Adapter:
         layout = FixedFormat(
             columns.roles, split, length, re.compile(pattern), follow, width + len(separator), "text"
         )
-        return DetectedFormat(layout, None, None, columns.unit, self.time_unit is not None, columns.summary)
+        return self._detected(layout, columns)
 
     def explain(self, data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
         """Return the error for data in which no frame was found."""

@@ -423,7 +423,8 @@ def _find_index(rows: Sequence[Sequence[float]], names: Sequence[str], field: in
             continue
         first, last, steps = numbers.min(), numbers.max(), np.diff(numbers)
         if (
-            last > first >= 0
+            last > first
+            and 0 <= first <= 1
             and np.mean((steps == 1) | ((numbers[:-1] == last) & (numbers[1:] == first))) > 0.9
         ):
             return column

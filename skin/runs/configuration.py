@@ -197,6 +197,7 @@ class Config:
     presses: str | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
+    adapter: dict[str, Any] = field(default_factory=dict)
     link: str | None = None
     seconds: float | None = None
     web: bool | None = None

@@ -109,6 +109,10 @@ class AnnouncementListener:
         self.contacts.extend(filter(None, map(parse_contact_line, lines)))
         return data
 
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._stream.write(data)
+
     def close(self) -> None:
         """Close the stream."""
         self._stream.close()

@@ -400,7 +400,7 @@ def emulate_session(
     true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
     measured = device.imperfection.raw(
         torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
-    )[0].numpy()
+    )[0].numpy() * device.imperfection.signs(true.shape[1])
     values = Converter(bits, device.imperfection.clip)(measured)
     return BenchSession(time, values, "N" if bits is None else "adc", gauge, bits)
 

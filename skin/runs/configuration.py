@@ -201,6 +201,9 @@ class Config:
     index: int | None = None
     session: str | None = None
     presses: str | None = None
+    weight: float | None = None
+    base: float | None = None
+    board: float | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
     link: str | None = None

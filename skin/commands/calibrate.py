@@ -19,6 +19,7 @@ from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
 
+_UNITS = ("force_scale", "time_scale")
 _LOADS = ("weight", "base", "board")
 _CONFIRMED = ("places", "channels", "broken")
 
@@ -42,7 +43,7 @@ def _calibrate_by_load(config: Config, path: str) -> None:
     """Calibrate from placements of a weight or a board."""
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
-    from skin.hardware.bench import read_bench_session, write_bench_session
+    from skin.hardware.bench import Units, read_bench_session, write_bench_session
     from skin.hardware.known_loads import KnownLoad, emulate_known_load, fit_known_load, print_known_load
     from skin.hardware.wiring import Confirmed, device_channels
     from skin.runs.build import build_device
@@ -57,7 +58,9 @@ def _calibrate_by_load(config: Config, path: str) -> None:
     if settings["demo"]:
         session = emulate_known_load(device, load, settings)
         print(f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s")
-    session = read_bench_session(path, settings["indenter"], settings["radius"], settings["unit"])
+    units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
+    shape = settings["indenter"], settings["radius"]
+    session = read_bench_session(path, *shape, settings["unit"], units)
     result = fit_known_load(device, confirmed.ordered(session), load)
     print_known_load(result)
     about = dict(result.calibration.about) | {"session": path}
@@ -71,8 +74,9 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
 
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
-    from skin.hardware.bench import read_bench_session, read_gauge, write_demo_session
+    from skin.hardware.bench import Units, read_bench_session, read_gauge, write_demo_session
     from skin.hardware.calibration import (
+        check_force,
         evaluate_held_out,
         fit_calibration,
         print_calibration,
@@ -86,12 +90,15 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
     if settings["demo"]:
         print(write_demo_session(device, settings, path))
     shape = settings["indenter"], settings["radius"]
-    session = read_bench_session(path, *shape, settings["unit"])
-    rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"])
+    units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
+    session = read_bench_session(path, *shape, settings["unit"], units)
+    rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"], units)
     with Console(stderr=True).status("fitting"):
         bench = wired_bench(device, session, rows, confirmed)
         calibration = fit_calibration(bench)
         check_usable(calibration)
+        if units.force_scale is None:
+            check_force(calibration, device.imperfection.clip)
         outcome = evaluate_held_out(bench, settings["held_out"])
     print_calibration(calibration, outcome)
     if not outcome.helps:

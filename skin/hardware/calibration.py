@@ -37,6 +37,7 @@ _CLIPPED = 0.95  # of the limit: a reading above may be cut off
 _TOO_FAR = 0.25  # error of a held-out force; positions off by 2 mm cause less
 _NEAR = 0.2  # of the strongest press's reading: presses that show the shape of a response
 _WEAK = 0.05  # of the median gain: such a channel has 20 times the noise of others
+_GAUGES, _LIKE = {"kg": 9.80665, "g": 0.00980665}, 1.5  # N; factor within which a unit explains
 _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 
@@ -473,6 +474,37 @@ def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Cali
         shares.append(estimate_force(raw[mine], bench.each[number], calibration) / late_force[mine])
     finite = [ratios[np.isfinite(ratios)] for ratios in shares]
     return np.array([np.median(ratios) for ratios in finite if len(ratios)])
+
+
+def check_force(calibration: Calibration, clip: float) -> None:
+    """Compare the unit of the gauge with what this skin can give.
+
+    Args:
+        calibration: fitted to the gauge.
+        clip: largest force that a sensor of this skin measures, N.
+
+    Raises:
+        InputError: gains of sensors in N, or limits of sensors in counts, are those of a gauge in another
+            unit.
+    """
+    if calibration.about.get("unit") == "N":
+        ratio = float(np.median([gain for gain in calibration.sensors["gain"] if gain is not None]))
+        words = f"the readings, in N, are {ratio:.3g} times what the gauge's force makes of them"
+    else:
+        limits = np.array([np.nan if value is None else value for value in calibration.sensors["clip"]])
+        if not np.isfinite(limits).any():
+            return
+        if calibration.curves is not None:
+            limits = calibration.curves.straighten(limits)
+        limit = float(np.nanmedian(limits))
+        ratio = clip / limit
+        words = f"sensors reach their limit at {limit:.3g} N, and device.clip is {clip:g} N"
+    fits = [name for name, unit in _GAUGES.items() if abs(math.log(ratio / unit)) < math.log(_LIKE)]
+    if fits:
+        raise InputError(
+            f"{words}: the force of the gauge seems to be in {fits[0]}; add "
+            f"calibrate.force_scale={_GAUGES[fits[0]]:g}, or calibrate.force_scale=1 if it is in N"
+        )
 
 
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:

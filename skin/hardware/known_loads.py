@@ -29,6 +29,7 @@ _SPREAD = 0.35  # of gains and model together, in assigning placements to sensor
 _FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
 _TILT = 0.25  # standard deviation of the tilt of a board's pressure, share from the middle to an edge
 _UNEVEN = 0.1  # of the pressure of foam, share
+_RELIEVED = 0.5  # weight of the inverse of a reading, over that of its median, in its error
 _MISSED = 0.25  # share of the sensors that may have no gain
 
 
@@ -199,14 +200,17 @@ def _fit_board(
     readings = placements.change * _sign(placements)
     shown = np.log(np.maximum(readings[:, alive], 3 * placements.noise[alive]))
     count, sensors = shown.shape
+    # Below the edge that a tilt relieves, the foam may have lost contact.
+    relief = np.median(shown, axis=0) - shown
+    uneven = _UNEVEN * np.hypot(1.0, _RELIEVED * np.exp(relief))
     start = np.r_[(shown - np.log(maps[0, alive])).mean(axis=0), np.zeros(2 * count)]
 
     def misfit(values: np.ndarray) -> np.ndarray:
         tilts = values[sensors:].reshape(count, 2)
         pressed = np.log(np.maximum(maps[0, alive] + tilts @ maps[1:, alive], 0.05 * maps[0, alive]))
-        return np.r_[((shown - values[:sensors] - pressed) / _UNEVEN).ravel(), values[sensors:] / _TILT]
+        return np.r_[((shown - values[:sensors] - pressed) / uneven).ravel(), values[sensors:] / _TILT]
 
-    fit = least_squares(misfit, start)
+    fit = least_squares(misfit, start, loss="soft_l1")
     gains = np.full(len(alive), np.nan)
     gains[alive] = np.exp(fit.x[:sensors]) * _sign(placements)[alive]
     left = _UNEVEN * np.abs(fit.fun[: shown.size]).mean()
@@ -226,10 +230,9 @@ def _build(
     dead = [int(n) for n in np.flatnonzero(~placements.reached)]
     never = [int(n) for n in np.flatnonzero(placements.reached & ~(gains * signs > 0))]
     if len(dead) + len(never) > _MISSED * len(gains):
-        silent = f"; sensors {list_numbers(dead)} did not respond at all" * bool(dead)
-        missing = f"sensors {list_numbers(never)} were never loaded" if never else "too few were loaded"
         raise InputError(
-            f"{missing}{silent}: put the load on every sensor and record again, or check the wiring"
+            f"sensors {list_numbers(sorted(dead + never))} were never loaded, or do not respond: put the "
+            "load on every sensor and record again, or check the wiring"
         )
     idle = placements.idle
     rests = []
@@ -285,7 +288,7 @@ def print_known_load(result: LoadResult) -> None:
     if math.isfinite(result.differ):
         print(f"placements of the same sensor differ by {result.differ:.1%} (median)")
     if dead := calibration.broken["dead"]:
-        print(f"dead or never loaded: sensors {list_numbers(dead)} (from 0) never left their noise")
+        print(f"dead, or never loaded: sensors {list_numbers(dead)} (from 0) never left their noise")
     if result.never:
         print(f"never loaded, so of median gain: sensors {list_numbers(result.never)}")
     if inverse := np.flatnonzero(calibration.signs < 0).tolist():

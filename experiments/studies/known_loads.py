@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from annotated_types import Ge
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from scipy.ndimage import gaussian_filter
 
@@ -34,6 +35,7 @@ from skin.hardware.bench import BenchSession, Protocol
 from skin.hardware.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.solid import Solid
+from skin.plot.figures import COLOURS, save_figure
 from skin.touch.shapes import Shapes
 
 WEIGHT, BOARD = KnownLoad(2.0, 0.02, None), KnownLoad(None, None, 500.0)
@@ -55,6 +57,7 @@ PROCEDURES: Mapping[str, tuple[KnownLoad, int]] = {
 }
 POSITION, MODULUS, UNEVEN, GAINS, NOISE, TILT = 0.002, 0.2, 0.1, 0.3, 0.1, 0.25
 _ALARMED = ("weight once", "board 8")
+_SHOWN, _DRAWN = 45.0, 6  # s and sensors of the figure
 _WAVE = 0.01  # m, over which the pressure changes
 _PROTOCOL = Protocol(idle=10.0, rest=2.0)
 
@@ -218,6 +221,29 @@ def measure_alarms(settings: Settings) -> Iterator[dict[str, Any]]:
         yield {"correction": name, "devices": settings.devices, "touches": settings.touches, **means}
 
 
+def draw_weight() -> Figure:
+    """Draw a session of a weight on a device, and its gains over the true ones."""
+    layers, simulator = SKINS["default, solid"]
+    nominal, device = make_skin(layers, simulator), draw_device(layers, simulator, 0)
+    session = record(device, WEIGHT, 1, 0)
+    calibration = fit_known_load(nominal, session, WEIGHT).calibration
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    trace, scatter = figure.subplots(1, 2, width_ratios=[2, 1])
+    part = session.time < _SHOWN
+    highest = np.nanmax(session.raw[part], axis=0)
+    for number in np.argsort(-highest)[:_DRAWN]:
+        trace.plot(session.time[part], session.raw[part, number], linewidth=0.7, label=f"sensor {number}")
+    trace.set(xlabel="time, s", ylabel="reading, N", title="2 kg put on one sensor after the other")
+    trace.legend(fontsize=8, ncols=2)
+    alive = ~device.constants.dead.numpy()
+    true, estimated = device.constants.gain.numpy()[alive], calibration.known("gain")[alive]
+    ends = [min(true) * 0.9, max(true) * 1.1]
+    scatter.plot(ends, ends, color="grey", linewidth=0.8)
+    scatter.plot(true, estimated, "o", markersize=4, color=COLOURS[0])
+    scatter.set(xlabel="true gain", ylabel="gain from the weight", title="24 working sensors")
+    return figure
+
+
 def write_rows(rows: Iterator[dict[str, Any]], path: Path) -> None:
     """Print rows as they come, and write them as CSV, rounded to two digits."""
     whole = []
@@ -237,6 +263,7 @@ def main(words: list[str]) -> None:
     given = OmegaConf.to_container(OmegaConf.from_dotlist(words))
     settings = configured(Settings, given, "known_loads")  # type: ignore[arg-type]
     folder = Path(settings.out)
+    print(save_figure(draw_weight(), folder / "known_loads.png"))
     write_rows(measure_gains(settings), folder / "known_loads.csv")
     if settings.alarm:
         write_rows(measure_alarms(settings), folder / "known_loads_alarm.csv")

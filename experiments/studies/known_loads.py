@@ -146,7 +146,7 @@ def compare_gains(device: Simulated, calibration: Calibration) -> tuple[np.ndarr
     return ratios[np.isfinite(ratios)], int((~np.isfinite(ratios)).sum())
 
 
-def summarise(skin: str, procedure: str, results: list[tuple[np.ndarray, int]]) -> dict[str, Any]:
+def summarise_gains(skin: str, procedure: str, results: list[tuple[np.ndarray, int]]) -> dict[str, Any]:
     """Return a row: errors over the sensors of all devices, %."""
     ratios = np.concatenate([ratios for ratios, _ in results])
     scales = np.array([np.median(ratios) for ratios, _ in results])
@@ -176,7 +176,7 @@ def measure_gains(settings: Settings) -> Iterator[dict[str, Any]]:
                     compare_gains(device, fit_known_load(nominal, session, load).calibration)
                 )
         for procedure in PROCEDURES:
-            yield summarise(name, procedure, results[procedure])
+            yield summarise_gains(name, procedure, results[procedure])
 
 
 def measure_alarms(settings: Settings) -> Iterator[dict[str, Any]]:

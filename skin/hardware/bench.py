@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,6 +33,9 @@ _log = logging.getLogger("skin.hardware.record")
 GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
 """Columns besides ``time``; the first three are required."""
 _PAUSE = 1.0  # s without a row end a press
+_SLOWEST, _FASTEST = 1.0, 5000.0  # Hz of a bench's files
+_UNITS = {"ms": 1e-3, "microseconds": 1e-6, "minutes": 60.0, "ms in place of microseconds": 1e3}
+"""Units that a time may have by mistake, in s."""
 _OTHER = ("time", "t_us", "seq", *GAUGE)
 
 
@@ -155,7 +158,49 @@ class Gauge:
         return np.where((force > 0)[:, None], values, np.nan)[:, None]
 
 
-def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+@dataclass(frozen=True)
+class Units:
+    """Units of force and time in the files of a bench.
+
+    Attributes:
+        force_scale: N per unit of the gauge, negative where pressing is; None: N.
+        time_scale: s per unit of ``time``; None: s, and a rate that no bench has is refused.
+    """
+
+    force_scale: float | None = None
+    time_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.force_scale == 0 or (self.time_scale is not None and not self.time_scale > 0):
+            raise InputError("calibrate.force_scale must not be 0, and calibrate.time_scale must be above 0")
+
+    def seconds(self, time: np.ndarray, where: str) -> np.ndarray:
+        """Return times (N,) in s.
+
+        Raises:
+            InputError: their steps are those of another unit.
+        """
+        if self.time_scale is not None or len(time) < 3:
+            return time * (1.0 if self.time_scale is None else self.time_scale)
+        step = float(np.median(np.diff(time)))
+        if not step > 0 or _SLOWEST <= 1 / step <= _FASTEST:
+            return time
+        fits = {name: unit for name, unit in _UNITS.items() if _SLOWEST <= 1 / (step * unit) <= _FASTEST}
+        near = sorted(fits, key=lambda name: abs(np.log(100 * step * fits[name])))
+        hint = "check the column time"
+        if near:
+            unit = fits[near[0]]
+            rate = 1 / (step * unit)
+            hint = f"{near[0]} would be {rate:.4g} Hz: add calibrate.time_scale={unit:g}"
+        raise InputError(
+            f"{where}: a row every {step:.4g} s is no rate of a bench "
+            f"({_SLOWEST:g} to {_FASTEST:g} Hz); {hint}"
+        )
+
+
+def read_gauge(
+    path: str | Path, indenter: str, radius: float, delay: float = 0.0, units: Units | None = None
+) -> Gauge:
     """Read a gauge file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
 
     Args:
@@ -163,15 +208,18 @@ def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.
         indenter: of a file without this column.
         radius: m, of a file without this column.
         delay: s, added to the times of the file to match the session's.
+        units: of the file; None: N and s.
 
     Raises:
         InputError: the file is invalid.
     """
     table, _ = load_table(path, "gauge file")
-    return gauge_from_table(table, str(path), indenter, radius, delay)
+    return gauge_from_table(table, str(path), indenter, radius, delay, units or Units())
 
 
-def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+def gauge_from_table(
+    table: pa.Table, where: str, indenter: str, radius: float, delay: float, units: Units
+) -> Gauge:
     """Return a gauge from the complete rows of a table; see :func:`read_gauge`."""
     columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
     for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
@@ -186,9 +234,15 @@ def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, 
     if not rows.any():
         raise InputError(f"{where}: no row has a time, a force and a place")
     complete = {name: values[rows] for name, values in columns.items()}
-    time, force = complete["time"] + delay, complete["force"]
+    time = units.seconds(complete["time"], where) + delay
+    force = complete["force"] * (units.force_scale or 1.0)
     if (np.diff(time) <= 0).any():
         raise InputError(f"{where}: time must grow from row to row, in s")
+    if -force.min() > 2 * force.max():
+        raise InputError(
+            f"{where}: force goes down to {force.min():g}, so pressing seems to be negative: add "
+            f"calibrate.force_scale={-(units.force_scale or 1.0):g}"
+        )
     if force.min() < -0.05 * force.max():
         raise InputError(f"{where}: force must be at least 0 N, got {force.min():g}: zero the gauge")
     place = np.stack([complete["x_m"], complete["y_m"]], axis=1)
@@ -287,7 +341,7 @@ class BenchSession:
 
 
 def read_bench_session(
-    path: str | Path, indenter: str, radius: float, unit: str | None = None
+    path: str | Path, indenter: str, radius: float, unit: str | None = None, units: Units | None = None
 ) -> BenchSession:
     """Read a session.
 
@@ -300,6 +354,7 @@ def read_bench_session(
         indenter: of gauge rows without one.
         radius: m, of gauge rows without one.
         unit: ``N`` or ``adc``; None: the unit in the file, else N.
+        units: of the columns of a gauge, and of ``time``; None: N and s.
 
     Raises:
         InputError: the file is invalid.
@@ -310,12 +365,15 @@ def read_bench_session(
         raise InputError(f"{path}: no column of a sensor beside {', '.join(table.column_names)}")
     in_microseconds = "time" not in table.column_names and "t_us" in table.column_names
     time = numbers(table, "t_us" if in_microseconds else "time", str(path))
-    time = 1e-6 * time if in_microseconds else time
+    units = units or Units()
+    time = units.seconds(1e-6 * time if in_microseconds else time, str(path))
     raw = np.stack([numbers(table, name, str(path)) for name in names], axis=1)
     inside = "force" in table.column_names
-    if inside and in_microseconds:
-        table = table.append_column("time", [time])
-    rows = gauge_from_table(table, str(path), indenter, radius) if inside else None
+    if inside:
+        present = [name for name in table.column_names if name != "time"]
+        table = table.select(present).append_column("time", [time])
+    in_seconds = replace(units, time_scale=1.0)
+    rows = gauge_from_table(table, str(path), indenter, radius, 0.0, in_seconds) if inside else None
     try:
         unit_of_values: Any = unit or about.get("unit", "N")
         return BenchSession(time, raw, unit_of_values, rows, about.get("bits"), about.get("channels"))
@@ -426,7 +484,7 @@ def emulate_session(
     true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
     measured = device.imperfection.raw(
         torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
-    )[0].numpy()
+    )[0].numpy() * device.imperfection.signs(true.shape[1])
     values = Converter(bits, device.imperfection.clip)(measured)
     return BenchSession(time, values, "N" if bits is None else "adc", gauge, bits)
 
@@ -545,7 +603,11 @@ def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Ga
     model = device.simulator(device.body, device.sensors)
     bench = BenchData(session, rows, per_newton(model, device.body, rows))
     if not bench.loading.any():
-        raise InputError("no frame of the session falls into a press: check the clocks, see calibrate.delay")
+        spans = [np.ptp(values) for values in (session.time, rows.time)]
+        raise InputError(
+            f"no frame of the session ({spans[0]:.4g} s long) falls into a press of the gauge "
+            f"({spans[1]:.4g} s): check the clocks and their units, see calibrate.delay"
+        )
     if bench.idle.sum() < _FEWEST:
         raise InputError(
             f"{bench.idle.sum()} idle frames, needed are {_FEWEST}: do not touch the skin for some seconds"

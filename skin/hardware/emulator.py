@@ -481,7 +481,7 @@ class Emulator:
         output = self.device.imperfection.raw(
             torch.from_numpy(true)[None].float(), self.device.constants, self._noise, time
         )
-        return self.converter(output[0].double().numpy())
+        return self.converter(output[0].double().numpy() * self.device.imperfection.signs(true.shape[1]))
 
     def _play(self, values: np.ndarray, end: int | None) -> bool:
         """Send frames when they are due; return whether the run is over."""

@@ -195,6 +195,8 @@ class SessionLog:
         """Write the conversion of the following values to N; its ``zero`` is the baseline."""
         # What a tare tells of the noise is for those who watch.
         arrays = {name: getattr(conversion, name).tolist() for name in ("scale", "zero", "broken")}
+        if conversion.curves is not None:
+            arrays["curves"] = conversion.curves.to_json()
         line, self._conversion_checksum = encode_event("meaning", **arrays)
         self._lines.add(line)
 

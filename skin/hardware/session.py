@@ -25,6 +25,7 @@ from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import json_line
 from skin.core.safe_loading import parse_json, read_file, regular, sha256
+from skin.device.curves import Curves
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.hardware.wire.channels import UnitConversion
@@ -256,12 +257,14 @@ class _Reading:
     def _event(self, content: dict[str, Any], token: str) -> None:
         match content.pop("event"):
             case "meaning":
+                bent = content.pop("curves", None)
+                curves = None if bent is None else Curves.of_json(bent, self._sensors)
                 arrays = {name: np.array(value) for name, value in content.items()}
                 if any(
                     len(array) != self._sensors or not np.isfinite(array).all() for array in arrays.values()
                 ):
                     raise ValueError("a conversion of other sensors")
-                self._conversion = token, UnitConversion(**arrays)
+                self._conversion = token, UnitConversion(**arrays, curves=curves)
                 self._marked = {"invalid": [], "saturated": []}
                 self._gesture, self._doubtful = None, False
             case "begin":

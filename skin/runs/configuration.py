@@ -195,6 +195,9 @@ class Config:
     from_: str | None = None  # a Python keyword: from= on the command line
     path: str | None = None
     presses: str | None = None
+    weight: float | None = None
+    base: float | None = None
+    board: float | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
     adapter: dict[str, Any] = field(default_factory=dict)

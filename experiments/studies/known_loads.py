@@ -31,7 +31,8 @@ from skin.core.settings import checked, configured
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.bench import BenchSession, Protocol
+from skin.hardware.bench import BenchSession
+from skin.hardware.bench_protocol import Protocol
 from skin.hardware.known_loads import KnownLoad, emulate_placements, fit_known_load
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.solid import Solid

@@ -74,7 +74,8 @@ def _calibrate_by_gauge(config: Config, path: str) -> None:
 
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
-    from skin.hardware.bench import Units, read_bench_session, read_gauge, write_demo_session
+    from skin.hardware.bench import Units, read_bench_session, read_gauge
+    from skin.hardware.bench_protocol import write_demo_session
     from skin.hardware.calibration import (
         check_force,
         evaluate_held_out,

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from skin.errors import InputError
 
@@ -110,7 +108,9 @@ def check_table(table: Any) -> Table:
 
 def _interpolate(values: Any, given: Sequence[float], result: Sequence[float]) -> Any:
     """Return values of a table, odd, and continued with the last slope."""
-    if isinstance(values, Tensor):
+    if not isinstance(values, np.ndarray):
+        import torch  # only here: settings are checked without it
+
         return torch.from_numpy(_interpolate(values.cpu().numpy(), given, result)).to(values)
     size = np.abs(values)
     slope = (result[-1] - result[-2]) / (given[-1] - given[-2])

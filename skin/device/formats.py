@@ -263,12 +263,12 @@ def read_format(name: str) -> ForeignFormat:
     """Return a mapping.
 
     Args:
-        name: path of a YAML file, or the name of a file in ``conf/format``.
+        name: path of a YAML file, or the name of a file in ``conf/mapping``.
 
     Raises:
         InputError: no such file, or invalid settings; the message names the file and the setting.
     """
-    shipped = {path.stem: path for path in sorted((CONF / "format").glob("*.yaml"))}
+    shipped = {path.stem: path for path in sorted((CONF / "mapping").glob("*.yaml"))}
     path = Path(name).expanduser() if name.endswith((".yaml", ".yml")) else shipped.get(name)
     if path is None:
         raise InputError(f"from={name} is no format: give map.yaml, or one of {', '.join(shipped)}")

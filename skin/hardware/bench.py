@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,14 +14,12 @@ import pyarrow.csv
 import pyarrow.parquet
 import torch
 from annotated_types import Ge, Le
-from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody, require_memory
 from skin.core.files import tabular, whole, write
-from skin.core.settings import checked, configured
+from skin.core.settings import checked
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.hardware.emulator import Converter
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.touch.fingertips import half_extents, peak_per_newton
 from skin.touch.shapes import Shapes
@@ -214,13 +212,19 @@ def read_gauge(
         InputError: the file is invalid.
     """
     table, _ = load_table(path, "gauge file")
-    return gauge_from_table(table, str(path), indenter, radius, delay, units or Units())
+    return gauge_from_table(table, str(path), indenter, radius, delay, units)
 
 
 def gauge_from_table(
-    table: pa.Table, where: str, indenter: str, radius: float, delay: float, units: Units
+    table: pa.Table,
+    where: str,
+    indenter: str,
+    radius: float,
+    delay: float = 0.0,
+    units: Units | None = None,
 ) -> Gauge:
     """Return a gauge from the complete rows of a table; see :func:`read_gauge`."""
+    units = units or Units()
     columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
     for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
         present = name in table.column_names
@@ -373,7 +377,7 @@ def read_bench_session(
         present = [name for name in table.column_names if name != "time"]
         table = table.select(present).append_column("time", [time])
     in_seconds = replace(units, time_scale=1.0)
-    rows = gauge_from_table(table, str(path), indenter, radius, 0.0, in_seconds) if inside else None
+    rows = gauge_from_table(table, str(path), indenter, radius, units=in_seconds) if inside else None
     try:
         unit_of_values: Any = unit or about.get("unit", "N")
         return BenchSession(time, raw, unit_of_values, rows, about.get("bits"), about.get("channels"))
@@ -412,105 +416,10 @@ _FEWEST = 50  # idle frames
 _SUDDEN = 2  # frames that a release may take
 
 
-@dataclass(frozen=True)
-class Protocol:
-    """Idle time, then a staircase at each place: up, down, up to the peak, and a sudden release.
-
-    The upward steps determine gains, the downward steps hysteresis, the release the lag, and idle time
-    offset, noise and drift.
-
-    Attributes:
-        peak: largest force of every press, N.
-        steps: shares of the peak on the way up, and reversed on the way down.
-        hold: at every step, s.
-        ramp: from one step to the next, s; the release takes none.
-        idle: before the first press, s.
-        rest: after every press, s.
-        indenter: name as in ``touch.shapes``.
-        radius: half its larger extent, m.
-        rate: of gauge and session, Hz.
-    """
-
-    peak: PositiveFloat = 120.0
-    steps: Sequence[float] = (0.1, 0.2, 0.4, 0.7, 1.0)
-    hold: PositiveFloat = 0.3
-    ramp: PositiveFloat = 0.05
-    idle: PositiveFloat = 3.0
-    rest: PositiveFloat = 2.0
-    indenter: str = "blurred_disc"
-    radius: PositiveFloat = 0.01
-    rate: PositiveFloat = 100.0
-
-    def gauge(self, places: np.ndarray) -> Gauge:
-        """Return a gauge's rows for presses at places (P, 2), m."""
-        levels = [0.0, *self.steps, *list(self.steps)[-2::-1], self.steps[-1]]
-        corners = np.cumsum([0.0, *[self.ramp, self.hold] * (len(levels) - 1)])
-        heights = self.peak * np.repeat(levels, 2)[1:]
-        inside = np.arange(0, corners[-1], 1 / self.rate)
-        press = np.concatenate(
-            [np.interp(inside, corners, heights), np.zeros(max(2, round(0.2 * self.rate)))]
-        )
-        pause, start = round(self.rest * self.rate), round(self.idle * self.rate)
-        starts = start + np.arange(len(places)) * (len(press) + pause)
-        frame = (starts[:, None] + np.arange(len(press))).ravel()
-        rows = len(frame)
-        return Gauge(
-            frame / self.rate,
-            np.tile(press, len(places)),
-            np.repeat(places, len(press), axis=0),
-            np.full(rows, self.radius),
-            np.zeros(rows),
-            np.full(rows, self.indenter),
-            np.repeat(np.arange(len(places)), len(press)),
-        )
-
-    def places(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
-        """Return two places per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
-        centre = device.sensors.positions[:, :2]
-        beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
-        return np.clip(np.concatenate([centre, beside]), 0, device.size)
-
-
-def emulate_session(
-    device: AbstractSimulated,
-    gauge: Gauge,
-    protocol: Protocol,
-    generator: np.random.Generator,
-    bits: int | None = None,
-) -> BenchSession:
-    """Simulate a session of a device under the presses of a gauge, in N, or in counts of ``bits``."""
-    frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
-    time = np.arange(frames) / protocol.rate
-    true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
-    measured = device.imperfection.raw(
-        torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
-    )[0].numpy() * device.imperfection.signs(true.shape[1])
-    values = Converter(bits, device.imperfection.clip)(measured)
-    return BenchSession(time, values, "N" if bits is None else "adc", gauge, bits)
-
-
 def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return true readings (T, S), N, of presses that give ``each`` (P, S) per N; 0 outside of them."""
     force, press = gauge.at(time)
     return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
-
-
-def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
-    """Write the simulated session of a device under the protocol; return a summary.
-
-    Args:
-        device: the simulated device.
-        settings: ``conf/calibrate.yaml`` under ``calibrate``.
-        path: .csv or .parquet.
-
-    Raises:
-        InputError: the protocol is invalid.
-    """
-    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
-    randomness = np.random.default_rng(device.seed)
-    rows = protocol.gauge(protocol.places(device, randomness))
-    session = emulate_session(device, rows, protocol, randomness, settings["bits"])
-    return f"{write_bench_session(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from skin.core.settings import configured
 from skin.device.base import AbstractSimulated
 from skin.device.calibration import Calibration
 from skin.errors import InputError
-from skin.hardware.bench import BenchSession, Gauge, Protocol, per_newton
+from skin.hardware.bench import BenchSession, Gauge, per_newton
+from skin.hardware.bench_protocol import Protocol
 from skin.hardware.emulator import Converter
 from skin.hardware.placements import Placements, find_placements
 from skin.hardware.wiring import find_quantum, list_numbers, measure_idle

@@ -15,7 +15,7 @@ from skin.device.formats import read_format
 from skin.errors import InputError
 
 REAL = ROOT.parent / "shared" / "real"
-SHIPPED = sorted(path.stem for path in (CONF / "format").glob("*.yaml"))
+SHIPPED = sorted(path.stem for path in (CONF / "mapping").glob("*.yaml"))
 PLAIN = {
     "files": "*.csv",
     "time": {"column": "t", "unit": "ms"},

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from skin.errors import InputError
-from skin.hardware.bench import Units, emulate_session, read_bench_session, write_bench_session
+from skin.hardware.bench import Units, read_bench_session, write_bench_session
+from skin.hardware.bench_protocol import emulate_session
 from skin.hardware.calibration import check_force, fit_calibration
 from skin.hardware.wiring import Confirmed, wired_bench
 from tests.hardware.test_fit import PROTOCOL, device

@@ -12,7 +12,7 @@ from skin.body.base import Sheet
 from skin.body.layout import Grid
 from skin.device.files import read_recording
 from skin.device.simulated import Simulated
-from skin.hardware import bench
+from skin.hardware import bench, bench_protocol
 from skin.hardware.comparison import compare_session
 from skin.hardware.emulator import Emulator, EmulatorSettings, Faults, emulated_gestures, open_port
 from skin.hardware.recorder import convert_session, record_session
@@ -153,7 +153,9 @@ def test_contacts_that_cannot_be_are_a_damaged_line(recorded, old, new):
 
 def test_a_gauge_tells_its_contacts():
     columns = {"time": [1.0, 1.5, 2.0, 2.5], "force": [0.0, 10.0, 20.0, 0.0], "x_m": [0.05] * 4}
-    rows = bench.gauge_from_table(pa.table(columns | {"y_m": [0.06] * 4}), "x", "disc", 0.01)
+    rows = bench.gauge_from_table(
+        pa.table(columns | {"y_m": [0.06] * 4}), "x", "disc", 0.01, 0.0, bench.Units()
+    )
     peaks = bench.pressed_peaks(SHEET, rows)
     assert peaks == pytest.approx(1 / (np.pi * 0.01**2), rel=0.02)
     contacts = rows.contacts(np.array([0.5, 1.25, 2.0, 3.0]), peaks)
@@ -164,9 +166,9 @@ def test_a_gauge_tells_its_contacts():
 
 
 def test_presses_of_a_bench_session_have_them(device, tmp_path):
-    protocol = bench.Protocol(idle=3.0, rate=50.0, indenter="disc")
+    protocol = bench_protocol.Protocol(idle=3.0, rate=50.0, indenter="disc")
     gauge = protocol.gauge(np.array([[0.03, 0.03], [0.08, 0.08]]))
-    session = bench.emulate_session(device, gauge, protocol, np.random.default_rng(0))
+    session = bench_protocol.emulate_session(device, gauge, protocol, np.random.default_rng(0))
     path = bench.write_bench_session(session, tmp_path / "s.parquet")
     settings = {"indenter": "disc", "radius": 0.01, "unit": None, "delay": 0.0, "scale": None, "seed": 0}
     sides = compare_session(device, str(path), None, settings).touches

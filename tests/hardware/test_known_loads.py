@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from skin.errors import InputError
-from skin.hardware.bench import BenchSession, Protocol
+from skin.hardware.bench import BenchSession
+from skin.hardware.bench_protocol import Protocol
 from skin.hardware.known_loads import (
     KnownLoad,
     base_readings,

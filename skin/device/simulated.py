@@ -31,6 +31,7 @@ from skin.touch.gesture import GestureSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
 from skin.touch.sampler import TouchSampler, balanced
+from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.
 
@@ -188,7 +189,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
         contact, settings = self.contact(body, model), GestureSettings.of(self.touch)
         judged = sensors if settings.over_sensors else cover_surface(body, sensors.footprint)
-        return TouchSampler(body, body.footprints(judged), contact, settings, self.padded)
+        moments = footprints(body, judged) if model.smooth else None
+        return TouchSampler(body, body.footprints(judged), contact, settings, self.padded, moments)
 
     @cached_property
     def geometry(self) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
+from skin.touch import splines
 from skin.touch.gesture import (
     Draws,
     GestureSettings,
@@ -59,6 +60,8 @@ class ContactResult(NamedTuple):
             the contact did not converge.
         hopeless: (B,), bool, the refused gestures for which no other path can succeed.
         unconverged: (B,), number of frames that did not converge to the tolerance; None where all are exact.
+        area: (U,), share of the sheet in contact, where the frames are moments of the pressure
+            (:mod:`skin.touch.splines`); None: frames are mean pressures of cells.
     """
 
     frames: Tensor
@@ -67,6 +70,7 @@ class ContactResult(NamedTuple):
     refused: np.ndarray
     hopeless: np.ndarray
     unconverged: np.ndarray | None = None
+    area: np.ndarray | None = None
 
 
 class ContactModel(Protocol):
@@ -132,6 +136,9 @@ class TouchSampler:
         contact: computes the pressure of gestures.
         settings: ranges of the gestures, as in ``conf/touch.yaml``.
         padded: whether gestures begin at a random frame of the window instead of its first.
+        moments: (S, H * W), weights of moments of the pressure in place of ``footprints``
+            (:func:`skin.touch.splines.footprints`). The frames of movies are then moments. None: they are
+            mean pressures of cells.
 
     Raises:
         InputError: settings or pictures that cannot be used.
@@ -144,12 +151,15 @@ class TouchSampler:
         contact: ContactModel,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
+        moments: np.ndarray | None = None,
     ) -> None:
         self.body = body
         self.settings = GestureSettings.of(settings)
         self.padded = padded
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
-        self.shapes = Shapes(self.settings.shapes, body, self.settings.thresholds.contact)
+        self.moments = None if moments is None else torch.as_tensor(moments, dtype=torch.float32)
+        fine = moments is not None
+        self.shapes = Shapes(self.settings.shapes, body, self.settings.thresholds.contact, fine)
         self.contact = contact
 
     @cached_property
@@ -249,9 +259,15 @@ class TouchSampler:
             paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
         index, shares = paths.trajectories.index, paths.trajectories.profile
+        area = None if pressed.area is None else torch.from_numpy(pressed.area).float()
+        weights = self.footprints if area is None or self.moments is None else self.moments
         measures = measure_gestures(
-            pressed.frames, index, shares, self.footprints, self.body.cell, settings.thresholds.contact
+            pressed.frames, index, shares, weights, self.body.cell, settings.thresholds.contact, area
         )
+        frames = pressed.frames
+        if self.moments is not None and area is None:
+            down, across = (torch.from_numpy(splines.of_cells(count)).float() for count in self.body.shape)
+            frames = down @ frames @ across.T
         if not self.contact.proportional:
             # The contact area grows with force, which moves the centre of pressure of a static touch.
             measures = measures._replace(travel=torch.from_numpy(paths.travel))
@@ -263,7 +279,7 @@ class TouchSampler:
         pull = settings.shear * heading(paths.place, paths.first) if settings.shear else None
         shear = None if pull is None else torch.from_numpy(pull).float()
         labels = measures.labels(settings.thresholds, settings.rate)
-        return Movie(pressed.frames, index, shares, labels, drawn, shear), pressed
+        return Movie(frames, index, shares, labels, drawn, shear), pressed
 
     def _explain_impossible(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))

@@ -108,8 +108,8 @@ def even_pressure(quick: bool) -> CheckResult:
     body = default_sheet(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
-    mesh = build_mesh(body, 2, {})
-    felt = Elastic(mesh).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
+    mesh = build_mesh(body, 2, {}, 2)
+    felt = Elastic(mesh, 2).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
     return CheckResult(
         [
             relative_finding(f"reading / p A, {1e3 * depth:g} mm deep", reading, 1, 2e-3)

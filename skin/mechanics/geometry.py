@@ -44,7 +44,7 @@ class Fingertip:
         if smooth:
             axes = zip((self._x, self._y), body.cells, body.cell, samples, strict=True)
             self._splines = tuple(
-                torch.from_numpy(splines.values(places.numpy() / cell, count) / number)
+                torch.from_numpy(splines.spline_values(places.numpy() / cell, count) / number)
                 for places, count, cell, number in axes
             )
 

@@ -119,7 +119,7 @@ class Shapes:
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
         finest = max(64, max(body.size) / self.spacing) * (2 if fine else 1)
         self.levels = pyramid([load_image(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
-        self.hulls = hulls(self.levels[0][:, 0].numpy(), contact)
+        self.hulls, self._outlines = (hulls(self.levels[0][:, 0].numpy(), edge) for edge in (contact, 0.0))
 
     def extent(
         self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, stretch: np.ndarray | None = None
@@ -223,10 +223,7 @@ class Shapes:
         place: np.ndarray,
         stretch: np.ndarray | None = None,
     ) -> Pressed:
-        """Return what shapes press, from pictures of at least 2 x 2 samples a cell, finer for small shapes.
-
-        The arguments are those of :meth:`render`. Only the box that a shape covers is sampled.
-        """
+        """Return what shapes press, as :meth:`render` takes them, from pictures of the boxes they cover."""
         drawn = _Drawn(shape, angle, scale, place, stretch)
         # Adjacent frames that differ in their place alone, as those of a path, share a picture.
         same = [np.diff(values) == 0 for values in drawn if values is not None and values.ndim == 1]
@@ -257,10 +254,6 @@ class Shapes:
             corners *= np.stack([wide, 1 / wide], axis=-1)[:, None]
         low, high = (side / self.body.cell for side in (corners.min(axis=1), corners.max(axis=1)))
         return low, np.maximum(np.ceil(high - low), 1).astype(int)
-
-    @cached_property
-    def _outlines(self) -> np.ndarray:
-        return hulls(self.levels[0][:, 0].numpy(), 0.0)
 
     def _pictures(
         self, drawn: _Drawn, samples: int | None = None
@@ -330,8 +323,8 @@ class Shapes:
         place = (cells[1][:, None, None] + row[:, None]) * width + cells[0][:, None, None] + column
         sheet = torch.zeros(len(box), height * width)
         sheet.scatter_(1, place.flatten(1), box.flatten(1))
-        sheet = splines.fold(sheet.view(-1, height, width)[:, : wide[0], : wide[1]])
-        return splines.fold(sheet.mT).mT
+        sheet = splines.fold_back(sheet.view(-1, height, width)[:, : wide[0], : wide[1]])
+        return splines.fold_back(sheet.mT).mT
 
     def render(
         self,

@@ -28,7 +28,7 @@ def unfolded(places: np.ndarray, count: int) -> np.ndarray:
     return np.nan_to_num(_PIECE(places[:, None] - middles))
 
 
-def values(places: np.ndarray, count: int) -> np.ndarray:
+def spline_values(places: np.ndarray, count: int) -> np.ndarray:
     """Return the splines of ``count`` cells at places (P,), in cells, (P, count)."""
     wide = unfolded(places, count)
     inner = wide[:, REACH:-REACH].copy()
@@ -61,7 +61,7 @@ def sampled(begin: np.ndarray, count: int, samples: int, least: np.ndarray, most
     return cubes.mul_(inside[:, :, None] / (6 * samples))
 
 
-def fold(wide: torch.Tensor) -> torch.Tensor:
+def fold_back(wide: torch.Tensor) -> torch.Tensor:
     """Return values (B, H + 4, ...) of splines with those beyond the edges folded back, (B, H, ...)."""
     inner = wide[:, REACH:-REACH].clone()
     for beyond in range(REACH):
@@ -81,25 +81,25 @@ def _points(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
 def of_cells(count: int) -> np.ndarray:
     """Return the moments (count, count) of 1 Pa on each cell (columns) along one axis."""
     places, weights = _points(0, count)
-    return (weights[:, None] * values(places, count)).reshape(count, -1, count).sum(1).T
+    return (weights[:, None] * spline_values(places, count)).reshape(count, -1, count).sum(1).T
 
 
 @lru_cache
 def _gram(count: int) -> np.ndarray:
     places, weights = _points(0, count)
-    splines = values(places, count)
+    splines = spline_values(places, count)
     return splines.T @ (weights[:, None] * splines)
 
 
 @lru_cache
-def fit(count: int, nodes: int) -> np.ndarray:
+def fit_nodes(count: int, nodes: int) -> np.ndarray:
     """Return the coefficients (count, nodes) of the least-squares fit of nodal values along one axis.
 
     Evenly spaced nodes, ends included, are joined by a cubic spline, which the splines of the cells fit.
     """
     places, weights = _points(0, count)
     joined = make_interp_spline(np.linspace(0, count, nodes), np.eye(nodes), k=min(3, nodes - 1))(places)
-    return np.linalg.solve(_gram(count), values(places, count).T @ (weights[:, None] * joined))
+    return np.linalg.solve(_gram(count), spline_values(places, count).T @ (weights[:, None] * joined))
 
 
 def footprints(body: AbstractBody, sensors: Sensors) -> np.ndarray:
@@ -113,6 +113,6 @@ def footprints(body: AbstractBody, sensors: Sensors) -> np.ndarray:
         rows = []
         for low, high in zip(np.maximum(middle - half, 0), np.minimum(middle + half, count), strict=True):
             places, shares = _points(low, high)
-            rows.append(shares @ values(places, count) / (high - low))
+            rows.append(shares @ spline_values(places, count) / (high - low))
         weights.append(np.linalg.solve(_gram(count), np.array(rows).T).T)
     return np.einsum("sh,sw->shw", weights[1], weights[0]).reshape(len(sensors), -1)

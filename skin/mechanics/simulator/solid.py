@@ -114,7 +114,8 @@ class Elastic:
         self.cells = columns // refinement, rows // refinement
         # A moment acts on the nodes as the splines fit what the nodes know of an influence.
         self._fits = [
-            splines.fit(count, nodes + 1) for count, nodes in zip(self.cells, (columns, rows), strict=True)
+            splines.fit_nodes(count, nodes + 1)
+            for count, nodes in zip(self.cells, (columns, rows), strict=True)
         ]
         self._area = mesh.lines[0][-1] * mesh.lines[1][-1] / (self.cells[0] * self.cells[1])
 
@@ -359,7 +360,7 @@ class Solid(AbstractSimulator):
             loads: (F, H, W), the moments, Pa.
         """
         cells = flatten(loads, self.shape, torch.float32).cpu()
-        moved = cells @ torch.from_numpy(_read(self._corners, self.influence(_INWARDS)).T)
+        moved = cells @ torch.from_numpy(_read(self._corners, self.influence(_INWARDS)).T).float()
         return moved.unflatten(1, (self.shape[0] + 1, self.shape[1] + 1))
 
     @cached_property

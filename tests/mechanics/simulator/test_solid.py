@@ -51,6 +51,20 @@ def test_a_place_between_nodes_moves_as_trilinear_elements_do():
     assert down == pytest.approx(_interpolated(mesh, points, strain), rel=1e-12)
 
 
+def test_middles_of_elements_tell_a_cubic_everywhere():
+    lines = tuple(np.sort(np.random.default_rng(seed).random(7)) for seed in range(3))
+    mesh = Hexahedra(lines, np.full((6, 6, 6), 2e5), np.full(6, 0.49), bent, identity)
+    x, y, z = np.meshgrid(*((line[1:] + line[:-1]) / 2 for line in lines), indexing="ij")
+
+    def cubic(x, y, z):
+        return (1 + x - 2 * x**3) * (2 - y**2 + y**3) * (1 + 3 * z)
+
+    inner = [(line[0] + line[1], line[-1] + line[-2]) for line in lines]
+    points = np.random.default_rng(3).uniform(*(np.array(inner).T / 2), (20, 3))
+    between = mesh.between(points) @ cubic(x, y, z).transpose(2, 1, 0).ravel()
+    assert between == pytest.approx(cubic(*points.T), rel=1e-9)
+
+
 def _interpolated(mesh, points, strain):
     """Return the third component of a uniform strain's motion where trilinear elements put chart points."""
     values = bent(np.stack(np.meshgrid(*mesh.lines, indexing="ij"), axis=-1)) @ strain

@@ -94,7 +94,7 @@ def sensitivity(simulator: AbstractSimulator, fingertip: Fingertip, touches: Ten
 
     Args:
         simulator: maps pressure to readings; its buffers become float64.
-        fingertip: the pressure of a touch.
+        fingertip: the loads of a touch.
         touches: (B, 4).
     """
     simulator.double()
@@ -111,7 +111,7 @@ def _parts(
             along = torch.zeros_like(part)
             along[:, axis] = 1
             # Touches do not influence each other, so one direction serves all of them.
-            pair = torch.func.jvp(lambda touch: simulator(fingertip(touch)).readings, (part,), (along,))
+            pair = torch.func.jvp(lambda touch: simulator.press(fingertip(touch)).readings, (part,), (along,))
             slopes.append(pair[1])
         yield pair[0], torch.stack(slopes, dim=-1)
 
@@ -227,7 +227,7 @@ class LocalPrecision:
             InputError: the margin leaves no place.
         """
         touches = self.sample(body)
-        felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
+        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), touches)
         area = math.prod(self._extent(body))
         return [self._findings(felt.of_force(force), force, body, area) for force in self.forces]
 
@@ -288,7 +288,7 @@ class LocalPrecision:
         down, across = torch.meshgrid(y, x, indexing="ij")
         constants = torch.tensor([sum(self.radii) / 2, 1.0]).expand(across.numel(), 2)
         touches = torch.cat([torch.stack([across, down], -1).flatten(0, 1), constants], dim=1)
-        felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
+        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), touches)
         places = [self._deviations(felt.of_force(force), force, body)[0] for force in self.forces]
         return torch.stack(places).unflatten(1, body.shape)
 

@@ -32,6 +32,7 @@ from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
 from skin.touch.sampler import AbstractSampler
+from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.
 
@@ -189,7 +190,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> AbstractSampler:
         contact, settings = self.contact(body, model), read_touch(self.touch)
         judged = sensors if settings.over_sensors else cover_surface(body, sensors.footprint)
-        return settings.sampler(body, body.footprints(judged), contact, self.padded)
+        moments = footprints(body, judged) if model.smooth else None
+        return settings.sampler(body, body.footprints(judged), contact, self.padded, moments)
 
     @cached_property
     def geometry(self) -> Tensor:

@@ -71,10 +71,15 @@ class FingertipSettings(TouchSettings):
         super().__post_init__()
 
     def sampler(
-        self, body: AbstractBody, footprints: np.ndarray, contact: ContactModel, padded: bool
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: ContactModel,
+        padded: bool,
+        moments: np.ndarray | None,
     ) -> "FingertipSampler":
         """Return what draws fingertips."""
-        return FingertipSampler(body, footprints, contact, self, padded)
+        return FingertipSampler(body, footprints, contact, self, padded, moments)
 
 
 _SPECIAL = {entry.name for entry in fields(FingertipSettings)} - {
@@ -214,7 +219,7 @@ class FingertipSampler(AbstractSampler):
     The other labels are what the movie gives: a touch is hardly ever big or dangerous.
 
     Args:
-        body, footprints, contact, padded: as of :class:`skin.touch.sampler.AbstractSampler`.
+        body, footprints, contact, padded, moments: as of :class:`skin.touch.sampler.AbstractSampler`.
         settings: ranges of the fingertips.
 
     Raises:
@@ -231,13 +236,14 @@ class FingertipSampler(AbstractSampler):
         contact: ContactModel,
         settings: FingertipSettings,
         padded: bool = True,
+        moments: np.ndarray | None = None,
     ) -> None:
         if not contact.proportional:
             raise InputError(
                 "fingertips are softer than the skin and press as their picture: set contact=prescribed, or "
                 "touch=gestures for rigid objects"
             )
-        super().__init__(body, footprints, contact, settings, padded)
+        super().__init__(body, footprints, contact, settings, padded, moments)
 
     def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Return label combinations (count, 4), bool: all four of dynamic and press equally often."""
@@ -313,35 +319,51 @@ class FingertipSampler(AbstractSampler):
         paths = sample_paths(drawn, wanted, settings, proportional=True)
         index, profile = paths.trajectories.index, paths.trajectories.profile
         scale = group.radius / half_extents(self.shapes)[group.shape]
-        frames = self._pressure(paths, group, scale)
-        measures = measure_gestures(
-            frames, index, profile, self.footprints, self.body.cell, settings.thresholds.contact
-        )
+        frames, highest, area = self._pressure(paths, group, scale)
+        weights = self.footprints if self.moments is None else self.moments
+        contact = settings.thresholds.contact
+        measures = measure_gestures(frames, index, profile, weights, self.body.cell, contact, area)
         present = np.arange(group.radius.shape[1]) < group.number[:, None]
-        peak = (frames.flatten(1).amax(1)[index] * profile).amax(1).double().numpy()
+        peak = (highest[index] * profile).amax(1).double().numpy()
         values = peak, (group.force * present).sum(axis=1), drawn["draws"]
         parameters = describe_touches(drawn, paths, values, measures)
         parameters["contacts"] = torch.from_numpy(group.number).float()
-        highest = group.force * peak_per_newton(self.shapes, group.shape, group.radius)
-        contacts = _contacts(paths, group, highest, present)
+        pressures = group.force * peak_per_newton(self.shapes, group.shape, group.radius)
+        contacts = _contacts(paths, group, pressures, present)
         labels = measures.labels(settings.thresholds, settings.rate)
         return Movie(frames, index, profile, labels, parameters, steer(paths, settings.shear), contacts)
 
-    def _pressure(self, paths: SampledPaths, group: Group, scale: np.ndarray) -> Tensor:
-        """Return the sum of the pressures of all fingertips at full force, (U, H, W), Pa."""
+    def _pressure(
+        self, paths: SampledPaths, group: Group, scale: np.ndarray
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return what all fingertips press at full force.
+
+        Returns:
+            The sum of their pressures, (U, H, W), Pa, the highest one, (U,), Pa, and the share of the sheet
+            in contact, (U,), or None where cells are counted.
+        """
         owner, place = paths.trajectories.owner, paths.trajectories.place
         frames = torch.zeros(len(owner), *self.body.shape)
-        area = float(np.prod(self.body.cell))
+        highest, areas = torch.zeros(2, len(owner))
+        cell = float(np.prod(self.body.cell))
         for k in range(scale.shape[1]):
             rows = np.flatnonzero(group.number[owner] > k)
             # Sorted by scale, because frames of one texture level are rendered together.
             rows = rows[np.argsort(scale[owner[rows], k], kind="stable")]
-            mine = owner[rows]
+            mine, todo = owner[rows], torch.from_numpy(rows)
             centres = place[rows] + group.offset[mine, k]
-            shares = self.shapes.render(group.shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres)
-            full = torch.from_numpy(group.force[mine, k] / area).float()
-            frames[torch.from_numpy(rows)] += shares * full[:, None, None]
-        return frames
+            pose = group.shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres
+            full = torch.from_numpy(group.force[mine, k] / cell).float()
+            if self.shapes.fine:
+                shares, peak, area = self.shapes.press(*pose)
+                areas[todo] += torch.from_numpy(area).float()
+                highest[todo] = torch.maximum(highest[todo], full * peak)
+            else:
+                shares = self.shapes.render(*pose)
+            frames[todo] += shares * full[:, None, None]
+        if self.shapes.fine:
+            return frames, highest, areas
+        return frames, frames.flatten(1).amax(1), None
 
 
 def _contacts(paths: SampledPaths, group: Group, highest: np.ndarray, present: np.ndarray) -> Tensor:

@@ -166,7 +166,12 @@ class TouchSettings(ABC):
 
     @abstractmethod
     def sampler(
-        self, body: AbstractBody, footprints: np.ndarray, contact: "ContactModel", padded: bool
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: "ContactModel",
+        padded: bool,
+        moments: np.ndarray | None,
     ) -> "AbstractSampler":
         """Return what draws such touches; the arguments are those of the sampler."""
 
@@ -215,12 +220,17 @@ class GestureSettings(TouchSettings):
         super().__post_init__()
 
     def sampler(
-        self, body: AbstractBody, footprints: np.ndarray, contact: "ContactModel", padded: bool
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: "ContactModel",
+        padded: bool,
+        moments: np.ndarray | None,
     ) -> "AbstractSampler":
         """Return what draws gestures."""
         from skin.touch.sampler import TouchSampler
 
-        return TouchSampler(body, footprints, contact, self, padded)
+        return TouchSampler(body, footprints, contact, self, padded, moments)
 
 
 def model_window(touch: Mapping[str, Any] | TouchSettings | None) -> tuple[int, float]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
+from skin.touch import splines
 from skin.touch.gesture import (
     Draws,
     GestureSettings,
@@ -62,6 +63,8 @@ class ContactResult(NamedTuple):
             the contact did not converge.
         hopeless: (B,), bool, the refused gestures for which no other path can succeed.
         unconverged: (B,), number of frames that did not converge to the tolerance; None where all are exact.
+        area: (U,), share of the sheet in contact, where the frames are moments of the pressure
+            (:mod:`skin.touch.splines`); None: frames are mean pressures of cells.
     """
 
     frames: Tensor
@@ -70,6 +73,7 @@ class ContactResult(NamedTuple):
     refused: np.ndarray
     hopeless: np.ndarray
     unconverged: np.ndarray | None = None
+    area: np.ndarray | None = None
 
 
 class ContactModel(Protocol):
@@ -154,6 +158,9 @@ class AbstractSampler(ABC):
         contact: computes the pressure of touches.
         settings: of the touches.
         padded: whether touches begin at a random frame of the window instead of its first.
+        moments: (S, H * W), weights of moments of the pressure in place of ``footprints``
+            (:func:`skin.touch.splines.footprints`). The frames of movies are then moments. None: they are
+            mean pressures of cells.
 
     Attributes:
         chosen: the labels that touches can be drawn for, names of ``TOUCH``; the others are what they are.
@@ -174,11 +181,13 @@ class AbstractSampler(ABC):
         contact: ContactModel,
         settings: TouchSettings,
         padded: bool = True,
+        moments: np.ndarray | None = None,
     ) -> None:
         self.body, self.contact, self.padded = body, contact, padded
         self.settings = settings
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
-        self.shapes = Shapes(settings.shapes, body, settings.thresholds.contact)
+        self.moments = None if moments is None else torch.as_tensor(moments, dtype=torch.float32)
+        self.shapes = Shapes(settings.shapes, body, settings.thresholds.contact, moments is not None)
 
     @abstractmethod
     def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -226,8 +235,9 @@ class TouchSampler(AbstractSampler):
         contact: ContactModel,
         settings: Mapping[str, Any] | GestureSettings | None = None,
         padded: bool = True,
+        moments: np.ndarray | None = None,
     ) -> None:
-        super().__init__(body, footprints, contact, GestureSettings.of(settings), padded)
+        super().__init__(body, footprints, contact, GestureSettings.of(settings), padded, moments)
         self.leak, self.strict = self.settings.leak, self.settings.strict
 
     @cached_property
@@ -322,9 +332,15 @@ class TouchSampler(AbstractSampler):
             paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
         index, shares = paths.trajectories.index, paths.trajectories.profile
+        area = None if pressed.area is None else torch.from_numpy(pressed.area).float()
+        weights = self.footprints if area is None or self.moments is None else self.moments
         measures = measure_gestures(
-            pressed.frames, index, shares, self.footprints, self.body.cell, settings.thresholds.contact
+            pressed.frames, index, shares, weights, self.body.cell, settings.thresholds.contact, area
         )
+        frames = pressed.frames
+        if self.moments is not None and area is None:
+            down, across = (torch.from_numpy(splines.of_cells(count)).float() for count in self.body.shape)
+            frames = down @ frames @ across.T
         if not self.contact.proportional:
             # The contact area grows with force, which moves the centre of pressure of a static touch.
             measures = measures._replace(travel=torch.from_numpy(paths.travel))
@@ -332,7 +348,7 @@ class TouchSampler(AbstractSampler):
         drawn = describe_touches(gestures, paths, values, measures)
         shear = steer(paths, settings.shear)
         labels = measures.labels(settings.thresholds, settings.rate)
-        return Movie(pressed.frames, index, shares, labels, drawn, shear), pressed
+        return Movie(frames, index, shares, labels, drawn, shear), pressed
 
     def _explain_impossible(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))

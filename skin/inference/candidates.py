@@ -1,0 +1,211 @@
+"""Readings of fingertips on a skin, for every place and radius: sampled once, then interpolated."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.polynomial import chebyshev
+from scipy.special import ndtr
+
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+from skin.mechanics.geometry import Fingertip
+from skin.mechanics.simulator.base import AbstractSimulator
+
+
+@dataclass(frozen=True)
+class FingertipPrior:
+    """What fingertips are expected before anything is read.
+
+    Places are uniform over the surface, radii uniform, forces log-normal; all independent. The defaults are
+    those of fingertips: 5 N within a factor of e^0.5, so that 95 % lie between 1.9 and 13 N.
+
+    Attributes:
+        force: median, N.
+        spread: standard deviation of the logarithm of the force.
+        radii: least and largest radius, m.
+        rim: over which the pressure falls at the edge, m (:class:`skin.mechanics.geometry.Fingertip`).
+        numbers: probabilities of 0, 1, 2 and 3 contacts.
+
+    Raises:
+        InputError: a number that has no meaning.
+    """
+
+    force: float = 5.0
+    spread: float = 0.5
+    radii: tuple[float, float] = (0.004, 0.012)
+    rim: float = 0.0015
+    numbers: tuple[float, float, float, float] = (0.25, 0.25, 0.25, 0.25)
+
+    def __post_init__(self) -> None:
+        if not (self.force > 0 and self.spread > 0 and self.rim > 0 and 0 < self.radii[0] < self.radii[1]):
+            raise InputError(
+                "a prior of fingertips needs force, spread and rim above 0 and two rising radii, got "
+                f"force={self.force:g}, spread={self.spread:g}, rim={self.rim:g} and radii={list(self.radii)}"
+            )
+
+    def peak(self, radius: np.ndarray) -> np.ndarray:
+        """Return the pressure in the middle of a fingertip of 1 N and some radius, m, in Pa/N."""
+        knots = np.linspace(*self.radii, 33)
+        reach = np.linspace(0, 1, 400)[:, None] * (knots + 12 * self.rim)
+        share = 1 / (1 + np.exp((reach - knots) / self.rim))
+        area = np.trapezoid(2 * np.pi * reach * share, reach, axis=0)
+        return np.interp(radius, knots, share[0] / area)
+
+
+def disc_readings(
+    simulator: AbstractSimulator, body: AbstractBody, discs: np.ndarray, rim: float
+) -> np.ndarray:
+    """Return the readings (N, S), N/N, of discs (N, 3) of 1 N: x, y and radius, m.
+
+    The only place where candidates meet the mechanics.
+    """
+    fingertip, parts = Fingertip(body, rim), []
+    touches = torch.from_numpy(np.column_stack([discs, np.ones(len(discs))])).float()
+    home = next(simulator.buffers())
+    with torch.no_grad():
+        for part in touches.split(256):
+            pressure = fingertip(part).to(home.device)
+            parts.append(simulator(pressure).readings.cpu().numpy().astype(np.float64))
+    return np.concatenate(parts)
+
+
+class Boxes(NamedTuple):
+    """Boxes of places and radii.
+
+    Attributes:
+        centre: (N, 3), x, y and radius, m.
+        width: (N, 3), m.
+    """
+
+    centre: np.ndarray
+    width: np.ndarray
+
+    def split(self, along: np.ndarray) -> "Boxes":
+        """Return the halves of each box along some axes, (N, 3), bool: up to eight children each."""
+        centre, width = self.centre, self.width
+        for axis in range(3):
+            cut = along[:, axis]
+            half = np.where(cut, width[:, axis] / 2, width[:, axis])
+            low, high = centre.copy(), centre[cut]
+            low[cut, axis] -= half[cut] / 2
+            high[:, axis] += half[cut] / 2
+            width = width.copy()
+            width[:, axis] = half
+            centre = np.concatenate([low, high])
+            width = np.concatenate([width, width[cut]])
+            along = np.concatenate([along, along[cut]])
+        return Boxes(centre, width)
+
+
+# Patches of the surface with a polynomial each.
+
+
+_POWERS = [(i, j) for i, j in product(range(4), repeat=2) if i + j <= 3]
+_RADII = 4  # Chebyshev points over the radii
+_PATCH = 0.002  # m, largest side of a patch
+
+
+class Candidates:
+    """Readings per newton of fingertips anywhere, and their derivatives.
+
+    The surface is divided into patches of at most 2 mm. On each, readings are polynomials of third order in
+    place and radius, fitted to samples on the corners of the patch and of its neighbours.
+
+    Args:
+        simulator: of the skin; its readings must add up.
+        body: the skin.
+        prior: radii and rim of fingertips.
+        coarse: largest width of the first boxes, m.
+
+    Attributes:
+        boxes: the first boxes, which cover the surface and the radii.
+        readings: (N, S), N/N, in their centres, float32.
+        slopes: (3, N, S), their derivatives, N/N/m, float32.
+    """
+
+    def __init__(
+        self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior, coarse: float = 0.004
+    ) -> None:
+        self.radii, self.size = prior.radii, np.array(body.size)
+        # An even number, so that two by two of them make a first box.
+        self._per_box = max(1, round(coarse / _PATCH))
+        self._counts = self._per_box * np.ceil(self.size / coarse - 1e-9).astype(int)
+        self._patch = self.size / self._counts
+        self._coefficients = self._fit(simulator, body, prior)
+        self.boxes = self._first_boxes()
+        self.readings, self.slopes = self.at(self.boxes.centre)
+
+    def _fit(self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior) -> np.ndarray:
+        """Return coefficients (patches, K, S), float32."""
+        x, y = (np.linspace(0, side, count + 1) for side, count in zip(self.size, self._counts, strict=True))
+        nodes = np.cos(np.pi * (np.arange(_RADII) + 0.5) / _RADII)
+        middle, half = sum(self.radii) / 2, (self.radii[1] - self.radii[0]) / 2
+        grid = np.stack(np.meshgrid(y, x, middle + half * nodes, indexing="ij"), -1)[..., [1, 0, 2]]
+        flat = disc_readings(simulator, body, grid.reshape(-1, 3), prior.rim)
+        samples = flat.reshape(*grid.shape[:3], -1)
+        # Along the radius: Chebyshev points give monomials without error.
+        monomials = np.linalg.inv(np.vander(nodes, increasing=True))
+        samples = np.einsum("kr,yxrs->yxks", monomials, samples)
+        # Beyond the edge the neighbours are continued along a line.
+        samples = _extend(_extend(samples, 0), 1)
+        fit = _stencil()
+        rows, columns = self._counts[1], self._counts[0]
+        total = np.zeros((rows, columns, len(_POWERS), _RADII, flat.shape[1]), np.float32)
+        for number, (down, across) in enumerate(product(range(4), repeat=2)):
+            part = samples[down : down + rows, across : across + columns]
+            total += (fit[:, number][:, None, None] * part[:, :, None]).astype(np.float32)
+        return total.reshape(rows * columns, len(_POWERS) * _RADII, flat.shape[1])
+
+    def _first_boxes(self) -> Boxes:
+        counts = self._counts // self._per_box
+        width = np.array([*(self.size / counts), (self.radii[1] - self.radii[0]) / 2])
+        x, y = ((np.arange(count) + 0.5) * side for count, side in zip(counts, width, strict=False))
+        radius = self.radii[0] + np.array([0.5, 1.5]) * width[2]
+        centre = np.stack(np.meshgrid(y, x, radius, indexing="ij"), -1)[..., [1, 0, 2]].reshape(-1, 3)
+        return Boxes(centre, np.broadcast_to(width, centre.shape).copy())
+
+    def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return readings (N, S), N/N, and slopes (3, N, S), N/N/m, at x, y and radius (N, 3), m; float32."""
+        patch = np.clip((places[:, :2] / self._patch).astype(int), 0, self._counts - 1)
+        across, down = (2 * (places[:, :2] / self._patch - patch) - 1).T
+        half = (self.radii[1] - self.radii[0]) / 2
+        wide = (places[:, 2] - self.radii[0]) / half - 1
+        scales = (2 / self._patch[0], 2 / self._patch[1], 1 / half)
+        powers = _monomials(across, down, wide, scales)
+        felt = np.matmul(powers, self._coefficients[patch[:, 1] * self._counts[0] + patch[:, 0]])
+        return felt[:, 0], felt[:, 1:].transpose(1, 0, 2)
+
+
+def _monomials(
+    across: np.ndarray, down: np.ndarray, wide: np.ndarray, scales: tuple[float, float, float]
+) -> np.ndarray:
+    """Return what coefficients are multiplied by for the value and three derivatives, (N, 4, K), float32."""
+    x, y, r = (np.stack([np.ones_like(v), v, v * v, v * v * v], 1) for v in (across, down, wide))
+    dx, dy, dr = (
+        np.stack([np.zeros_like(v), np.ones_like(v), 2 * v, 3 * v * v], 1) * scale
+        for v, scale in zip((across, down, wide), scales, strict=True)
+    )
+    i, j = np.array(_POWERS).T
+    place = np.stack([x[:, i] * y[:, j], dx[:, i] * y[:, j], x[:, i] * dy[:, j], x[:, i] * y[:, j]], 1)
+    radius = np.stack([r, r, r, dr], 1)
+    return (place[..., None] * radius[:, :, None]).reshape(len(across), 4, -1).astype(np.float32)
+
+
+def _extend(samples: np.ndarray, axis: int) -> np.ndarray:
+    """Continue samples by a step at both ends of an axis."""
+    first, second = (samples.take([number], axis) for number in (0, 1))
+    last, before = (samples.take([number], axis) for number in (-1, -2))
+    return np.concatenate([2 * first - second, samples, 2 * last - before], axis)
+
+
+def _stencil() -> np.ndarray:
+    """Return what fits the polynomial of a patch to 4 x 4 samples, (terms, 16); the inner ones count most."""
+    at = np.array([-3.0, -1.0, 1.0, 3.0])
+    down, across = (part.ravel() for part in np.meshgrid(at, at, indexing="ij"))
+    design = np.stack([across**i * down**j for i, j in _POWERS], axis=1)
+    weight = np.where((np.abs(across) < 2) & (np.abs(down) < 2), 10.0, 1.0)
+    return np.linalg.pinv(design * weight[:, None]) * weight

@@ -105,6 +105,7 @@ class Boxes(NamedTuple):
 
 
 _POWERS = [(i, j) for i, j in product(range(4), repeat=2) if i + j <= 3]
+_EXPONENTS = np.array(_POWERS).T
 _RADII = 4  # Chebyshev points over the radii
 _PATCH = 0.002  # m, largest side of a patch
 
@@ -137,7 +138,7 @@ class Candidates:
         self._patch = self.size / self._counts
         self._coefficients = self._fit(simulator, body, prior)
         self.boxes = self._first_boxes()
-        self.readings, self.slopes = self.at(self.boxes.centre)
+        self.readings, self.slopes = (np.ascontiguousarray(part) for part in self.at(self.boxes.centre))
 
     def _fit(self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior) -> np.ndarray:
         """Return coefficients (patches, K, S), float32."""
@@ -184,15 +185,23 @@ def _monomials(
     across: np.ndarray, down: np.ndarray, wide: np.ndarray, scales: tuple[float, float, float]
 ) -> np.ndarray:
     """Return what coefficients are multiplied by for the value and three derivatives, (N, 4, K), float32."""
-    x, y, r = (np.stack([np.ones_like(v), v, v * v, v * v * v], 1) for v in (across, down, wide))
-    dx, dy, dr = (
-        np.stack([np.zeros_like(v), np.ones_like(v), 2 * v, 3 * v * v], 1) * scale
-        for v, scale in zip((across, down, wide), scales, strict=True)
-    )
-    i, j = np.array(_POWERS).T
-    place = np.stack([x[:, i] * y[:, j], dx[:, i] * y[:, j], x[:, i] * dy[:, j], x[:, i] * y[:, j]], 1)
-    radius = np.stack([r, r, r, dr], 1)
-    return (place[..., None] * radius[:, :, None]).reshape(len(across), 4, -1).astype(np.float32)
+    axes = np.stack([across, down, wide]).astype(np.float32)
+    powers = np.ones((3, 4, len(across)), np.float32)
+    powers[:, 1] = axes
+    np.multiply(axes, axes, out=powers[:, 2])
+    np.multiply(powers[:, 2], axes, out=powers[:, 3])
+    slopes = np.zeros_like(powers)
+    slopes[:, 1:] = powers[:, :3] * (np.arange(1, 4)[:, None] * np.array(scales)[:, None, None]).astype(np.float32)
+    i, j = _EXPONENTS
+    (x, y, r), (dx, dy, dr) = powers, slopes
+    columns = y[j]
+    place = x[i] * columns
+    terms = np.empty((4, len(_POWERS), _RADII, len(across)), np.float32)
+    np.multiply(place[:, None], r, out=terms[0])
+    np.multiply((dx[i] * columns)[:, None], r, out=terms[1])
+    np.multiply((x[i] * dy[j])[:, None], r, out=terms[2])
+    np.multiply(place[:, None], dr, out=terms[3])
+    return terms.reshape(4, -1, len(across)).transpose(2, 0, 1)
 
 
 def _extend(samples: np.ndarray, axis: int) -> np.ndarray:

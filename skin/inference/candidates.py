@@ -28,7 +28,9 @@ class FingertipPrior:
         spread: standard deviation of the logarithm of the force.
         radii: least and largest radius, m.
         rim: over which the pressure falls at the edge, m (:class:`skin.mechanics.geometry.Fingertip`).
-        numbers: probabilities of 0, 1, 2 and 3 contacts.
+        numbers: probabilities of 0, 1, 2 and 3 fingertips. By default a skin is idle or touched by one more often
+            than by several.
+        large: probability of a contact that is larger, such as a hand.
 
     Raises:
         InputError: a number that has no meaning.
@@ -38,7 +40,8 @@ class FingertipPrior:
     spread: float = 0.5
     radii: tuple[float, float] = (0.004, 0.012)
     rim: float = 0.0015
-    numbers: tuple[float, float, float, float] = (0.25, 0.25, 0.25, 0.25)
+    numbers: tuple[float, float, float, float] = (0.3, 0.4, 0.15, 0.05)
+    large: float = 0.1
 
     def __post_init__(self) -> None:
         if not (self.force > 0 and self.spread > 0 and self.rim > 0 and 0 < self.radii[0] < self.radii[1]):

@@ -1,289 +1,322 @@
-"""Posterior of one contact: boxes of places and radii, refined where the probability is."""
+"""Where and how hard a skin is touched, and how sure that is, from readings of any layout, without training."""
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import gammaincc, logsumexp
 
-from skin.inference.candidates import Boxes, Candidates, FingertipPrior
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+from skin.inference.candidates import Candidates, FingertipPrior
+from skin.inference.contact import Cloud, one_contact
+from skin.inference.contacts import Mixture, Search
+from skin.inference.likelihood import Frame
 from skin.inference.noise import Noise
+from skin.mechanics.simulator.base import AbstractSimulator
 
-# A frame, and the likelihood of candidates. Forces are integrated around the most probable one.
+MOST_CONTACTS = 3
+"""Contacts that are told apart."""
 
-
-_NEWTON = 3  # steps towards the most probable force; the last one changes it by less than 1 %
-_NODES = {False: 3, True: 15}  # of the integral over forces, by whether a sensor clips
+_FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
+_POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
+_CELLS = 160  # of a region, along an axis at most
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A frame as the likelihood needs it.
+class Region:
+    """The most probable places of a contact, as cells of a raster.
 
     Attributes:
-        readings: (S,), N, float32; 0 where they do not count.
-        counts: (S,), float32: 1 where the reading has a value, 0 where a sensor is invalid or clips.
-        clipped: indices of sensors that clip.
+        cells: (C, 2), x and y of their centres, m.
+        width: (2,), of a cell, m.
+        share: probability that they hold.
+    """
+
+    cells: np.ndarray
+    width: np.ndarray
+    share: float
+
+    @property
+    def area(self) -> float:
+        """Area of all cells, m^2."""
+        return float(len(self.cells) * self.width.prod())
+
+    def contains(self, place: np.ndarray) -> bool:
+        """Return whether a place (2,), m, lies in a cell."""
+        return bool((np.abs(self.cells - place) <= self.width / 2).all(axis=1).any())
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """Posterior of one contact; samples are weighted.
+
+    Attributes:
+        place, place_deviation: (2,), mean and standard deviation of x and y, m.
+        force, force_deviation: N.
+        radius, radius_deviation: m.
+        peak, peak_deviation: highest pressure, Pa.
+        places, widths: (N, 2), boxes that hold the place, m.
+        peaks: (N, J), Pa, of the boxes' forces.
+        weights: (N, J), probabilities that sum to 1.
+    """
+
+    place: np.ndarray
+    place_deviation: np.ndarray
+    force: float
+    force_deviation: float
+    radius: float
+    radius_deviation: float
+    peak: float
+    peak_deviation: float
+    places: np.ndarray = field(repr=False)
+    widths: np.ndarray = field(repr=False)
+    peaks: np.ndarray = field(repr=False)
+    weights: np.ndarray = field(repr=False)
+
+    def exceeds(self, pressure: float) -> float:
+        """Return the probability that the highest pressure is above a limit, Pa."""
+        return float(self.weights[self.peaks > pressure].sum())
+
+    def region(self, share: float = 0.9) -> Region:
+        """Return the smallest set of cells that holds the place with a probability; it may have parts."""
+        weight = self.weights.sum(1)
+        low, high = (self.places - self.widths / 2).min(0), (self.places + self.widths / 2).max(0)
+        steps = np.clip(np.ceil((high - low) / self.widths.min(0) - 1e-6), 1, _CELLS).astype(int)
+        edges = [np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1)]
+        parts = [_overlap(edges[axis], self.places[:, axis], self.widths[:, axis]) for axis in (0, 1)]
+        mass = (parts[0] * weight[:, None]).T @ parts[1]
+        order = np.argsort(-mass, axis=None, kind="stable")
+        total = np.cumsum(mass.ravel()[order])
+        # The last cell counts if the share is nearer with it than without.
+        count = max(1, int(np.argmin(np.abs(total - share))) + 1)
+        chosen = np.unravel_index(order[:count], mass.shape)
+        middles = [(line[1:] + line[:-1]) / 2 for line in edges]
+        cells = np.stack([middles[axis][chosen[axis]] for axis in (0, 1)], axis=1)
+        return Region(cells, (high - low) / steps, float(total[count - 1]))
+
+
+def _overlap(edges: np.ndarray, centre: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return the share of each interval between edges, (N, cells)."""
+    low, high = (centre - width / 2)[:, None], (centre + width / 2)[:, None]
+    return np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0, None) / width[:, None]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the readings of a frame tell.
+
+    Attributes:
+        number: the most probable number of contacts.
+        probabilities: (4,), of 0, 1, 2 and 3 contacts, if they are fingertips.
+        contacts: ``number`` of them, the strongest first.
+        fit: posterior predictive p-value: how often such contacts would give readings that fit worse.
+        large: probability of a larger contact, such as a hand, beside those of fingertips.
+        fingertip: whether there are contacts, they fit, and a larger one is less probable.
+        unknown: what cannot be known from these sensors, or None.
+    """
+
+    number: int
+    probabilities: np.ndarray
+    contacts: tuple[ContactEstimate, ...]
+    fit: float
+    large: float
+    fingertip: bool
+    unknown: str | None
+
+    def exceeds(self, pressure: float) -> float:
+        """Return the probability that some contact's highest pressure is above a limit, Pa."""
+        return 1 - math.prod(1 - contact.exceeds(pressure) for contact in self.contacts)
+
+
+class Posterior:
+    """Estimates contacts from readings, for any layout on a sheet or an arm, without training.
+
+    Readings of contacts add up, so those of all candidates are one table. Places and radii are refined around
+    the best candidates, forces are integrated. A silent sensor informs, too.
+
+    Args:
+        simulator: of the skin: ``solid``, ``naive``, or ``fem`` with ``reading=interface``. Readings of
+            equation 10 do not add up: it takes ``contacts=1``.
         noise: of the readings.
+        body: the skin.
+        prior: of fingertips; None: the default.
+        contacts: the largest number of contacts, up to three.
+
+    Raises:
+        InputError: a simulator whose readings do not add up, or more contacts than three.
     """
 
-    readings: np.ndarray
-    counts: np.ndarray
-    clipped: np.ndarray
-    noise: Noise
+    def __init__(
+        self,
+        simulator: AbstractSimulator,
+        noise: Noise,
+        body: AbstractBody,
+        prior: FingertipPrior | None = None,
+        contacts: int = MOST_CONTACTS,
+    ) -> None:
+        if not 1 <= contacts <= MOST_CONTACTS:
+            raise InputError(f"a posterior tells 1 to {MOST_CONTACTS} contacts apart, got contacts={contacts}")
+        if not isinstance(simulator, AbstractSimulator):
+            raise InputError(
+                f"a posterior needs the mechanics of a skin, such as skin.Solid(body, sensors), got {simulator!r}"
+            )
+        if contacts > 1 and getattr(simulator, "reading", None) == "equation10":
+            raise InputError(
+                "readings of simulator.reading=equation10 do not add up, so that only one contact can be "
+                "estimated: give contacts=1, or set simulator.reading=interface or simulator=solid"
+            )
+        self.noise, self.prior, self._most = noise, prior or FingertipPrior(), contacts
+        self.candidates = Candidates(simulator, body, self.prior)
+        self._search = Search(self.candidates, self.prior)
+        self._numbers = np.log(np.array(self.prior.numbers[: contacts + 1]))
+        self._peak = self.prior.peak
 
-    @classmethod
-    def of(cls, readings: np.ndarray, valid: np.ndarray, saturated: np.ndarray, noise: Noise) -> "Frame":
-        """Return the frame of readings, valid and saturated, each (S,)."""
-        valued = valid & ~saturated
-        values = np.where(valued, readings, 0.0).astype(np.float32)
-        return cls(values, valued.astype(np.float32), np.flatnonzero(valid & saturated), noise)
+    def estimate(
+        self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
+    ) -> "Estimate | list[Estimate]":
+        """Return what readings tell, frame by frame.
 
-    def empty(self) -> float:
-        """Return the log likelihood of no contact at all."""
-        return float(self.likelihood(np.zeros((1, len(self.readings)), np.float32), np.float32(0))[0])
+        Args:
+            readings: (S,), N, or (T, S) of several frames.
+            valid: same shape, bool: which have a value; None: those that are finite.
+            saturated: same shape, bool: which exceed the largest force; None: those from ``noise.clip`` up.
 
-    def likelihood(self, felt: np.ndarray, spread: np.ndarray | np.float32) -> np.ndarray:
-        """Return the log likelihood (...,) of true readings (..., S), N, with further variances, N^2."""
-        variance = spread + np.float32(self.noise.floor)
-        terms = self.readings - felt
-        terms *= terms
-        terms /= variance
-        fit = terms @ self.counts
-        fit += np.log(np.float32(2 * math.pi) * variance) @ self._each(variance)
-        fit *= np.float32(-0.5)
-        if len(self.clipped):
-            fit += self.clipping(felt[..., self.clipped], variance)
-        return fit
+        Raises:
+            InputError: readings of another number of sensors.
+        """
+        values = np.asarray(readings, dtype=float)
+        sensors = self.candidates.readings.shape[1]
+        if values.ndim not in (1, 2) or values.shape[-1] != sensors:
+            raise InputError(
+                f"this skin has {sensors} sensors: give readings ({sensors},) or (T, {sensors}), N, got "
+                f"{values.shape}"
+            )
+        valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
+        clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
+        frames = zip(*(np.atleast_2d(part) for part in (values, valued, valued & clips)), strict=True)
+        estimates = [self._frame(Frame.of(*frame, self.noise)) for frame in frames]
+        return estimates if values.ndim == 2 else estimates[0]
 
-    def _each(self, variance: np.ndarray) -> np.ndarray:
-        return self.counts if variance.ndim else self.counts.sum()[None]
+    def estimate_touch(
+        self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
+    ) -> Estimate:
+        """Return what the frames of a touch that does not move tell together.
 
-    def clipping(self, felt: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """Return the log probability (...,) that the sensors that clip do so, from their readings (..., C)."""
-        deviation = np.sqrt(variance[..., self.clipped] if variance.ndim else variance)
-        return log_ndtr((felt - np.float32(self.noise.clip)) / deviation).sum(-1)
+        Readings are proportional to the force, so that the mean of the frames is the reading of the mean
+        force. A sensor that is invalid or clips in a frame is so in all.
 
+        Args:
+            readings: (T, S), N.
+            valid, saturated: as of :meth:`estimate`.
+        """
+        values = np.atleast_2d(np.asarray(readings, dtype=float))
+        valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
+        clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
+        noise = replace(self.noise, frames=self.noise.frames * len(values))
+        return self._frame(Frame.of(values.mean(0), valued.all(0), (valued & clips).any(0), noise))
 
-def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray) -> np.ndarray | None:
-    """Return the variance from gains and positions of sensors (N, S), per square newton of force, or None."""
-    spread = None
-    if noise.gain:
-        spread = (np.float32(noise.gain) * readings) ** 2
-    if noise.position:
-        moved = np.float32(noise.position**2) * (slopes[0] ** 2 + slopes[1] ** 2)
-        spread = moved if spread is None else spread + moved
-    return spread
+    def _frame(self, frame: Frame) -> Estimate:
+        """Return the estimate of a frame, which depends on nothing else."""
+        single = one_contact(self.candidates, self.prior, frame)
+        evidence, mixtures = self._several(frame, single)
+        logs = np.array(evidence) + self._numbers
+        number = int(logs.argmax())
+        probabilities = np.exp(logs - logsumexp(logs))
+        sensors = int(frame.counts.sum()) + len(frame.clipped)
+        misfit = {0: frame.misfit_empty(), 1: single.misfit}.get(number)
+        if misfit is None:
+            misfit = mixtures[number].misfit
+        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
+        contacts = self._contacts(number, single, mixtures)
+        fingertip = number > 0 and fit >= _FITS
+        return Estimate(number, probabilities, contacts, fit, 0.0, fingertip, _unknown(sensors, frame))
 
+    def _several(self, frame: Frame, single: Cloud) -> tuple[list[float], dict[int, Mixture]]:
+        """Return the log evidence of each number of contacts, and the posteriors of several."""
+        evidence, mixtures, mode, misfit = [frame.empty(), single.evidence], {}, single.mode, single.misfit
+        sensors = max(frame.counts.sum(), 1) / 2
+        felt = self._search.felt(mode[None])[0][0]
+        for number in range(2, self._most + 1):
+            guesses, factor = self._search.add(frame, mode)
+            silent = evidence[-1] + factor
+            odds = factor + self._numbers[number] - self._numbers[number - 1]
+            if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
+                evidence.append(silent)
+                continue
+            mixture = self._refine(frame, guesses, mode, felt)
+            evidence.append(max(silent, mixture.evidence))
+            mixtures[number] = mixture
+            mode, felt, misfit = mixture.mode, mixture.felt, mixture.misfit
+        return evidence, mixtures
 
-class Forces(NamedTuple):
-    """Posterior of the force of each of N candidates, to second order.
+    def _refine(self, frame: Frame, guesses: np.ndarray, mode: np.ndarray, felt: np.ndarray) -> Mixture:
+        """Return the best contacts, one more than a mode (n, 4), from several starts."""
+        starts = [guesses]
+        for index in range(len(mode)):
+            others = np.delete(mode, index, 0)
+            left = felt * 0 if not len(others) else self._search.felt(others[None])[0][0]
+            pairs = self._search.pairs(frame, left)
+            starts.append(np.concatenate([np.repeat(others[None], len(pairs), 0), pairs], axis=1))
+        modes, score = self._search.refine(frame, np.concatenate(starts))
+        return self._search.sample(frame, modes[score.argmax()])
 
-    Attributes:
-        mode: (N,), of the logarithm of the force.
-        curvature: (N,), of the log posterior there.
-    """
+    def _contacts(self, number: int, single: Cloud, mixtures: dict[int, Mixture]) -> tuple[ContactEstimate, ...]:
+        if number == 0:
+            return ()
+        if number == 1:
+            boxes = single.boxes
+            return (
+                self._summary(
+                    boxes.centre[:, :2], boxes.width[:, :2], boxes.centre[:, 2:], single.force, single.weight
+                ),
+            )
+        if number not in mixtures:
+            raise AssertionError("a number of contacts that was not refined is not the most probable")
+        mixture = mixtures[number]
+        weight = mixture.weight[:, None]
+        parts = list[ContactEstimate]()
+        for contact in mixture.samples.transpose(1, 0, 2):
+            spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
+            widths = np.broadcast_to(0.6 * spread, (len(contact), 2))
+            parts.append(self._summary(contact[:, :2], widths, contact[:, 2:3], contact[:, 3:], weight))
+        return tuple(sorted(parts, key=lambda part: -part.force))
 
-    mode: np.ndarray
-    curvature: np.ndarray
-
-
-def fit_force(
-    frame: Frame, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray
-) -> tuple[Forces, np.ndarray]:
-    """Return the force of candidates, and the log of the likelihood (N,) integrated over its prior.
-
-    Args:
-        frame: the frame.
-        prior: of the force.
-        readings: (N, S), N/N.
-        spread: (N, S), further variance per square newton.
-    """
-    floor, values = np.float32(frame.noise.floor), frame.readings
-    plain = frame.counts / (floor + (np.float32(frame.noise.gain) * values) ** 2)
-    squares = readings * readings
-    mode = _mode(prior, readings @ (plain * values), squares @ plain, None).mode
-    force = np.exp(mode)[:, None]
-    variance = force * force * spread
-    variance += floor
-    squares /= variance
-    along = (readings / variance) @ (frame.counts * values)
-    forces = _mode(prior, along, squares @ frame.counts, mode)
-    force = np.exp(forces.mode)[:, None]
-    variance = force * force * spread
-    fit = frame.likelihood(force * readings, variance)
-    return forces, fit + _density(prior, forces.mode) - np.float32(0.5) * np.log(forces.curvature)
-
-
-def _density(prior: FingertipPrior, mode: np.ndarray) -> np.ndarray:
-    """Return the log of the prior of a log force, but for the root of 2 pi."""
-    return -0.5 * ((mode - math.log(prior.force)) / prior.spread) ** 2 - math.log(prior.spread)
-
-
-def _mode(prior: FingertipPrior, along: np.ndarray, square: np.ndarray, start: np.ndarray | None) -> Forces:
-    """Return the most probable log force, that of A F - B F^2 / 2 and the prior."""
-    centre, tight = math.log(prior.force), 1 / prior.spread**2
-    if start is None:
-        # Far above the noise the readings decide, else the prior.
-        free = np.log(np.maximum(along, np.float32(1e-12)) / np.maximum(square, np.float32(1e-12)))
-        start = np.where(along * along > square, np.maximum(free, centre - 9 * prior.spread), centre)
-    mode = start.astype(np.float32)
-    for _ in range(_NEWTON):
-        pull, curvature = _push(mode, along, square)
-        pull -= tight * (mode - centre)
-        curvature += tight
-        pull /= curvature
-        mode += np.minimum(np.maximum(pull, -1), 1)
-    return Forces(mode, _push(mode, along, square)[1] + tight)
-
-
-def _push(mode: np.ndarray, along: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slope of A F - B F^2 / 2 along log F, and its curvature or a part of it that is positive."""
-    force = np.exp(mode)
-    rising, falling = along * force, square * force
-    falling *= force
-    return rising - falling, np.maximum(2 * falling - rising, 0.5 * falling)
-
-
-def integrate_force(
-    frame: Frame, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray | None, fit: Forces
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return forces (N, J), N, and the log weight of each, whose sum is the integral over the prior.
-
-    Args:
-        frame, prior, readings: as of :func:`fit_force`.
-        spread: (N, S), further variance per square newton; None: none.
-        fit: where the forces are.
-    """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES[bool(len(frame.clipped))])
-    deviation = 1 / np.sqrt(fit.curvature)
-    logarithm = fit.mode[:, None] + nodes.astype(np.float32) * deviation[:, None]
-    force = np.exp(logarithm)
-    if spread is None:
-        likelihood = _quadratic(frame, readings, force)
-    else:
-        felt, further = force[..., None] * readings[:, None], (force * force)[..., None] * spread[:, None]
-        likelihood = frame.likelihood(felt, further)
-    factor = np.log(weights / math.sqrt(2 * math.pi)) + nodes**2 / 2 + np.log(deviation)[:, None]
-    return force, likelihood + _density(prior, logarithm) + factor
-
-
-def _quadratic(frame: Frame, readings: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Return the log likelihood of forces (N, J) where the variance does not depend on them."""
-    floor = frame.noise.floor
-    precise = readings.astype(float)
-    values, counts = frame.readings.astype(float), frame.counts.astype(float)
-    along, square = precise @ (counts * values), (precise * precise) @ counts
-    misfit = values @ values - force * (2 * along[:, None] - force * square[:, None])
-    fit = -0.5 * (misfit / floor + counts.sum() * math.log(2 * math.pi * floor))
-    if len(frame.clipped):
-        fit += frame.clipping(force[..., None] * precise[:, None, frame.clipped], np.asarray(floor))
-    return fit
-
-
-# Boxes, refined.
-
-
-_LENGTH = 1.0  # a box is split along an axis that is longer, in standard deviations
-_DROPPED = 1e-4  # probability that may be lost in a refinement
-_MOST = 700  # boxes that are refined no further
-_ROUNDS = 12
-_RADIUS_STEP = 0.3  # largest share of the radii in a box
+    def _summary(
+        self, places: np.ndarray, widths: np.ndarray, radius: np.ndarray, force: np.ndarray, weight: np.ndarray
+    ) -> ContactEstimate:
+        """Return the moments of weighted places (N, 2), radii (N, 1) and forces (N, J)."""
+        total = weight.sum(1)
+        peaks = self._peak(radius) * force
+        place, size = total @ places, float(total @ radius[:, 0])
+        mean, peak = float((weight * force).sum()), float((weight * peaks).sum())
+        return ContactEstimate(
+            place,
+            np.sqrt(_variance(places, total)),
+            mean,
+            math.sqrt(float((weight * (force - mean) ** 2).sum())),
+            size,
+            math.sqrt(float(total @ (radius[:, 0] - size) ** 2)),
+            peak,
+            math.sqrt(float((weight * (peaks - peak) ** 2).sum())),
+            places,
+            widths,
+            peaks,
+            weight,
+        )
 
 
-@dataclass(frozen=True)
-class Cloud:
-    """Posterior of one contact as weighted boxes.
-
-    Attributes:
-        boxes: N of them.
-        force: (N, J), N.
-        weight: (N, J), probabilities that sum to 1.
-        evidence: log of the likelihood integrated over the prior.
-    """
-
-    boxes: Boxes
-    force: np.ndarray
-    weight: np.ndarray
-    evidence: float
+def _variance(places: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return weight @ (places - weight @ places) ** 2
 
 
-def one_contact(candidates: Candidates, prior: FingertipPrior, frame: Frame) -> Cloud:
-    """Return the posterior of one contact."""
-    boxes, readings, slopes = candidates.boxes, candidates.readings, candidates.slopes
-    for _ in range(_ROUNDS):
-        spread = relative_variance(frame.noise, readings, slopes)
-        forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread))
-        kept = _probable(evidence + np.log(boxes.width.prod(1)))
-        boxes = Boxes(boxes.centre[kept], boxes.width[kept])
-        readings, slopes = readings[kept], slopes[:, kept]
-        spread = None if spread is None else spread[kept]
-        forces = Forces(forces.mode[kept], forces.curvature[kept])
-        along = _lengths(frame, prior, forces, readings, slopes, spread) * boxes.width > _LENGTH
-        along[:, 2] |= boxes.width[:, 2] > _RADIUS_STEP * (prior.radii[1] - prior.radii[0])
-        if len(kept) > _MOST or not along.any():
-            break
-        boxes = boxes.split(along)
-        readings, slopes = candidates.at(boxes.centre)
-    return _weigh(frame, prior, boxes, readings, spread, forces)
-
-
-def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
-    """Return the variance (N, S) per square newton with that over a box, so that a box speaks for all in it."""
-    scaled = slopes * (boxes.width * math.sqrt(1 / 12)).T.astype(np.float32)[..., None]
-    scaled *= scaled
-    blurred = scaled[0]
-    blurred += scaled[1]
-    blurred += scaled[2]
-    return blurred if spread is None else blurred + spread
-
-
-def _probable(evidence: np.ndarray) -> np.ndarray:
-    """Return the indices of what holds nearly all probability, in their order."""
-    chance = np.exp(evidence - evidence.max())
-    order = np.argsort(chance)
-    lost = np.cumsum(chance[order], dtype=float)
-    return np.sort(order[lost > _DROPPED * lost[-1]])
-
-
-def _lengths(
-    frame: Frame,
-    prior: FingertipPrior,
-    fit: Forces,
-    readings: np.ndarray,
-    slopes: np.ndarray,
-    spread: np.ndarray | None,
-) -> np.ndarray:
-    """Return standard deviations per m along place and radius (N, 3), with the force unknown."""
-    force = np.exp(fit.mode)[:, None]
-    square = force * force
-    variance = np.float32(frame.noise.floor) + (0 if spread is None else square * spread)
-    weight = np.broadcast_to(frame.counts / variance, readings.shape)
-    if len(frame.clipped):
-        # A sensor that clips tells about as much as its reading, near the limit.
-        near = np.abs(force * readings[:, frame.clipped] - frame.noise.clip)
-        deviation = np.broadcast_to(np.sqrt(variance), readings.shape)[:, frame.clipped]
-        weight = weight.copy()
-        weight[:, frame.clipped] = np.exp(-0.5 * (near / deviation) ** 2) / deviation**2
-    square = square * weight
-    felt = readings * square
-    whole = np.vecdot(felt, readings) + 1 / prior.spread**2
-    crossed = np.vecdot(slopes, felt)
-    return np.sqrt(np.maximum(np.vecdot(slopes * square, slopes) - crossed**2 / whole, 0)).T
-
-
-def _weigh(
-    frame: Frame,
-    prior: FingertipPrior,
-    boxes: Boxes,
-    readings: np.ndarray,
-    spread: np.ndarray | None,
-    fit: Forces,
-) -> Cloud:
-    force, logs = integrate_force(frame, prior, readings, spread, fit)
-    logs = logs + np.log(boxes.width.prod(1))[:, None]
-    top = logs.max()
-    weight = np.exp(logs - top)
-    total = weight.sum()
-    return Cloud(boxes, force, weight / total, float(top + math.log(total)))
+def _unknown(sensors: int, frame: Frame) -> str | None:
+    """Return what a frame cannot tell, in a sentence."""
+    if sensors == 0:
+        return "no sensor is valid: nothing is known beyond the prior"
+    if sensors < 3:
+        return (
+            f"{sensors} valid sensor{'s' if sensors > 1 else ''}: place and force cannot be told apart; "
+            "a region is where the prior allows, and several contacts look like one"
+        )
+    return None

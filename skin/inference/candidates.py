@@ -1,14 +1,11 @@
 """Readings of fingertips on a skin, for every place and radius: sampled once, then interpolated."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.polynomial import chebyshev
-from scipy.special import ndtr
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
@@ -28,8 +25,8 @@ class FingertipPrior:
         spread: standard deviation of the logarithm of the force.
         radii: least and largest radius, m.
         rim: over which the pressure falls at the edge, m (:class:`skin.mechanics.geometry.Fingertip`).
-        numbers: probabilities of 0, 1, 2 and 3 fingertips. By default a skin is idle or touched by one more often
-            than by several.
+        numbers: probabilities of 0, 1, 2 and 3 fingertips. By default a skin is idle or touched by one
+            fingertip more often than by several.
         large: probability of a contact that is larger, such as a hand.
 
     Raises:
@@ -44,6 +41,11 @@ class FingertipPrior:
     large: float = 0.1
 
     def __post_init__(self) -> None:
+        if min(self.numbers) < 0 or not any(self.numbers[1:]) or not self.large >= 0:
+            raise InputError(
+                "a prior of fingertips needs probabilities of 0 or more, and one above 0 of a contact, got "
+                f"numbers={list(self.numbers)} and large={self.large:g}"
+            )
         if not (self.force > 0 and self.spread > 0 and self.rim > 0 and 0 < self.radii[0] < self.radii[1]):
             raise InputError(
                 "a prior of fingertips needs force, spread and rim above 0 and two rising radii, got "
@@ -113,7 +115,7 @@ _RADII = 4  # Chebyshev points over the radii
 _PATCH = 0.002  # m, largest side of a patch
 
 
-class Candidates:
+class CandidateReadings:
     """Readings per newton of fingertips anywhere, and their derivatives.
 
     The surface is divided into patches of at most 2 mm. On each, readings are polynomials of third order in
@@ -194,7 +196,9 @@ def _monomials(
     np.multiply(axes, axes, out=powers[:, 2])
     np.multiply(powers[:, 2], axes, out=powers[:, 3])
     slopes = np.zeros_like(powers)
-    slopes[:, 1:] = powers[:, :3] * (np.arange(1, 4)[:, None] * np.array(scales)[:, None, None]).astype(np.float32)
+    slopes[:, 1:] = powers[:, :3] * (np.arange(1, 4)[:, None] * np.array(scales)[:, None, None]).astype(
+        np.float32
+    )
     i, j = _EXPONENTS
     (x, y, r), (dx, dy, dr) = powers, slopes
     columns = y[j]

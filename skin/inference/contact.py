@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skin.inference.candidates import Boxes, Candidates, FingertipPrior
-from skin.inference.likelihood import Forces, Frame, fit_force, integrate_force, relative_variance
+from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
+from skin.inference.likelihood import Forces, Observation, fit_force, integrate_force, relative_variance
 
 _LENGTH = 1.0  # a box is split along an axis that is longer, in standard deviations
 _DROPPED = 1e-4  # probability that may be lost in a refinement
@@ -35,12 +35,12 @@ class Cloud:
 
     @property
     def mode(self) -> np.ndarray:
-        """The most probable contact (1, 4): x, y and radius, m, and the logarithm of the force."""
+        """The most probable contact (1, 4): x, y and radius, m, and force, N."""
         box, force = np.unravel_index(self.weight.argmax(), self.weight.shape)
-        return np.array([[*self.boxes.centre[box], math.log(self.force[box, force])]])
+        return np.array([[*self.boxes.centre[box], self.force[box, force]]])
 
 
-def one_contact(candidates: Candidates, prior: FingertipPrior, frame: Frame) -> Cloud:
+def one_contact(candidates: CandidateReadings, prior: FingertipPrior, frame: Observation) -> Cloud:
     """Return the posterior of one contact."""
     boxes, readings, slopes = candidates.boxes, candidates.readings, candidates.slopes
     for _ in range(_ROUNDS):
@@ -61,7 +61,7 @@ def one_contact(candidates: Candidates, prior: FingertipPrior, frame: Frame) -> 
 
 
 def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
-    """Return the variance (N, S) per square newton with that over a box, so that a box speaks for all in it."""
+    """Return the variance (N, S) per square newton with that over a box, which then speaks for all in it."""
     scaled = slopes * (boxes.width * math.sqrt(1 / 12)).T.astype(np.float32)[..., None]
     scaled *= scaled
     blurred = scaled[0]
@@ -79,7 +79,7 @@ def _probable(evidence: np.ndarray) -> np.ndarray:
 
 
 def _lengths(
-    frame: Frame,
+    frame: Observation,
     prior: FingertipPrior,
     fit: Forces,
     readings: np.ndarray,
@@ -105,8 +105,8 @@ def _lengths(
 
 
 def _weigh(
-    candidates: Candidates,
-    frame: Frame,
+    candidates: CandidateReadings,
+    frame: Observation,
     prior: FingertipPrior,
     boxes: Boxes,
     readings: np.ndarray,

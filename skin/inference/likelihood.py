@@ -15,7 +15,7 @@ _NODES = {False: 3, True: 15}  # of the integral over forces, by whether a senso
 
 
 @dataclass(frozen=True)
-class Frame:
+class Observation:
     """A frame as the likelihood needs it.
 
     Attributes:
@@ -31,7 +31,9 @@ class Frame:
     noise: Noise
 
     @classmethod
-    def of(cls, readings: np.ndarray, valid: np.ndarray, saturated: np.ndarray, noise: Noise) -> "Frame":
+    def of(
+        cls, readings: np.ndarray, valid: np.ndarray, saturated: np.ndarray, noise: Noise
+    ) -> "Observation":
         """Return the frame of readings, valid and saturated, each (S,)."""
         valued = valid & ~saturated
         values = np.where(valued, readings, 0.0).astype(np.float32)
@@ -60,7 +62,7 @@ class Frame:
         return fit
 
     def clipping(self, felt: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """Return the log probability (...,) that the sensors that clip do so, from their readings (..., C)."""
+        """Return the log probability (...,) that those sensors clip, from their readings (..., C), N."""
         deviation = np.sqrt(variance[..., self.clipped] if variance.ndim else variance)
         return log_ndtr((felt - np.float32(self.noise.clip)) / deviation).sum(-1)
 
@@ -89,7 +91,7 @@ class Forces(NamedTuple):
 
 
 def fit_force(
-    frame: Frame, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray
+    frame: Observation, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray
 ) -> tuple[Forces, np.ndarray]:
     """Return the force of candidates, and the log of the likelihood (N,) integrated over its prior.
 
@@ -146,7 +148,7 @@ def _push(mode: np.ndarray, along: np.ndarray, square: np.ndarray) -> tuple[np.n
 
 
 def integrate_force(
-    frame: Frame, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray | None, fit: Forces
+    frame: Observation, prior: FingertipPrior, readings: np.ndarray, spread: np.ndarray | None, fit: Forces
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return forces (N, J), N, and the log weight of each, whose sum is the integral over the prior.
 
@@ -168,7 +170,7 @@ def integrate_force(
     return force, likelihood + _density(prior, logarithm) + factor
 
 
-def _quadratic(frame: Frame, readings: np.ndarray, force: np.ndarray) -> np.ndarray:
+def _quadratic(frame: Observation, readings: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Return the log likelihood of forces (N, J) where the variance does not depend on them."""
     floor = frame.noise.floor
     precise = readings.astype(float)

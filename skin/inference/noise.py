@@ -33,7 +33,9 @@ class Noise:
 
     def __post_init__(self) -> None:
         if not self.frame > 0:
-            raise InputError(f"noise needs a standard deviation above 0 N in a frame, got frame={self.frame:g}")
+            raise InputError(
+                f"noise needs a standard deviation above 0 N in a frame, got frame={self.frame:g}"
+            )
         if self.frames < 1 or not self.clip > 0:
             raise InputError(
                 f"noise needs frames >= 1 and clip > 0 N, got frames={self.frames} and clip={self.clip:g}"

@@ -1,4 +1,4 @@
-"""Where and how hard a skin is touched, and how sure that is, from readings of any layout, without training."""
+"""Where and how hard a skin is touched, and how sure that is, from readings of any layout."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -8,10 +8,10 @@ from scipy.special import gammaincc, logsumexp
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.inference.candidates import Candidates, FingertipPrior
+from skin.inference.candidates import CandidateReadings, FingertipPrior
 from skin.inference.contact import Cloud, one_contact
 from skin.inference.contacts import Mixture, Search
-from skin.inference.likelihood import Frame
+from skin.inference.likelihood import Observation
 from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
 
@@ -103,7 +103,7 @@ def _overlap(edges: np.ndarray, centre: np.ndarray, width: np.ndarray) -> np.nda
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FrameEstimate:
     """What the readings of a frame tell.
 
     Attributes:
@@ -156,25 +156,30 @@ class Posterior:
         contacts: int = MOST_CONTACTS,
     ) -> None:
         if not 1 <= contacts <= MOST_CONTACTS:
-            raise InputError(f"a posterior tells 1 to {MOST_CONTACTS} contacts apart, got contacts={contacts}")
+            raise InputError(
+                f"a posterior tells 1 to {MOST_CONTACTS} contacts apart, got contacts={contacts}"
+            )
         if not isinstance(simulator, AbstractSimulator):
             raise InputError(
-                f"a posterior needs the mechanics of a skin, such as skin.Solid(body, sensors), got {simulator!r}"
+                f"a posterior needs the mechanics of a skin, such as skin.Solid, got {simulator!r}"
             )
         if contacts > 1 and getattr(simulator, "reading", None) == "equation10":
             raise InputError(
                 "readings of simulator.reading=equation10 do not add up, so that only one contact can be "
                 "estimated: give contacts=1, or set simulator.reading=interface or simulator=solid"
             )
-        self.noise, self.prior, self._most = noise, prior or FingertipPrior(), contacts
-        self.candidates = Candidates(simulator, body, self.prior)
+        self.noise, self.prior = noise, prior or FingertipPrior()
+        possible = np.flatnonzero(self.prior.numbers[: contacts + 1])
+        self._most = int(possible[-1])
+        self.candidates = CandidateReadings(simulator, body, self.prior)
         self._search = Search(self.candidates, self.prior)
-        self._numbers = np.log(np.array(self.prior.numbers[: contacts + 1]))
+        with np.errstate(divide="ignore"):
+            self._numbers = np.log(np.array(self.prior.numbers[: self._most + 1]))
         self._peak = self.prior.peak
 
     def estimate(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
-    ) -> "Estimate | list[Estimate]":
+    ) -> "FrameEstimate | list[FrameEstimate]":
         """Return what readings tell, frame by frame.
 
         Args:
@@ -194,13 +199,18 @@ class Posterior:
             )
         valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
         clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
-        frames = zip(*(np.atleast_2d(part) for part in (values, valued, valued & clips)), strict=True)
-        estimates = [self._frame(Frame.of(*frame, self.noise)) for frame in frames]
+        clipped = valued & clips
+        estimates = [
+            self._frame(Observation.of(frame, works, limits, self.noise))
+            for frame, works, limits in zip(
+                np.atleast_2d(values), np.atleast_2d(valued), np.atleast_2d(clipped), strict=True
+            )
+        ]
         return estimates if values.ndim == 2 else estimates[0]
 
     def estimate_touch(
         self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
-    ) -> Estimate:
+    ) -> FrameEstimate:
         """Return what the frames of a touch that does not move tell together.
 
         Readings are proportional to the force, so that the mean of the frames is the reading of the mean
@@ -214,9 +224,9 @@ class Posterior:
         valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
         clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
         noise = replace(self.noise, frames=self.noise.frames * len(values))
-        return self._frame(Frame.of(values.mean(0), valued.all(0), (valued & clips).any(0), noise))
+        return self._frame(Observation.of(values.mean(0), valued.all(0), (valued & clips).any(0), noise))
 
-    def _frame(self, frame: Frame) -> Estimate:
+    def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""
         single = one_contact(self.candidates, self.prior, frame)
         evidence, mixtures = self._several(frame, single)
@@ -228,13 +238,18 @@ class Posterior:
         if misfit is None:
             misfit = mixtures[number].misfit
         fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
+        if number in mixtures:
+            mixtures[number] = self._search.walk(frame, mixtures[number])
         contacts = self._contacts(number, single, mixtures)
         fingertip = number > 0 and fit >= _FITS
-        return Estimate(number, probabilities, contacts, fit, 0.0, fingertip, _unknown(sensors, frame))
+        return FrameEstimate(number, probabilities, contacts, fit, 0.0, fingertip, _unknown(sensors, frame))
 
-    def _several(self, frame: Frame, single: Cloud) -> tuple[list[float], dict[int, Mixture]]:
+    def _several(self, frame: Observation, single: Cloud) -> tuple[list[float], dict[int, Mixture]]:
         """Return the log evidence of each number of contacts, and the posteriors of several."""
-        evidence, mixtures, mode, misfit = [frame.empty(), single.evidence], {}, single.mode, single.misfit
+        evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
+        mode = np.column_stack(
+            [single.mode[:, :2], *self._search.scores(single.mode[:, 2], single.mode[:, 3])]
+        )
         sensors = max(frame.counts.sum(), 1) / 2
         felt = self._search.felt(mode[None])[0][0]
         for number in range(2, self._most + 1):
@@ -250,7 +265,7 @@ class Posterior:
             mode, felt, misfit = mixture.mode, mixture.felt, mixture.misfit
         return evidence, mixtures
 
-    def _refine(self, frame: Frame, guesses: np.ndarray, mode: np.ndarray, felt: np.ndarray) -> Mixture:
+    def _refine(self, frame: Observation, guesses: np.ndarray, mode: np.ndarray, felt: np.ndarray) -> Mixture:
         """Return the best contacts, one more than a mode (n, 4), from several starts."""
         starts = [guesses]
         for index in range(len(mode)):
@@ -259,9 +274,11 @@ class Posterior:
             pairs = self._search.pairs(frame, left)
             starts.append(np.concatenate([np.repeat(others[None], len(pairs), 0), pairs], axis=1))
         modes, score = self._search.refine(frame, np.concatenate(starts))
-        return self._search.sample(frame, modes[score.argmax()])
+        return self._search.sample(frame, modes, score)
 
-    def _contacts(self, number: int, single: Cloud, mixtures: dict[int, Mixture]) -> tuple[ContactEstimate, ...]:
+    def _contacts(
+        self, number: int, single: Cloud, mixtures: dict[int, Mixture]
+    ) -> tuple[ContactEstimate, ...]:
         if number == 0:
             return ()
         if number == 1:
@@ -276,14 +293,19 @@ class Posterior:
         mixture = mixtures[number]
         weight = mixture.weight[:, None]
         parts = list[ContactEstimate]()
-        for contact in mixture.samples.transpose(1, 0, 2):
+        for contact in self._search.contacts(mixture.samples).transpose(1, 0, 2):
             spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
             widths = np.broadcast_to(0.6 * spread, (len(contact), 2))
             parts.append(self._summary(contact[:, :2], widths, contact[:, 2:3], contact[:, 3:], weight))
         return tuple(sorted(parts, key=lambda part: -part.force))
 
     def _summary(
-        self, places: np.ndarray, widths: np.ndarray, radius: np.ndarray, force: np.ndarray, weight: np.ndarray
+        self,
+        places: np.ndarray,
+        widths: np.ndarray,
+        radius: np.ndarray,
+        force: np.ndarray,
+        weight: np.ndarray,
     ) -> ContactEstimate:
         """Return the moments of weighted places (N, 2), radii (N, 1) and forces (N, J)."""
         total = weight.sum(1)
@@ -310,7 +332,7 @@ def _variance(places: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return weight @ (places - weight @ places) ** 2
 
 
-def _unknown(sensors: int, frame: Frame) -> str | None:
+def _unknown(sensors: int, frame: Observation) -> str | None:
     """Return what a frame cannot tell, in a sentence."""
     if sensors == 0:
         return "no sensor is valid: nothing is known beyond the prior"

@@ -18,6 +18,7 @@ from skin.mechanics.simulator.base import AbstractSimulator
 MOST_CONTACTS = 3
 """Contacts that are told apart."""
 
+_PER_CONTACT = 3  # sensors that a contact takes at least: it has a place and a force
 _FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
 _POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
 _CELLS = 160  # of a region, along an axis at most
@@ -229,11 +230,12 @@ class Posterior:
     def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""
         single = one_contact(self.candidates, self.prior, frame)
-        evidence, mixtures = self._several(frame, single)
-        logs = np.array(evidence) + self._numbers
+        sensors = int(frame.counts.sum()) + len(frame.clipped)
+        evidence, mixtures = self._several(frame, single, min(self._most, max(1, sensors // _PER_CONTACT)))
+        logs = np.full(len(self._numbers), -np.inf)
+        logs[: len(evidence)] = np.array(evidence) + self._numbers[: len(evidence)]
         number = int(logs.argmax())
         probabilities = np.exp(logs - logsumexp(logs))
-        sensors = int(frame.counts.sum()) + len(frame.clipped)
         misfit = {0: frame.misfit_empty(), 1: single.misfit}.get(number)
         if misfit is None:
             misfit = mixtures[number].misfit
@@ -244,7 +246,9 @@ class Posterior:
         fingertip = number > 0 and fit >= _FITS
         return FrameEstimate(number, probabilities, contacts, fit, 0.0, fingertip, _unknown(sensors, frame))
 
-    def _several(self, frame: Observation, single: Cloud) -> tuple[list[float], dict[int, Mixture]]:
+    def _several(
+        self, frame: Observation, single: Cloud, most: int
+    ) -> tuple[list[float], dict[int, Mixture]]:
         """Return the log evidence of each number of contacts, and the posteriors of several."""
         evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
         mode = np.column_stack(
@@ -252,7 +256,7 @@ class Posterior:
         )
         sensors = max(frame.counts.sum(), 1) / 2
         felt = self._search.felt(mode[None])[0][0]
-        for number in range(2, self._most + 1):
+        for number in range(2, most + 1):
             guesses, factor = self._search.add(frame, mode)
             silent = evidence[-1] + factor
             odds = factor + self._numbers[number] - self._numbers[number - 1]

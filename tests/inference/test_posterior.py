@@ -232,7 +232,7 @@ def test_frames_of_a_touch_tell_more_together():
     frames = np.concatenate([measure(felt(touches), Noise(0.05), seed) for seed in range(10)])
     alone = posterior(noise=Noise(0.05)).estimate(frames[0])
     together = posterior(noise=Noise(0.05)).estimate_touch(frames)
-    assert together.contacts[0].place_deviation.max() < 0.6 * alone.contacts[0].place_deviation.max()
+    assert together.contacts[0].region().area < 0.5 * alone.contacts[0].region().area
     mean = posterior().estimate(frames.mean(0))
     np.testing.assert_allclose(together.contacts[0].place, mean.contacts[0].place, rtol=1e-9)
 
@@ -241,7 +241,7 @@ def test_two_sensors_say_what_cannot_be_known():
     body = DEEP
     sensors = sensors_of(body, 0.0295)
     two = type(sensors)(sensors.positions[[11, 13]], sensors.footprint)
-    estimate = Posterior(Solid(body, two), NOISE, body).estimate(np.array([0.5, 0.1]))
+    estimate = Posterior(Solid(body, two), NOISE, body).estimate(np.array([0.3, 0.0]))
     assert "cannot be told apart" in estimate.unknown
     assert estimate.number >= 1
     assert estimate.contacts[0].region().area > 5e-4
@@ -259,7 +259,7 @@ def test_a_limit_of_pressure_has_a_probability():
 
 
 def test_every_simulator_that_adds_up_and_an_arm_work():
-    touch, sensors = np.array([[0.07, 0.09, 0.008]]), Grid(5, 5, (0.01, 0.01)).sensors(THIN)
+    touch, sensors = np.array([[0.075, 0.083, 0.008]]), Grid(5, 5, (0.01, 0.01)).sensors(THIN)
     arm = Arm(
         radius=0.05, length=0.16, angle=3.2, cells=(16, 16),
         layers=[{"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}, "thickness": 0.01},

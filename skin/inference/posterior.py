@@ -4,13 +4,14 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import gammaincc, logsumexp
+from scipy.special import expit, gammaincc, logsumexp
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior
 from skin.inference.contact import Cloud, one_contact
 from skin.inference.contacts import Mixture, Search
+from skin.inference.large import LargeContacts
 from skin.inference.likelihood import Observation
 from skin.inference.noise import Noise
 from skin.mechanics.simulator.base import AbstractSimulator
@@ -174,6 +175,7 @@ class Posterior:
         self._most = int(possible[-1])
         self.candidates = CandidateReadings(simulator, body, self.prior)
         self._search = Search(self.candidates, self.prior)
+        self._large = LargeContacts(self.candidates, noise) if self.prior.large else None
         with np.errstate(divide="ignore"):
             self._numbers = np.log(np.array(self.prior.numbers[: self._most + 1]))
         self._peak = self.prior.peak
@@ -243,8 +245,16 @@ class Posterior:
         if number in mixtures:
             mixtures[number] = self._search.walk(frame, mixtures[number])
         contacts = self._contacts(number, single, mixtures)
-        fingertip = number > 0 and fit >= _FITS
-        return FrameEstimate(number, probabilities, contacts, fit, 0.0, fingertip, _unknown(sensors, frame))
+        large = self._probability_of_large(frame, float(logsumexp(logs)))
+        fingertip = number > 0 and fit >= _FITS and large < 0.5
+        return FrameEstimate(number, probabilities, contacts, fit, large, fingertip, _unknown(sensors, frame))
+
+    def _probability_of_large(self, frame: Observation, fingertips: float) -> float:
+        """Return the probability of a large contact, beside the log evidence of fingertips."""
+        if self._large is None:
+            return 0.0
+        odds = self._large.evidence(frame) + math.log(self.prior.large) - fingertips
+        return float(expit(odds))
 
     def _several(
         self, frame: Observation, single: Cloud, most: int

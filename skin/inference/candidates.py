@@ -1,6 +1,7 @@
 """Readings of fingertips on a skin, for every place and radius: sampled once, then interpolated."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
@@ -54,11 +55,15 @@ class FingertipPrior:
 
     def peak(self, radius: np.ndarray) -> np.ndarray:
         """Return the pressure in the middle of a fingertip of 1 N and some radius, m, in Pa/N."""
+        return np.interp(radius, *self._peaks)
+
+    @cached_property
+    def _peaks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Radii, m, and the pressure in the middle of fingertips of 1 N, Pa."""
         knots = np.linspace(*self.radii, 33)
         reach = np.linspace(0, 1, 400)[:, None] * (knots + 12 * self.rim)
         share = 1 / (1 + np.exp((reach - knots) / self.rim))
-        area = np.trapezoid(2 * np.pi * reach * share, reach, axis=0)
-        return np.interp(radius, knots, share[0] / area)
+        return knots, share[0] / np.trapezoid(2 * np.pi * reach * share, reach, axis=0)
 
 
 def disc_readings(
@@ -128,6 +133,8 @@ class CandidateReadings:
         coarse: largest width of the first boxes, m.
 
     Attributes:
+        radii, span: least and largest radius, and their difference, m.
+        size: of the body, (2,), m.
         boxes: the first boxes, which cover the surface and the radii.
         readings: (N, S), N/N, in their centres, float32.
         slopes: (3, N, S), their derivatives, N/N/m, float32.
@@ -137,6 +144,7 @@ class CandidateReadings:
         self, simulator: AbstractSimulator, body: AbstractBody, prior: FingertipPrior, coarse: float = 0.004
     ) -> None:
         self.radii, self.size = prior.radii, np.array(body.size)
+        self.span = prior.radii[1] - prior.radii[0]
         # An even number, so that two by two of them make a first box.
         self._per_box = max(1, round(coarse / _PATCH))
         self._counts = self._per_box * np.ceil(self.size / coarse - 1e-9).astype(int)
@@ -178,7 +186,7 @@ class CandidateReadings:
         """Return readings (N, S), N/N, and slopes (3, N, S), N/N/m, at x, y and radius (N, 3), m; float32."""
         patch = np.clip((places[:, :2] / self._patch).astype(int), 0, self._counts - 1)
         across, down = (2 * (places[:, :2] / self._patch - patch) - 1).T
-        half = (self.radii[1] - self.radii[0]) / 2
+        half = self.span / 2
         wide = (places[:, 2] - self.radii[0]) / half - 1
         scales = (2 / self._patch[0], 2 / self._patch[1], 1 / half)
         powers = _monomials(across, down, wide, scales)

@@ -1,7 +1,9 @@
 """One contact: boxes of places and radii, refined where the probability is."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,8 +11,8 @@ from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
 from skin.inference.likelihood import Forces, Observation, fit_force, integrate_force, relative_variance
 
 _LENGTH = 1.0  # a box is split along an axis that is longer, in standard deviations
-_DROPPED = 1e-4  # probability that may be lost in a refinement
-_MOST = 700  # boxes that are refined no further
+_DROPPED = 3e-4  # probability that may be lost in a refinement
+_MOST = 900  # boxes
 _ROUNDS = 12
 _RADIUS_STEP = 0.3  # largest share of the radii in a box
 
@@ -40,24 +42,77 @@ class Cloud:
         return np.array([[*self.boxes.centre[box], self.force[box, force]]])
 
 
+class _Leaves(NamedTuple):
+    """Boxes with what is computed of them.
+
+    Attributes:
+        boxes: N of them.
+        readings: (N, S), N/N.
+        spread: (N, S), variance from gains and positions per square newton, or None.
+        forces: of the boxes.
+        evidence: (N,), log of the probability in a box.
+    """
+
+    boxes: Boxes
+    readings: np.ndarray
+    spread: np.ndarray | None
+    forces: Forces
+    evidence: np.ndarray
+
+    def rows(self, rows: np.ndarray) -> "_Leaves":
+        """Return some of the boxes."""
+        spread = None if self.spread is None else self.spread[rows]
+        boxes, forces = (type(part)(*(values[rows] for values in part)) for part in (self.boxes, self.forces))
+        return _Leaves(boxes, self.readings[rows], spread, forces, self.evidence[rows])  # type: ignore[arg-type]
+
+    @staticmethod
+    def join(parts: "Sequence[_Leaves]") -> "_Leaves":
+        """Return the boxes of all parts."""
+        boxes, forces = (
+            type(same[0])(*map(np.concatenate, zip(*same, strict=True)))
+            for same in ([part.boxes for part in parts], [part.forces for part in parts])
+        )
+        spread = None if parts[0].spread is None else np.concatenate([part.spread for part in parts])  # type: ignore[misc]
+        readings, evidence = (
+            np.concatenate(same)
+            for same in ([part.readings for part in parts], [part.evidence for part in parts])
+        )
+        return _Leaves(boxes, readings, spread, forces, evidence)  # type: ignore[arg-type]
+
+
 def one_contact(candidates: CandidateReadings, prior: FingertipPrior, frame: Observation) -> Cloud:
     """Return the posterior of one contact."""
-    boxes, readings, slopes = candidates.boxes, candidates.readings, candidates.slopes
+    slopes = candidates.slopes
+    active = _judge(frame, prior, candidates.boxes, candidates.readings, slopes)
+    leaves = list[_Leaves]()
     for _ in range(_ROUNDS):
-        spread = relative_variance(frame.noise, readings, slopes)
-        forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread))
-        kept = _probable(evidence + np.log(boxes.width.prod(1)))
-        boxes = Boxes(boxes.centre[kept], boxes.width[kept])
-        readings, slopes = readings[kept], slopes[:, kept]
-        spread = None if spread is None else spread[kept]
-        forces = Forces(forces.mode[kept], forces.curvature[kept])
-        along = _lengths(frame, prior, forces, readings, slopes, spread) * boxes.width > _LENGTH
-        along[:, 2] |= boxes.width[:, 2] > _RADIUS_STEP * (prior.radii[1] - prior.radii[0])
-        if len(kept) > _MOST or not along.any():
+        kept = _probable(active.evidence, [part.evidence for part in leaves])
+        active, slopes = active.rows(kept), slopes[:, kept]
+        lengths = _lengths(frame, prior, active, slopes) * active.boxes.width
+        lengths[:, 2] = np.maximum(lengths[:, 2], active.boxes.width[:, 2] / (_RADIUS_STEP * candidates.span))
+        cut = lengths > _LENGTH
+        many = sum(len(part.evidence) for part in leaves) + (1 << cut.sum(1)).sum() > _MOST
+        if many:
+            # Where there are many boxes, each is cut along its longest axis alone.
+            cut &= lengths == lengths.max(1, keepdims=True)
+        split = cut.any(1)
+        if len(kept) > _MOST or not split.any():
             break
-        boxes = boxes.split(along)
+        leaves.append(active.rows(np.flatnonzero(~split)))
+        old = Boxes(active.boxes.centre[split], active.boxes.width[split])
+        boxes = old.split(cut[split])
         readings, slopes = candidates.at(boxes.centre)
-    return _weigh(candidates, frame, prior, boxes, readings, spread, forces)
+        active = _judge(frame, prior, boxes, readings, slopes)
+    return _weigh(candidates, frame, prior, _Leaves.join([*leaves, active]))
+
+
+def _judge(
+    frame: Observation, prior: FingertipPrior, boxes: Boxes, readings: np.ndarray, slopes: np.ndarray
+) -> _Leaves:
+    """Return boxes with their probability, as if each were blurred over its width."""
+    spread = relative_variance(frame.noise, readings, slopes)
+    forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread))
+    return _Leaves(boxes, readings, spread, forces, evidence + np.log(boxes.width.prod(1)))
 
 
 def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
@@ -70,24 +125,25 @@ def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.
     return blurred if spread is None else blurred + spread
 
 
-def _probable(evidence: np.ndarray) -> np.ndarray:
-    """Return the indices of what holds nearly all probability, in their order."""
-    chance = np.exp(evidence - evidence.max())
+def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
+    """Return the indices of what holds nearly all probability, in their order, beside that of others."""
+    top = max(float(part.max()) for part in [evidence, *others] if len(part))
+    chance = np.exp(evidence - top)
     order = np.argsort(chance)
     lost = np.cumsum(chance[order], dtype=float)
-    return np.sort(order[lost > _DROPPED * lost[-1]])
+    whole = lost[-1] + sum(float(np.exp(part - top).sum()) for part in others)
+    return np.sort(order[lost > _DROPPED * whole])
 
 
 def _lengths(
     frame: Observation,
     prior: FingertipPrior,
-    fit: Forces,
-    readings: np.ndarray,
+    active: _Leaves,
     slopes: np.ndarray,
-    spread: np.ndarray | None,
 ) -> np.ndarray:
     """Return standard deviations per m along place and radius (N, 3), with the force unknown."""
-    force = np.exp(fit.mode)[:, None]
+    readings, spread = active.readings, active.spread
+    force = np.exp(active.forces.mode)[:, None]
     square = force * force
     variance = np.float32(frame.noise.floor) + (0 if spread is None else square * spread)
     weight = np.broadcast_to(frame.counts / variance, readings.shape)
@@ -105,14 +161,10 @@ def _lengths(
 
 
 def _weigh(
-    candidates: CandidateReadings,
-    frame: Observation,
-    prior: FingertipPrior,
-    boxes: Boxes,
-    readings: np.ndarray,
-    spread: np.ndarray | None,
-    fit: Forces,
+    candidates: CandidateReadings, frame: Observation, prior: FingertipPrior, leaves: _Leaves
 ) -> Cloud:
+    """Return the posterior of boxes, whose probabilities are those in their middles."""
+    boxes, readings, spread, fit, _ = leaves
     force, logs = integrate_force(frame, prior, readings, spread, fit)
     logs = logs + np.log(boxes.width.prod(1))[:, None]
     top = logs.max()
@@ -122,6 +174,6 @@ def _weigh(
     middle = np.exp(fit.mode)[:, None]
     variance = frame.noise.floor + (0 if spread is None else middle * middle * spread)
     misfit = ((frame.readings - middle * readings) ** 2 / variance) @ frame.counts
-    extent = float(np.prod(candidates.size) * (prior.radii[1] - prior.radii[0]))
+    extent = float(np.prod(candidates.size) * candidates.span)
     evidence = float(top + math.log(total) - math.log(extent))
     return Cloud(boxes, force, weight, evidence, float(weight.sum(1) @ misfit) + 1)

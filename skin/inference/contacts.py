@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -45,6 +46,21 @@ class Mixture:
     misfit: float
     mode: np.ndarray
     felt: np.ndarray
+
+
+class Addition(NamedTuple):
+    """What a further contact would explain, at each of N places.
+
+    Attributes:
+        mode: (N,), the most probable log force.
+        ratio: (N,), log of the likelihood ratio to no further contact, integrated over the force.
+        factor: log factor of the evidence: the mean of the ratio over all places, also those that no sensor
+            feels, times the orders that the contact can have among the others.
+    """
+
+    mode: np.ndarray
+    ratio: np.ndarray
+    factor: float
 
 
 class Search:
@@ -152,28 +168,28 @@ class Search:
         penalty = 0.5 * (distance**2).sum((1, 2))
         return frame.likelihood(felt, variance - frame.noise.floor) - penalty, pull, information
 
-    def add(self, frame: Observation, guess: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return guesses (M, n + 1, 4) with a further contact, and the log factor of the evidence.
+    def add(self, frame: Observation, guess: np.ndarray) -> "Addition":
+        """Return what a further contact, beside a guess (n, 4), would explain.
 
-        The contacts of the guess (n, 4) may move, to first order. The factor is the mean of the likelihood
-        ratio over all places and forces of the new contact, times the orders that it can have among the
-        others; it counts places that no sensor feels.
+        The contacts of the guess may move, to first order.
         """
         felt, columns = self.felt(guess[None])
         weight = frame.counts / self.variance(frame, felt, columns)[0]
         scaled = columns[0] * weight
         information = scaled @ columns[0].T + np.diag(np.tile(self._scale**-2, len(guess)))
         projected = np.diag(weight) - scaled.T @ np.linalg.solve(information, scaled)
-        mode, ratio = fit_residual(
-            self.prior, self._lattice, (frame.readings - felt[0]) * frame.counts, projected
-        )
+        left = (frame.readings - felt[0]) * frame.counts
+        mode, ratio = fit_residual(self.prior, self._lattice, left, projected)
         top = ratio.max()
-        best = self._apart(ratio, self._places, 3)
-        new = np.column_stack(
-            [self._places[best, :2], *self.scores(self._places[best, 2], np.exp(mode[best]))]
-        )[:, None]
-        guesses = np.concatenate([np.repeat(guess[None], len(best), 0), new], axis=1)
-        return guesses, float(top + np.log(np.exp(ratio - top).mean())) + math.log(len(guess) + 1)
+        factor = float(top + np.log(np.exp(ratio - top).mean())) + math.log(len(guess) + 1)
+        return Addition(mode, ratio, factor)
+
+    def extend(self, guess: np.ndarray, addition: "Addition") -> np.ndarray:
+        """Return guesses (M, n + 1, 4) with the best further contacts."""
+        best = self._apart(addition.ratio, self._places, 3)
+        scores = self.scores(self._places[best, 2], np.exp(addition.mode[best]))
+        new = np.column_stack([self._places[best, :2], *scores])[:, None]
+        return np.concatenate([np.repeat(guess[None], len(best), 0), new], axis=1)
 
     @staticmethod
     def _apart(score: np.ndarray, places: np.ndarray, number: int) -> list[int]:

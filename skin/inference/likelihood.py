@@ -11,7 +11,7 @@ from skin.inference.candidates import FingertipPrior
 from skin.inference.noise import Noise
 
 _NEWTON = 3  # steps towards the most probable force; the last one changes it by less than 1 %
-_NODES = {False: 3, True: 15}  # of the integral over forces, by whether a sensor clips
+_NODES = {clips: np.polynomial.hermite_e.hermegauss(count) for clips, count in ((False, 3), (True, 15))}
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def integrate_force(
         spread: (N, S), further variance per square newton; None: none.
         fit: where the forces are.
     """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES[bool(len(frame.clipped))])
+    nodes, weights = _NODES[bool(len(frame.clipped))]
     deviation = 1 / np.sqrt(fit.curvature)
     logarithm = fit.mode[:, None] + nodes.astype(np.float32) * deviation[:, None]
     force = np.exp(logarithm)

@@ -267,13 +267,13 @@ class Posterior:
         sensors = max(frame.counts.sum(), 1) / 2
         felt = self._search.felt(mode[None])[0][0]
         for number in range(2, most + 1):
-            guesses, factor = self._search.add(frame, mode)
-            silent = evidence[-1] + factor
-            odds = factor + self._numbers[number] - self._numbers[number - 1]
+            addition = self._search.add(frame, mode)
+            silent = evidence[-1] + addition.factor
+            odds = addition.factor + self._numbers[number] - self._numbers[number - 1]
             if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
                 evidence.append(silent)
                 continue
-            mixture = self._refine(frame, guesses, mode, felt)
+            mixture = self._refine(frame, self._search.extend(mode, addition), mode, felt)
             evidence.append(max(silent, mixture.evidence))
             mixtures[number] = mixture
             mode, felt, misfit = mixture.mode, mixture.felt, mixture.misfit

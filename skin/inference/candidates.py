@@ -137,7 +137,7 @@ class CandidateReadings:
         size: of the body, (2,), m.
         boxes: the first boxes, which cover the surface and the radii.
         readings: (N, S), N/N, in their centres, float32.
-        slopes: (3, N, S), their derivatives, N/N/m, float32.
+        slopes: (N, 3, S), their derivatives, N/N/m, float32.
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class CandidateReadings:
         return Boxes(centre, np.broadcast_to(width, centre.shape).copy())
 
     def at(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings (N, S), N/N, and slopes (3, N, S), N/N/m, at x, y and radius (N, 3), m; float32."""
+        """Return readings (N, S), N/N, and slopes (N, 3, S), N/N/m, at x, y and radius (N, 3), m; float32."""
         patch = np.clip((places[:, :2] / self._patch).astype(int), 0, self._counts - 1)
         across, down = (2 * (places[:, :2] / self._patch - patch) - 1).T
         half = self.span / 2
@@ -191,7 +191,7 @@ class CandidateReadings:
         scales = (2 / self._patch[0], 2 / self._patch[1], 1 / half)
         powers = _monomials(across, down, wide, scales)
         felt = np.matmul(powers, self._coefficients[patch[:, 1] * self._counts[0] + patch[:, 0]])
-        return felt[:, 0], felt[:, 1:].transpose(1, 0, 2)
+        return felt[:, 0], felt[:, 1:]
 
 
 def _monomials(

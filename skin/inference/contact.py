@@ -6,11 +6,19 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
-from skin.inference.likelihood import Forces, Observation, fit_force, integrate_force, relative_variance
+from skin.inference.likelihood import (
+    Forces,
+    Observation,
+    fit_force,
+    integrate_force,
+    refit_force,
+    relative_variance,
+)
 
-_LENGTH = 1.0  # a box is split along an axis that is longer, in standard deviations
+_LENGTH = 1.25  # a box is split along an axis that is longer, in standard deviations
 _DROPPED = 3e-4  # probability that may be lost in a refinement
 _MOST = 900  # boxes
 _ROUNDS = 12
@@ -48,6 +56,7 @@ class _Leaves(NamedTuple):
     Attributes:
         boxes: N of them.
         readings: (N, S), N/N.
+        slopes: (N, 3, S), their derivatives by place and radius, N/N/m.
         spread: (N, S), variance from gains and positions per square newton, or None.
         forces: of the boxes.
         evidence: (N,), log of the probability in a box.
@@ -55,6 +64,7 @@ class _Leaves(NamedTuple):
 
     boxes: Boxes
     readings: np.ndarray
+    slopes: np.ndarray
     spread: np.ndarray | None
     forces: Forces
     evidence: np.ndarray
@@ -63,7 +73,8 @@ class _Leaves(NamedTuple):
         """Return some of the boxes."""
         spread = None if self.spread is None else self.spread[rows]
         boxes, forces = (type(part)(*(values[rows] for values in part)) for part in (self.boxes, self.forces))
-        return _Leaves(boxes, self.readings[rows], spread, forces, self.evidence[rows])  # type: ignore[arg-type]
+        arrays = self.readings[rows], self.slopes[rows], spread
+        return _Leaves(boxes, *arrays, forces, self.evidence[rows])  # type: ignore[arg-type]
 
     @staticmethod
     def join(parts: "Sequence[_Leaves]") -> "_Leaves":
@@ -73,22 +84,22 @@ class _Leaves(NamedTuple):
             for same in ([part.boxes for part in parts], [part.forces for part in parts])
         )
         spread = None if parts[0].spread is None else np.concatenate([part.spread for part in parts])  # type: ignore[misc]
-        readings, evidence = (
-            np.concatenate(same)
-            for same in ([part.readings for part in parts], [part.evidence for part in parts])
+        readings, slopes, evidence = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("readings", "slopes", "evidence")
         )
-        return _Leaves(boxes, readings, spread, forces, evidence)  # type: ignore[arg-type]
+        return _Leaves(boxes, readings, slopes, spread, forces, evidence)  # type: ignore[arg-type]
 
 
 def one_contact(candidates: CandidateReadings, prior: FingertipPrior, frame: Observation) -> Cloud:
     """Return the posterior of one contact."""
-    slopes = candidates.slopes
-    active = _judge(frame, prior, candidates.boxes, candidates.readings, slopes)
+    active = _judge(frame, prior, candidates.boxes, candidates.readings, candidates.slopes)
     leaves = list[_Leaves]()
     for _ in range(_ROUNDS):
         kept = _probable(active.evidence, [part.evidence for part in leaves])
-        active, slopes = active.rows(kept), slopes[:, kept]
-        lengths = _lengths(frame, prior, active, slopes) * active.boxes.width
+        active = active.rows(kept)
+        information = np.diagonal(_expand(frame, prior, active)[1], axis1=1, axis2=2)
+        lengths = np.sqrt(np.maximum(information, 0)) * active.boxes.width
         lengths[:, 2] = np.maximum(lengths[:, 2], active.boxes.width[:, 2] / (_RADIUS_STEP * candidates.span))
         cut = lengths > _LENGTH
         many = sum(len(part.evidence) for part in leaves) + (1 << cut.sum(1)).sum() > _MOST
@@ -101,8 +112,7 @@ def one_contact(candidates: CandidateReadings, prior: FingertipPrior, frame: Obs
         leaves.append(active.rows(np.flatnonzero(~split)))
         old = Boxes(active.boxes.centre[split], active.boxes.width[split])
         boxes = old.split(cut[split])
-        readings, slopes = candidates.at(boxes.centre)
-        active = _judge(frame, prior, boxes, readings, slopes)
+        active = _judge(frame, prior, boxes, *candidates.at(boxes.centre))
     return _weigh(candidates, frame, prior, _Leaves.join([*leaves, active]))
 
 
@@ -112,16 +122,16 @@ def _judge(
     """Return boxes with their probability, as if each were blurred over its width."""
     spread = relative_variance(frame.noise, readings, slopes)
     forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread))
-    return _Leaves(boxes, readings, spread, forces, evidence + np.log(boxes.width.prod(1)))
+    return _Leaves(boxes, readings, slopes, spread, forces, evidence + np.log(boxes.width.prod(1)))
 
 
 def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
     """Return the variance (N, S) per square newton with that over a box, which then speaks for all in it."""
-    scaled = slopes * (boxes.width * math.sqrt(1 / 12)).T.astype(np.float32)[..., None]
+    scaled = slopes * (boxes.width * math.sqrt(1 / 12)).astype(np.float32)[..., None]
     scaled *= scaled
-    blurred = scaled[0]
-    blurred += scaled[1]
-    blurred += scaled[2]
+    blurred = scaled[:, 0]
+    blurred += scaled[:, 1]
+    blurred += scaled[:, 2]
     return blurred if spread is None else blurred + spread
 
 
@@ -135,38 +145,64 @@ def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
     return np.sort(order[lost > _DROPPED * whole])
 
 
-def _lengths(
-    frame: Observation,
-    prior: FingertipPrior,
-    active: _Leaves,
-    slopes: np.ndarray,
-) -> np.ndarray:
-    """Return standard deviations per m along place and radius (N, 3), with the force unknown."""
-    readings, spread = active.readings, active.spread
-    force = np.exp(active.forces.mode)[:, None]
-    square = force * force
-    variance = np.float32(frame.noise.floor) + (0 if spread is None else square * spread)
+def _expand(frame: Observation, prior: FingertipPrior, leaves: _Leaves) -> tuple[np.ndarray, np.ndarray]:
+    """Return slope (N, 3), 1/m, and information (N, 3, 3), 1/m^2, of the log likelihood in boxes.
+
+    Derivatives are those by place and radius at the most probable force, which follows them.
+    """
+    readings, spread = leaves.readings, leaves.spread
+    force = np.exp(leaves.forces.mode)[:, None]
+    variance = np.float32(frame.noise.floor) + (0 if spread is None else force * force * spread)
     weight = np.broadcast_to(frame.counts / variance, readings.shape)
+    pull = weight * (frame.readings - force * readings)
     if len(frame.clipped):
-        # A sensor that clips tells about as much as its reading, near the limit.
-        near = np.abs(force * readings[:, frame.clipped] - frame.noise.clip)
-        deviation = np.broadcast_to(np.sqrt(variance), readings.shape)[:, frame.clipped]
+        # A sensor that clips tells most where it is predicted to read about its limit.
+        clipped = frame.clipped
+        deviation = np.broadcast_to(np.sqrt(variance), readings.shape)[:, clipped]
+        above = (force * readings[:, clipped] - np.float32(frame.noise.clip)) / deviation
+        hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
         weight = weight.copy()
-        weight[:, frame.clipped] = np.exp(-0.5 * (near / deviation) ** 2) / deviation**2
-    square = square * weight
-    felt = readings * square
-    whole = np.vecdot(felt, readings) + 1 / prior.spread**2
-    crossed = np.vecdot(slopes, felt)
-    return np.sqrt(np.maximum(np.vecdot(slopes * square, slopes) - crossed**2 / whole, 0)).T
+        weight[:, clipped], pull[:, clipped] = hazard * (hazard + above) / deviation**2, hazard / deviation
+    slope = np.vecdot(leaves.slopes, (force * pull)[:, None])
+    weighted = leaves.slopes * (force * force * weight)[:, None]
+    whole = np.vecdot(readings * readings, force * force * weight) + 1 / prior.spread**2
+    crossed = np.vecdot(weighted, readings[:, None])
+    distance = (leaves.forces.mode - math.log(prior.force)) / prior.spread**2
+    left = np.vecdot(readings, force * pull) - distance
+    slope = slope - crossed * (left / whole)[:, None]
+    information = np.matmul(weighted, leaves.slopes.transpose(0, 2, 1))
+    return slope, information - crossed[:, :, None] * (crossed / whole[:, None])[:, None]
+
+
+def _average(frame: Observation, prior: FingertipPrior, leaves: _Leaves) -> tuple[Boxes, np.ndarray]:
+    """Return what a box holds, as a smaller box, and the log of the mean of the likelihood by its middle's.
+
+    To second order, with a normal distribution in place of the uniform one over the box.
+    """
+    slope, information = (part.astype(float) for part in _expand(frame, prior, leaves))
+    centre, width = leaves.boxes
+    # In units of the standard deviation over a box.
+    unit = width / math.sqrt(12)
+    slope, information = slope * unit, information * unit[:, :, None] * unit[:, None] + np.eye(3)
+    covariance = np.linalg.inv(information)
+    moved = np.vecdot(covariance, slope[:, None])
+    factor = 0.5 * (np.vecdot(slope, moved) - np.log(np.linalg.det(information)))
+    inside = np.clip(moved, -1.5, 1.5)
+    factor = np.where((inside == moved).all(1), factor, np.vecdot(slope, inside) / 2)
+    narrow = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return Boxes(centre + inside * unit, width * narrow), factor
 
 
 def _weigh(
     candidates: CandidateReadings, frame: Observation, prior: FingertipPrior, leaves: _Leaves
 ) -> Cloud:
-    """Return the posterior of boxes, whose probabilities are those in their middles."""
-    boxes, readings, spread, fit, _ = leaves
+    """Return the posterior of boxes."""
+    _, readings, _, spread, blurred, _ = leaves
+    fit = refit_force(frame, prior, readings, spread, blurred.mode)
+    leaves = leaves._replace(forces=fit)
+    boxes, factor = _average(frame, prior, leaves)
     force, logs = integrate_force(frame, prior, readings, spread, fit)
-    logs = logs + np.log(boxes.width.prod(1))[:, None]
+    logs = logs + (np.log(leaves.boxes.width.prod(1)) + factor)[:, None]
     top = logs.max()
     weight = np.exp(logs - top)
     total = weight.sum()

@@ -99,7 +99,7 @@ class Search:
         readings, slopes = self.candidates.at(places)
         felt = force[:, None] * readings
         columns = np.empty((len(places), 4, felt.shape[1]))
-        np.multiply(force[:, None, None], slopes.transpose(1, 0, 2), out=columns[:, :3])
+        np.multiply(force[:, None, None], slopes, out=columns[:, :3])
         columns[:, 2] *= stretch[:, None]
         columns[:, 3] = self.prior.spread * felt
         return felt.reshape(count, number, -1).sum(1), columns.reshape(count, 4 * number, -1)

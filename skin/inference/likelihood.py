@@ -73,7 +73,7 @@ def relative_variance(noise: Noise, readings: np.ndarray, slopes: np.ndarray) ->
     if noise.gain:
         spread = (np.float32(noise.gain) * readings) ** 2
     if noise.position:
-        moved = np.float32(noise.position**2) * (slopes[0] ** 2 + slopes[1] ** 2)
+        moved = np.float32(noise.position**2) * (slopes[:, 0] ** 2 + slopes[:, 1] ** 2)
         spread = moved if spread is None else spread + moved
     return spread
 
@@ -105,16 +105,29 @@ def fit_force(
     plain = frame.counts / (floor + (np.float32(frame.noise.gain) * values) ** 2)
     squares = readings * readings
     mode = _mode(prior, readings @ (plain * values), squares @ plain, None).mode
-    force = np.exp(mode)[:, None]
-    variance = force * force * spread
-    variance += floor
-    squares /= variance
-    along = (readings / variance) @ (frame.counts * values)
-    forces = _mode(prior, along, squares @ frame.counts, mode)
+    forces = refit_force(frame, prior, readings, spread, mode)
     force = np.exp(forces.mode)[:, None]
     variance = force * force * spread
     fit = frame.likelihood(force * readings, variance)
     return forces, fit + _density(prior, forces.mode) - np.float32(0.5) * np.log(forces.curvature)
+
+
+def refit_force(
+    frame: Observation,
+    prior: FingertipPrior,
+    readings: np.ndarray,
+    spread: np.ndarray | None,
+    mode: np.ndarray,
+) -> Forces:
+    """Return the force of candidates from that of a similar likelihood, (N,), its logarithm."""
+    variance = np.float32(frame.noise.floor)
+    if spread is not None:
+        force = np.exp(mode)[:, None]
+        variance = force * force * spread + variance
+    weight = readings / variance
+    along = weight @ (frame.counts * frame.readings)
+    weight *= readings
+    return _mode(prior, along, weight @ frame.counts, mode)
 
 
 def _density(prior: FingertipPrior, mode: np.ndarray) -> np.ndarray:

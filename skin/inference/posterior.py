@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import expit, gammaincc, logsumexp
+from scipy.special import expit, gammaincc
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
@@ -237,7 +237,8 @@ class Posterior:
         logs = np.full(len(self._numbers), -np.inf)
         logs[: len(evidence)] = np.array(evidence) + self._numbers[: len(evidence)]
         number = int(logs.argmax())
-        probabilities = np.exp(logs - logsumexp(logs))
+        total = float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
+        probabilities = np.exp(logs - total)
         misfit = {0: frame.misfit_empty(), 1: single.misfit}.get(number)
         if misfit is None:
             misfit = mixtures[number].misfit
@@ -245,7 +246,7 @@ class Posterior:
         if number in mixtures:
             mixtures[number] = self._search.walk(frame, mixtures[number])
         contacts = self._contacts(number, single, mixtures)
-        large = self._probability_of_large(frame, float(logsumexp(logs)))
+        large = self._probability_of_large(frame, total)
         fingertip = number > 0 and fit >= _FITS and large < 0.5
         return FrameEstimate(number, probabilities, contacts, fit, large, fingertip, _unknown(sensors, frame))
 
@@ -297,11 +298,7 @@ class Posterior:
             return ()
         if number == 1:
             boxes = single.boxes
-            return (
-                self._summary(
-                    boxes.centre[:, :2], boxes.width[:, :2], boxes.centre[:, 2:], single.force, single.weight
-                ),
-            )
+            return (self._summary(boxes.centre, boxes.width, single.force, single.weight),)
         if number not in mixtures:
             raise AssertionError("a number of contacts that was not refined is not the most probable")
         mixture = mixtures[number]
@@ -309,34 +306,31 @@ class Posterior:
         parts = list[ContactEstimate]()
         for contact in self._search.contacts(mixture.samples).transpose(1, 0, 2):
             spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
-            widths = np.broadcast_to(0.6 * spread, (len(contact), 2))
-            parts.append(self._summary(contact[:, :2], widths, contact[:, 2:3], contact[:, 3:], weight))
+            widths = np.zeros((len(contact), 3))
+            widths[:, :2] = 0.6 * spread
+            parts.append(self._summary(contact[:, :3], widths, contact[:, 3:], weight))
         return tuple(sorted(parts, key=lambda part: -part.force))
 
     def _summary(
-        self,
-        places: np.ndarray,
-        widths: np.ndarray,
-        radius: np.ndarray,
-        force: np.ndarray,
-        weight: np.ndarray,
+        self, boxes: np.ndarray, widths: np.ndarray, force: np.ndarray, weight: np.ndarray
     ) -> ContactEstimate:
-        """Return the moments of weighted places (N, 2), radii (N, 1) and forces (N, J)."""
+        """Return the moments of weighted boxes of places and radii (N, 3), m, and forces (N, J), N."""
         total = weight.sum(1)
-        peaks = self._peak(radius) * force
-        place, size = total @ places, float(total @ radius[:, 0])
+        peaks = self._peak(boxes[:, 2:]) * force
+        middle = total @ boxes
+        deviation = np.sqrt(total @ ((boxes - middle) ** 2 + widths**2 / 12))
         mean, peak = float((weight * force).sum()), float((weight * peaks).sum())
         return ContactEstimate(
-            place,
-            np.sqrt(_variance(places, total)),
+            middle[:2],
+            deviation[:2],
             mean,
             math.sqrt(float((weight * (force - mean) ** 2).sum())),
-            size,
-            math.sqrt(float(total @ (radius[:, 0] - size) ** 2)),
+            float(middle[2]),
+            float(deviation[2]),
             peak,
             math.sqrt(float((weight * (peaks - peak) ** 2).sum())),
-            places,
-            widths,
+            boxes[:, :2],
+            widths[:, :2],
             peaks,
             weight,
         )

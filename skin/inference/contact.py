@@ -18,9 +18,9 @@ from skin.inference.likelihood import (
     relative_variance,
 )
 
-_LENGTH = 1.25  # a box is split along an axis that is longer, in standard deviations
+_LENGTH = 1.8  # a box is split along an axis that is longer, in standard deviations
 _DROPPED = 3e-4  # probability that may be lost in a refinement
-_MOST = 900  # boxes
+_MOST = 500  # boxes
 _ROUNDS = 12
 _RADIUS_STEP = 0.3  # largest share of the radii in a box
 
@@ -145,10 +145,13 @@ def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
     return np.sort(order[lost > _DROPPED * whole])
 
 
-def _expand(frame: Observation, prior: FingertipPrior, leaves: _Leaves) -> tuple[np.ndarray, np.ndarray]:
+def _expand(
+    frame: Observation, prior: FingertipPrior, leaves: _Leaves
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return slope (N, 3), 1/m, and information (N, 3, 3), 1/m^2, of the log likelihood in boxes.
 
-    Derivatives are those by place and radius at the most probable force, which follows them.
+    Derivatives are those by place and radius at the most probable force, which follows them: the last result
+    is the derivative of its logarithm, (N, 3), 1/m.
     """
     readings, spread = leaves.readings, leaves.spread
     force = np.exp(leaves.forces.mode)[:, None]
@@ -171,15 +174,20 @@ def _expand(frame: Observation, prior: FingertipPrior, leaves: _Leaves) -> tuple
     left = np.vecdot(readings, force * pull) - distance
     slope = slope - crossed * (left / whole)[:, None]
     information = np.matmul(weighted, leaves.slopes.transpose(0, 2, 1))
-    return slope, information - crossed[:, :, None] * (crossed / whole[:, None])[:, None]
+    turn = -crossed / whole[:, None]
+    return slope, information + crossed[:, :, None] * turn[:, None], turn
 
 
-def _average(frame: Observation, prior: FingertipPrior, leaves: _Leaves) -> tuple[Boxes, np.ndarray]:
+def _average(
+    frame: Observation, prior: FingertipPrior, leaves: _Leaves
+) -> tuple[Boxes, np.ndarray, np.ndarray]:
     """Return what a box holds, as a smaller box, and the log of the mean of the likelihood by its middle's.
+
+    The last result is the log factor of the force, which differs from that in the middle.
 
     To second order, with a normal distribution in place of the uniform one over the box.
     """
-    slope, information = (part.astype(float) for part in _expand(frame, prior, leaves))
+    slope, information, turn = (part.astype(float) for part in _expand(frame, prior, leaves))
     centre, width = leaves.boxes
     # In units of the standard deviation over a box.
     unit = width / math.sqrt(12)
@@ -190,7 +198,9 @@ def _average(frame: Observation, prior: FingertipPrior, leaves: _Leaves) -> tupl
     inside = np.clip(moved, -1.5, 1.5)
     factor = np.where((inside == moved).all(1), factor, np.vecdot(slope, inside) / 2)
     narrow = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    return Boxes(centre + inside * unit, width * narrow), factor
+    turn = turn * unit
+    further = np.vecdot(turn, inside + 0.5 * np.vecdot(covariance, turn[:, None]))
+    return Boxes(centre + inside * unit, width * narrow), factor, further
 
 
 def _weigh(
@@ -200,8 +210,9 @@ def _weigh(
     _, readings, _, spread, blurred, _ = leaves
     fit = refit_force(frame, prior, readings, spread, blurred.mode)
     leaves = leaves._replace(forces=fit)
-    boxes, factor = _average(frame, prior, leaves)
+    boxes, factor, further = _average(frame, prior, leaves)
     force, logs = integrate_force(frame, prior, readings, spread, fit)
+    force = force * np.exp(np.clip(further, -1, 1))[:, None]
     logs = logs + (np.log(leaves.boxes.width.prod(1)) + factor)[:, None]
     top = logs.max()
     weight = np.exp(logs - top)

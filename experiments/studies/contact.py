@@ -36,7 +36,7 @@ POISSON = {"Dragon Skin 10 Medium": 0.49}
 FELT = 3.0  # standard deviations of a frame
 
 
-def sheet(*layers: tuple[str, float], softer: float = 1.0) -> Sheet:
+def make_sheet(*layers: tuple[str, float], softer: float = 1.0) -> Sheet:
     """Return a sheet of materials and thicknesses, m, from the base up; moduli by a factor."""
     made = [(Material.of(name), thickness) for name, thickness in layers]
     return Sheet(
@@ -46,8 +46,8 @@ def sheet(*layers: tuple[str, float], softer: float = 1.0) -> Sheet:
     )
 
 
-DEEP = sheet(("EcoFlex 00-30", 0.03))
-THIN = sheet(("Dragon Skin 10 Medium", 0.01), ("EcoFlex 00-30", 0.005))
+DEEP = make_sheet(("EcoFlex 00-30", 0.03))
+THIN = make_sheet(("Dragon Skin 10 Medium", 0.01), ("EcoFlex 00-30", 0.005))
 _FOOTPRINT = (0.01, 0.01)
 GRID = Grid(5, 5, _FOOTPRINT)
 
@@ -113,10 +113,10 @@ def rows() -> list[Row]:
         *(Row(f"layout_{name}", layout=layout, margin=0.0) for name, layout in layouts.items()),
         *(Row(f"device_{number}", noise=device, margin=0.0) for number in range(1, 6)),
         *(replace(thin, name=f"thin_device_{number}", noise=device) for number in range(1, 6)),
-        Row("stiffer", actual=sheet(("EcoFlex 00-30", 0.03), softer=1.2)),
-        Row("softer", actual=sheet(("EcoFlex 00-30", 0.03), softer=0.8)),
-        Row("thicker", actual=sheet(("EcoFlex 00-30", 0.033))),
-        Row("thinner", actual=sheet(("EcoFlex 00-30", 0.03 * 0.9)), depth=0.0265),
+        Row("stiffer", actual=make_sheet(("EcoFlex 00-30", 0.03), softer=1.2)),
+        Row("softer", actual=make_sheet(("EcoFlex 00-30", 0.03), softer=0.8)),
+        Row("thicker", actual=make_sheet(("EcoFlex 00-30", 0.033))),
+        Row("thinner", actual=make_sheet(("EcoFlex 00-30", 0.03 * 0.9)), depth=0.0265),
         *(
             Row(f"{name}_{kind}", number=number, apart=apart, exactly=exactly)
             for name, number in (("two", 2), ("three", 3))
@@ -164,7 +164,7 @@ def press_hands(simulator: Solid, count: int, rng: np.random.Generator) -> np.nd
         return simulator(frames / frames.amax((1, 2), keepdim=True) * peak).readings.numpy().astype(float)
 
 
-def measure(readings: np.ndarray, noise: Noise, rng: np.random.Generator) -> np.ndarray:
+def read_device(readings: np.ndarray, noise: Noise, rng: np.random.Generator) -> np.ndarray:
     """Return what a device with gains of its own measures, (B, S), N."""
     gain = 1 + noise.gain * rng.standard_normal(readings.shape[1])
     return gain * readings + np.sqrt(noise.floor) * rng.standard_normal(readings.shape)
@@ -194,7 +194,7 @@ def run_row(row: Row, count: int, seed: int) -> dict[str, object]:
         true = press_hands(touched, count, rng)
         contacts = np.zeros((count, 0, 4))
     chosen = np.flatnonzero((true > FELT * row.noise.frame).any(1))[:count]
-    readings = measure(true[chosen], row.noise, rng)
+    readings = read_device(true[chosen], row.noise, rng)
     estimates, seconds = list[FrameEstimate](), list[float]()
     for values in readings:
         start = time.process_time()
@@ -202,13 +202,13 @@ def run_row(row: Row, count: int, seed: int) -> dict[str, object]:
         seconds.append(time.process_time() - start)
         assert isinstance(estimate, FrameEstimate)
         estimates.append(estimate)
-    return {"row": row.name} | summarise(estimates, contacts[chosen], prior) | {
+    return {"row": row.name} | summarise_estimates(estimates, contacts[chosen], prior) | {
         "ms_median": 1e3 * float(np.median(seconds)),
         "ms_p99": 1e3 * float(np.quantile(seconds, 0.99)),
     }  # fmt: skip
 
 
-def summarise(
+def summarise_estimates(
     estimates: Sequence[FrameEstimate], contacts: np.ndarray, prior: FingertipPrior
 ) -> dict[str, object]:
     """Return the figures of estimates for true contacts (B, n, 4), of the touches whose number is right."""

@@ -17,6 +17,7 @@ from skin.inference.likelihood import (
     refit_force,
     relative_variance,
 )
+from skin.inference.noise import Noise
 
 _LENGTH = 1.8  # a box is split along an axis that is longer, in standard deviations
 _DROPPED = 3e-4  # probability that may be lost in a refinement
@@ -91,9 +92,32 @@ class _Leaves(NamedTuple):
         return _Leaves(boxes, readings, slopes, spread, forces, evidence)  # type: ignore[arg-type]
 
 
-def one_contact(candidates: CandidateReadings, prior: FingertipPrior, frame: Observation) -> Cloud:
-    """Return the posterior of one contact."""
-    active = _judge(frame, prior, candidates.boxes, candidates.readings, candidates.slopes)
+def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray | None, np.ndarray]:
+    """Return what all frames share: the relative variance of the first boxes, and that with their width."""
+    spread = relative_variance(noise, candidates.readings, candidates.slopes)
+    return spread, _blurred(candidates.boxes, candidates.slopes, spread)
+
+
+def one_contact(
+    candidates: CandidateReadings,
+    prior: FingertipPrior,
+    frame: Observation,
+    first: tuple[np.ndarray | None, np.ndarray] | None = None,
+) -> Cloud:
+    """Return the posterior of one contact.
+
+    Args:
+        candidates: of the skin.
+        prior: of the contact.
+        frame: the frame.
+        first: of :func:`blur_first` for the noise of the frame; None: it is computed.
+    """
+    spread, blurred = first or blur_first(candidates, frame.noise)
+    boxes = candidates.boxes
+    forces, evidence = fit_force(frame, prior, candidates.readings, blurred)
+    # The first boxes have the same width.
+    evidence = evidence + math.log(boxes.width[0].prod())
+    active = _Leaves(boxes, candidates.readings, candidates.slopes, spread, forces, evidence)
     leaves = list[_Leaves]()
     for _ in range(_ROUNDS):
         kept = _probable(active.evidence, [part.evidence for part in leaves])

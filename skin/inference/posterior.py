@@ -9,7 +9,7 @@ from scipy.special import expit, gammaincc
 from skin.body.base import AbstractBody
 from skin.errors import InputError
 from skin.inference.candidates import CandidateReadings, FingertipPrior
-from skin.inference.contact import Cloud, one_contact
+from skin.inference.contact import Cloud, blur_first, one_contact
 from skin.inference.contacts import Mixture, Search
 from skin.inference.large import LargeContacts
 from skin.inference.likelihood import Observation
@@ -174,6 +174,7 @@ class Posterior:
         possible = np.flatnonzero(self.prior.numbers[: contacts + 1])
         self._most = int(possible[-1])
         self.candidates = CandidateReadings(simulator, body, self.prior)
+        self._first = blur_first(self.candidates, noise)
         self._search = Search(self.candidates, self.prior)
         self._large = LargeContacts(self.candidates, noise) if self.prior.large else None
         with np.errstate(divide="ignore"):
@@ -231,7 +232,7 @@ class Posterior:
 
     def _frame(self, frame: Observation) -> FrameEstimate:
         """Return the estimate of a frame, which depends on nothing else."""
-        single = one_contact(self.candidates, self.prior, frame)
+        single = one_contact(self.candidates, self.prior, frame, self._first)
         sensors = int(frame.counts.sum()) + len(frame.clipped)
         evidence, mixtures = self._several(frame, single, min(self._most, max(1, sensors // _PER_CONTACT)))
         logs = np.full(len(self._numbers), -np.inf)

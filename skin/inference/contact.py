@@ -20,7 +20,7 @@ from skin.inference.likelihood import (
 from skin.inference.noise import Noise
 
 _LENGTH = 1.8  # a box is split along an axis that is longer, in standard deviations
-_DROPPED = 3e-4  # probability that may be lost in a refinement
+_DROPPED = 3e-5  # probability that may be lost in a refinement
 _MOST = 500  # boxes
 _ROUNDS = 12
 _RADIUS_STEP = 0.3  # largest share of the radii in a box
@@ -207,7 +207,7 @@ def _average(
 ) -> tuple[Boxes, np.ndarray, np.ndarray]:
     """Return what a box holds, as a smaller box, and the log of the mean of the likelihood by its middle's.
 
-    The last result is the log factor of the force, which differs from that in the middle.
+    The last result, (2, N), holds how much mean and variance of the log force exceed those in the middle.
 
     To second order, with a normal distribution in place of the uniform one over the box.
     """
@@ -223,8 +223,9 @@ def _average(
     factor = np.where((inside == moved).all(1), factor, np.vecdot(slope, inside) / 2)
     narrow = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     turn = turn * unit
-    further = np.vecdot(turn, inside + 0.5 * np.vecdot(covariance, turn[:, None]))
-    return Boxes(centre + inside * unit, width * narrow), factor, further
+    shift = np.vecdot(turn, inside)
+    wider = np.vecdot(turn, np.vecdot(covariance, turn[:, None]))
+    return Boxes(centre + inside * unit, width * narrow), factor, np.stack([shift, wider])
 
 
 def _weigh(
@@ -236,7 +237,10 @@ def _weigh(
     leaves = leaves._replace(forces=fit)
     boxes, factor, further = _average(frame, prior, leaves)
     force, logs = integrate_force(frame, prior, readings, spread, fit)
-    force = force * np.exp(np.clip(further, -1, 1))[:, None]
+    shift, stretch = np.clip(further[0], -1, 1), np.sqrt(1 + fit.curvature * further[1])
+    force = np.exp(
+        fit.mode[:, None] + shift[:, None] + (np.log(force) - fit.mode[:, None]) * stretch[:, None]
+    )
     logs = logs + (np.log(leaves.boxes.width.prod(1)) + factor)[:, None]
     top = logs.max()
     weight = np.exp(logs - top)

@@ -11,7 +11,7 @@ from skin.inference.candidates import FingertipPrior
 from skin.inference.noise import Noise
 
 _NEWTON = 3  # steps towards the most probable force; the last one changes it by less than 1 %
-_NODES = {clips: np.polynomial.hermite_e.hermegauss(count) for clips, count in ((False, 3), (True, 15))}
+_NODES = {clips: np.polynomial.hermite_e.hermegauss(count) for clips, count in ((False, 5), (True, 15))}
 
 
 @dataclass(frozen=True)

@@ -80,18 +80,24 @@ def brute_force(readings, thin, noise, contact, count, seed=0):
     mean, spread = moments(contact)
     centre = np.array([*mean[:2], np.log(mean[3])])
     wide = 1.6 * np.maximum([*spread[:2], spread[3] / mean[3]], [1e-4, 1e-4, 1e-3])
-    normal = rng.standard_normal((count, 3))
-    points, radius = centre + wide * normal, rng.uniform(*prior.radii, count)
+    # A third of the samples are from the prior, which has all modes.
+    points, radius = centre + wide * rng.standard_normal((count, 3)), rng.uniform(*prior.radii, count)
+    third = count // 3
+    points[:third, :2] = rng.uniform(0, 0.16, (third, 2))
+    points[:third, 2] = np.log(prior.force) + prior.spread * rng.standard_normal(third)
+    near = np.exp(-0.5 * (((points - centre) / wide) ** 2).sum(1)) / wide.prod() / (2 * np.pi) ** 1.5
+    density = -0.5 * ((points[:, 2] - np.log(prior.force)) / prior.spread) ** 2
+    far = np.exp(density) / (prior.spread * np.sqrt(2 * np.pi) * 0.16**2)
     force = np.exp(points[:, 2])
     inside = ((points[:, :2] > 0) & (points[:, :2] < 0.16)).all(1)
+    proposal = np.log(2 / 3 * near + np.where(inside, far / 3, 0))
     discs = np.column_stack([points[:, :2].clip(0, 0.16), radius])
     true = disc_readings(solid(thin), THIN if thin else DEEP, discs, prior.rim) * force[:, None]
     variance = noise.floor + (noise.gain * true) ** 2
     clips = readings >= noise.clip
     terms = -0.5 * ((readings - true) ** 2 / variance + np.log(variance))
     terms = np.where(clips, log_ndtr((true - noise.clip) / np.sqrt(variance)), terms)
-    density = -0.5 * ((points[:, 2] - np.log(prior.force)) / prior.spread) ** 2
-    logs = np.where(inside, terms.sum(1) + density + 0.5 * (normal**2).sum(1), -np.inf)
+    logs = np.where(inside, terms.sum(1) + density - proposal, -np.inf)
     weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     values = np.column_stack([discs, force])
@@ -112,7 +118,7 @@ def test_a_contact_agrees_with_brute_force(thin, noise):
     for row in rows:
         readings = measure(true[row], noise, row)
         (contact,) = estimated.estimate(readings).contacts
-        mean, spread, effective = brute_force(readings, thin, noise, contact, 320_000, row)
+        mean, spread, effective = brute_force(readings, thin, noise, contact, 480_000, row)
         assert effective >= 5000
         assert (np.abs(moments(contact)[0] - mean) <= 0.1 * spread).all()
         assert moments(contact)[1] == pytest.approx(spread, rel=0.05)

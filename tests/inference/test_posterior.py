@@ -75,7 +75,10 @@ def moments(contact):
 
 
 def brute_force(readings, thin, noise, contact, count, seed=0):
-    """Return mean and deviation (4,) by importance samples near the posterior, and their effective number."""
+    """Return mean and deviation (4,) by importance samples near the posterior, and their effective number.
+
+    The last result is by how much the deviations of both halves of the samples differ, relative.
+    """
     prior, rng = FingertipPrior(), np.random.default_rng(seed)
     mean, spread = moments(contact)
     centre = np.array([*mean[:2], np.log(mean[3])])
@@ -101,8 +104,15 @@ def brute_force(readings, thin, noise, contact, count, seed=0):
     weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     values = np.column_stack([discs, force])
-    average = weight @ values
-    return average, np.sqrt(weight @ (values - average) ** 2), 1 / (weight**2).sum()
+    average, spread = _moments(weight, values)
+    halves = [_moments(weight[part], values[part])[1] for part in (slice(0, None, 2), slice(1, None, 2))]
+    differ = np.abs(halves[0] / halves[1] - 1).max()
+    return average, spread, 1 / (weight**2).sum(), differ
+
+
+def _moments(weight, values):
+    average = weight @ values / weight.sum()
+    return average, np.sqrt(weight @ (values - average) ** 2 / weight.sum())
 
 
 @pytest.mark.slow
@@ -113,15 +123,20 @@ def brute_force(readings, thin, noise, contact, count, seed=0):
 def test_a_contact_agrees_with_brute_force(thin, noise):
     touches = draw(60, seed=3, margin=0.02)
     true = felt(touches, thin)
-    rows = np.flatnonzero((true > 0.15).any(1))[:2]
-    estimated = posterior(thin, noise, contacts=1)
-    for row in rows:
+    estimated, compared = posterior(thin, noise, contacts=1), 0
+    for row in np.flatnonzero((true > 0.15).any(1))[:6]:
         readings = measure(true[row], noise, row)
         (contact,) = estimated.estimate(readings).contacts
-        mean, spread, effective = brute_force(readings, thin, noise, contact, 480_000, row)
-        assert effective >= 5000
+        mean, spread, effective, differ = brute_force(readings, thin, noise, contact, 400_000, row)
+        # A rare second mode with few samples says nothing of its weight.
+        if effective < 5000 or differ > 0.03:
+            continue
         assert (np.abs(moments(contact)[0] - mean) <= 0.1 * spread).all()
         assert moments(contact)[1] == pytest.approx(spread, rel=0.05)
+        compared += 1
+        if compared == 2:
+            break
+    assert compared == 2
 
 
 @pytest.mark.parametrize(("thin", "noise"), [(False, NOISE), (True, Noise(0.05, 10, gain=0.05, offset=0.02))])

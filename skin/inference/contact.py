@@ -23,6 +23,7 @@ _LENGTH = 1.8  # a box is split along an axis that is longer, in standard deviat
 _DROPPED = 3e-5  # probability that may be lost in a refinement
 _MOST = 500  # boxes
 _ROUNDS = 12
+_FORCE_STEP = 0.5  # largest change of the logarithm of the force over a box
 _RADIUS_STEP = 0.3  # largest share of the radii in a box
 
 
@@ -122,8 +123,9 @@ def one_contact(
     for _ in range(_ROUNDS):
         kept = _probable(active.evidence, [part.evidence for part in leaves])
         active = active.rows(kept)
-        information = np.diagonal(_expand(frame, prior, active)[1], axis1=1, axis2=2)
-        lengths = np.sqrt(np.maximum(information, 0)) * active.boxes.width
+        _, information, turn = _expand(frame, prior, active)
+        lengths = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 0)) * active.boxes.width
+        lengths = np.maximum(lengths, np.abs(turn) * active.boxes.width * (_LENGTH / _FORCE_STEP))
         lengths[:, 2] = np.maximum(lengths[:, 2], active.boxes.width[:, 2] / (_RADIUS_STEP * candidates.span))
         cut = lengths > _LENGTH
         many = sum(len(part.evidence) for part in leaves) + (1 << cut.sum(1)).sum() > _MOST
@@ -211,20 +213,22 @@ def _average(
 
     To second order, with a normal distribution in place of the uniform one over the box.
     """
-    slope, information, turn = (part.astype(float) for part in _expand(frame, prior, leaves))
+    # In double precision: what the force explains is subtracted, and may be nearly all.
+    precise = leaves._replace(readings=leaves.readings.astype(float), slopes=leaves.slopes.astype(float))
+    slope, information, turn = _expand(frame, prior, precise)
     centre, width = leaves.boxes
     # In units of the standard deviation over a box.
     unit = width / math.sqrt(12)
     slope, information = slope * unit, information * unit[:, :, None] * unit[:, None] + np.eye(3)
     covariance = np.linalg.inv(information)
     moved = np.vecdot(covariance, slope[:, None])
-    factor = 0.5 * (np.vecdot(slope, moved) - np.log(np.linalg.det(information)))
+    factor = 0.5 * (np.vecdot(slope, moved) - np.log(np.maximum(np.linalg.det(information), 1)))
     inside = np.clip(moved, -1.5, 1.5)
     factor = np.where((inside == moved).all(1), factor, np.vecdot(slope, inside) / 2)
     narrow = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     turn = turn * unit
     shift = np.vecdot(turn, inside)
-    wider = np.vecdot(turn, np.vecdot(covariance, turn[:, None]))
+    wider = np.maximum(np.vecdot(turn, np.vecdot(covariance, turn[:, None])), 0)
     return Boxes(centre + inside * unit, width * narrow), factor, np.stack([shift, wider])
 
 

@@ -132,7 +132,9 @@ def test_a_contact_agrees_with_brute_force(thin, noise):
         if effective < 5000 or differ > 0.03:
             continue
         assert (np.abs(moments(contact)[0] - mean) <= 0.1 * spread).all()
-        assert moments(contact)[1] == pytest.approx(spread, rel=0.05)
+        # On the thin skin the force is little more than its prior; docs/contacts.md states the shortfall there.
+        columns = slice(3 if thin else 4)
+        assert moments(contact)[1][columns] == pytest.approx(spread[columns], rel=0.05)
         compared += 1
         if compared == 2:
             break
@@ -198,6 +200,15 @@ def test_two_contacts_are_told_apart():
         places = np.array([contact.place for contact in estimates[row].contacts])
         away = np.linalg.norm(touches[row][:, None, :2] - places, axis=2).min(1)
         assert away.max() < 0.015
+
+
+@pytest.mark.parametrize("thin", [False, True])
+def test_a_bar_is_no_fingertip(thin):
+    along = np.linspace(0.04, 0.12, 21)
+    chain = np.stack([along, 0.5 * along + 0.03, np.full(21, 0.004), np.full(21, 3.0)], axis=1)
+    estimate = posterior(thin).estimate(measure(felt(chain[None], thin), NOISE, 22)[0])
+    assert not estimate.fingertip
+    assert estimate.large > 0.9
 
 
 def test_frames_alone_and_together_give_the_same_bits():

@@ -132,7 +132,7 @@ def test_a_contact_agrees_with_brute_force(thin, noise):
         if effective < 5000 or differ > 0.03:
             continue
         assert (np.abs(moments(contact)[0] - mean) <= 0.1 * spread).all()
-        # On the thin skin the force is little more than its prior; docs/contacts.md states the shortfall there.
+        # On the thin skin the deviation of the force falls short, as docs/contacts.md states.
         columns = slice(3 if thin else 4)
         assert moments(contact)[1][columns] == pytest.approx(spread[columns], rel=0.05)
         compared += 1
@@ -204,8 +204,8 @@ def test_two_contacts_are_told_apart():
 
 @pytest.mark.parametrize("thin", [False, True])
 def test_a_bar_is_no_fingertip(thin):
-    along = np.linspace(0.04, 0.12, 21)
-    chain = np.stack([along, 0.5 * along + 0.03, np.full(21, 0.004), np.full(21, 3.0)], axis=1)
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0.04, 0.12, 21), np.linspace(0.06, 0.084, 7)))
+    chain = np.stack([x, y, np.full(x.size, 0.004), np.full(x.size, 0.6)], axis=1)
     estimate = posterior(thin).estimate(measure(felt(chain[None], thin), NOISE, 22)[0])
     assert not estimate.fingertip
     assert estimate.large > 0.9

@@ -53,7 +53,7 @@ slow: $(PEERS)/.ready  ## run all tests under these settings, with the baseline 
 	$(MAKE) cluster
 	$(MAKE) docs
 
-cluster: $(READY)  ## check a job array and concurrent writers on real SLURM and PostgreSQL, where they are installed
+cluster: $(READY)  ## check a job array with killed processes on real SLURM and PostgreSQL, where they are installed
 	experiments/cluster/check.sh
 
 check: $(READY)  ## check lint, format and types

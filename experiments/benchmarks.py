@@ -39,7 +39,8 @@ from skin.learning.data import TouchData
 from skin.learning.network import Network
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config, validate_config
-from skin.runs.model_of_run import RunModel, window_classifier
+from skin.runs.model_of_run import RunModel
+from skin.runs.trained_model import TrainedModel
 
 Figures = dict[str, float]
 Benchmark = tuple[str, tuple[object, ...]]
@@ -245,13 +246,8 @@ def measure_latency(row: str, frames: int) -> dict[str, float]:
         frames: number of classified frames.
     """
     torch.set_num_threads(1)
-    device, learner, data = _untrained(row)
-    positions = data.example.positions
-    classify = window_classifier(learner, positions, device.model_rate)
-    engine = Engine(
-        classify, device.task, len(positions), device.window, device.model_rate, Detection(_TOUCH)
-    )
-    return _time_verdicts(device, engine, frames)
+    device, model, _ = _untrained(row)
+    return _time_verdicts(device, model, frames)
 
 
 def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
@@ -260,21 +256,14 @@ def measure_onnx_latency(row: str, frames: int) -> dict[str, float]:
     from skin.runs.onnx_writer import write_model
 
     torch.set_num_threads(1)
-    device, learner, data = _untrained(row)
-    touches = data.touches("train")
-    model = RunModel(device, learner, data.example, touch=_TOUCH)
+    device, model, data = _untrained(row)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.onnx"
-        write_model(learner.pipeline(model.places), model.describe(), touches, path)
-        exported = ExportedModel(path)
-    about = exported.metadata
-    engine = Engine(
-        exported.probabilities, about.task, len(about.positions), about.window, about.rate, Detection(_TOUCH)
-    )
-    return _time_verdicts(device, engine, frames)
+        write_model(model.learner.pipeline(model.places), model.describe(), data.touches("train"), path)
+        return _time_verdicts(device, ExportedModel(path), frames)
 
 
-def _untrained(row: str) -> tuple[AbstractSimulated, Network, TouchData]:
+def _untrained(row: str) -> tuple[AbstractSimulated, RunModel, TouchData]:
     """Return the device of a row, its network with random weights, and a few touches."""
     config = training_config(
         *_SETTINGS.get(row, ("simulator=naive",)), f"experiment={row}", "data.gestures=100"
@@ -283,11 +272,14 @@ def _untrained(row: str) -> tuple[AbstractSimulated, Network, TouchData]:
     assert isinstance(learner, Network)
     data = build_data(config, device)
     learner.build(data)
-    return device, learner, data
+    return device, RunModel(device, learner, data.example, touch=_TOUCH), data
 
 
-def _time_verdicts(device: AbstractSimulated, engine: Engine, frames: int) -> dict[str, float]:
-    """Return the times of :func:`measure_latency` for an engine on a stream of a device."""
+def _time_verdicts(device: AbstractSimulated, model: TrainedModel, frames: int) -> dict[str, float]:
+    """Return the times of :func:`measure_latency` for a model on a stream of a device."""
+    engine = Engine(
+        model.probabilities, model.task, len(model.positions), model.window, model.rate, Detection(_TOUCH)
+    )
     durations = np.array([_seconds(engine, frame) for frame in _stream(device, engine, frames + _WARM)])
     wall, core = 1e3 * durations[_WARM:].T
     return {

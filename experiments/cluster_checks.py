@@ -1,16 +1,12 @@
-"""Check that a cluster loses no run: with killed processes, and with many writers at the same time.
+"""Check that a job array loses no run, although processes are killed.
 
-    python -m experiments.cluster_checks array FOLDER http://127.0.0.1:5000
-    python -m experiments.cluster_checks writers http://127.0.0.1:5000 --seconds 600
+    python -m experiments.cluster_checks FOLDER http://127.0.0.1:5000
 
-``array`` trains 60 short runs on this machine, then as an array of 8 tasks on the server, of which two are
-killed with -9; submits the array again, and compares the tables. Uses SLURM where ``SLURM_CONF`` names a
-cluster (slurm.sh), otherwise one process after the other with the variables that SLURM would set.
+Trains 60 short runs on this machine, then as an array of 8 tasks on the server, of which two are killed with
+-9; submits the array again, and compares the tables. Uses SLURM where ``SLURM_CONF`` names a cluster
+(slurm.sh), otherwise one process after the other with the variables that SLURM would set.
 
-In ``writers``, each process begins runs, logs metrics, tags and a file as a training does, and ends them.
-Afterwards, the values are read back.
-
-Exit code 1 if a check fails.
+Exit code 1 if the check fails.
 """
 
 import argparse
@@ -21,13 +17,9 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from multiprocessing import get_context
-from multiprocessing.queues import Queue
 from pathlib import Path
 from typing import Any
 
@@ -38,27 +30,17 @@ from skin.runs.store import PROCESS, Store
 FOLDER = ROOT / "experiments" / "cluster"
 STUDY = ["study", "--config-dir", str(FOLDER / "conf"), "study=short_runs"]
 TASKS, RUNS = 8, 60
-STEPS = 20  # of each run of a writer
 EXPERIMENT = "studies"  # as in conf/study.yaml
 
 
 def main() -> None:
-    """Run a check."""
+    """Run the check."""
     parser = argparse.ArgumentParser()
-    checks = parser.add_subparsers(required=True)
-    array = checks.add_parser("array")
-    array.add_argument("folder", type=Path)
-    array.add_argument("uri")
-    array.add_argument("--kill", type=int, default=2, help="number of processes to kill")
-    array.add_argument("--seed", type=int, default=0, help="of the choice of the processes")
-    array.set_defaults(check=check_array)
-    writers = checks.add_parser("writers")
-    writers.add_argument("uri")
-    writers.add_argument("--writers", type=int, default=16)
-    writers.add_argument("--seconds", type=float, default=600)
-    writers.set_defaults(check=check_writers)
-    arguments = vars(parser.parse_args())
-    sys.exit(0 if arguments.pop("check")(**arguments) else 1)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("uri")
+    parser.add_argument("--kill", type=int, default=2, help="number of processes to kill")
+    parser.add_argument("--seed", type=int, default=0, help="of the choice of the processes")
+    sys.exit(0 if check_array(**vars(parser.parse_args())) else 1)
 
 
 def check_array(folder: Path, uri: str, kill: int, seed: int) -> bool:
@@ -152,61 +134,6 @@ def in_turn(script: Sequence[str], folder: Path, meanwhile: Callable[[], None]) 
 def environment() -> dict[str, str]:
     """Return the variables of the commands: this interpreter and this code."""
     return os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-
-
-def check_writers(uri: str, writers: int, seconds: float) -> bool:
-    """Run the writers, and return whether none of them met an error and no value is missing."""
-    context = get_context("fork")
-    results: Queue = context.Queue()
-    settings = Tracking(uri, None, "writers", True, None)
-    store = Store.open(settings)  # imports, once for all writers
-    began = time.monotonic()
-    processes = [
-        context.Process(target=write_runs, args=(settings, number, began + seconds, results))
-        for number in range(writers)
-    ]
-    for process in processes:
-        process.start()
-    reports = [results.get() for _ in processes]
-    for process in processes:
-        process.join()
-    runs = [run for made, _ in reports for run in made]
-    errors = [error for _, error in reports if error]
-    with ThreadPoolExecutor(4) as pool:
-        lost = sum(pool.map(lambda run: is_incomplete(store, run), runs))
-    took = time.monotonic() - began
-    print(f"{writers} writers, {took:.0f} s, {len(runs)} runs, {STEPS * len(runs)} batches of metrics")
-    print(f"{len(errors)} errors, {lost} incomplete runs", *errors, sep="\n")
-    return bool(runs) and not errors and not lost
-
-
-def write_runs(settings: Tracking, number: int, end: float, results: Queue) -> None:
-    """Log runs until a time of the monotonic clock; put the ids of complete ones and an error, or None."""
-    made: list[str] = []
-    error = None
-    try:
-        store = Store.open(settings)
-        while time.monotonic() < end:
-            with store.run(f"writer {number}", {"writer": str(number)}) as run:
-                for step in range(STEPS):
-                    store.log_metrics(run, {f"metric_{index}": step + 0.1 * index for index in range(10)})
-                    store.client.set_tag(run.info.run_id, "step", str(step))
-                store.client.log_text(run.info.run_id, "written", "note.txt")
-            made.append(run.info.run_id)
-    except Exception:
-        error = traceback.format_exc()
-    results.put((made, error))
-
-
-def is_incomplete(store: Store, run: str) -> bool:
-    """Return whether a value of a run is missing on the server."""
-    stored = store.client.get_run(run)
-    return (
-        stored.info.status != "FINISHED"
-        or stored.data.tags["step"] != str(STEPS - 1)
-        or len(store.client.get_metric_history(run, "metric_9")) != STEPS
-        or [file.path for file in store.client.list_artifacts(run)] != ["note.txt"]
-    )
 
 
 if __name__ == "__main__":

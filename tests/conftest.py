@@ -126,8 +126,9 @@ def no_thread_survives():
     before = set(threading.enumerate())
     yield
     deadline = monotonic() + 10
-    # MLflow keeps a pool of threads, which end with the interpreter.
-    new = lambda one: one not in before and not one.name.startswith("Mlflow")  # noqa: E731
+    # MLflow keeps a pool of threads and tqdm a monitor, which end with the interpreter.
+    lasting = ("Mlflow", "tqdm_monitor")
+    new = lambda thread: thread not in before and not thread.name.startswith(lasting)  # noqa: E731
     while left := [thread for thread in threading.enumerate() if new(thread)]:
         if monotonic() > deadline:
             pytest.fail(f"still running: {left}")
@@ -350,11 +351,17 @@ def run(begin, stores_are_copied) -> Callable[..., subprocess.CompletedProcess]:
     return run
 
 
+def _print_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    """Print a warning to the standard error stream of the moment, as Python does outside of pytest."""
+    (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
+
+
 def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     """Run ``skin`` with these words in this process; leave its state as it was."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.singleton import Singleton
 
+    import skin.runs.store  # noqa: F401  # it sets variables of the environment, which stay
     from skin.__main__ import main
 
     state, environment, here = Singleton.get_state(), dict(os.environ), Path.cwd()
@@ -373,6 +380,7 @@ def run_here(folder: Path, words: list[str]) -> subprocess.CompletedProcess:
     try:
         with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
             warnings.simplefilter("default")
+            warnings.showwarning = _print_warning  # pytest collects warnings where a person sees them
             main(words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -2,7 +2,7 @@
 
 Same networks, same numbers; but a PyTorch Geometric ``Data`` object per graph, and a dense image of three
 equal channels per frame, convolved frame by frame. Weights are interchangeable with
-``skin.learning.classifier.TouchClassifier`` by ``take_weights``.
+``skin.learning.network.TouchClassifier`` by ``take_weights``.
 """
 
 from collections.abc import Callable, Sequence

@@ -11,6 +11,7 @@ from skin.device.files import DataSet, Manifest
 from skin.runs.build import build_device
 from skin.runs.configuration import validate_config
 from skin.runs.generation import generate_data_set
+from skin.touch.fingertips import CONTACT
 
 PAGE = (ROOT / "docs" / "data.md").read_text()
 LINES = {
@@ -80,3 +81,8 @@ def test_the_page_names_the_columns(place):
     assert {name for name in named if not name.endswith("_")} <= set(known)
     own = {name for name in known if not name.startswith(("reading_", "saturated_", "gesture_"))}
     assert own <= set(named)
+
+
+def test_the_page_names_the_columns_of_contacts():
+    named = set(re.findall(r"`(contact_00_\w+)`", PAGE))
+    assert named == {f"contact_00_{name}" for name in CONTACT}

@@ -14,8 +14,7 @@ from tempfile import mkdtemp
 
 from skin.core.files import ROOT
 from skin.design.drawing import draw_sweep
-from skin.design.precision import Findings
-from skin.design.sweep import Step
+from skin.design.precision import Findings, Step
 
 # %%
 # ``skin design design=sweep simulator=solid simulator.divisions=6`` computed the numbers.

@@ -1,9 +1,9 @@
 #!/bin/bash
-# Start SLURM, PostgreSQL and an MLflow server on this machine, run the checks of a cluster, and stop all of it.
+# Start SLURM, PostgreSQL and an MLflow server on this machine, run the check of a job array, and stop all of it.
 #
-#     experiments/cluster/check.sh          # SECONDS_OF_WRITING=60: shorter
+#     experiments/cluster/check.sh
 #
-# Without SLURM, the tasks of the array run one after the other; without PostgreSQL, the checks are left out.
+# Without SLURM, the tasks of the array run one after the other; without PostgreSQL, it is left out.
 set -euo pipefail
 
 cd "$(dirname "$0")/../.."
@@ -23,6 +23,5 @@ if [ "$(id -u)" = 0 ] && command -v slurmctld munged >/dev/null; then
 else
     echo "without SLURM (Debian's slurm-wlm and munge, as root): the tasks run one after the other"
 fi
-"$PYTHON" -m experiments.cluster_checks array "$folder/array" "$uri"
-"$PYTHON" -m experiments.cluster_checks writers "$uri" --seconds "${SECONDS_OF_WRITING:-600}"
+"$PYTHON" -m experiments.cluster_checks "$folder/array" "$uri"
 rm -rf "$folder/array"

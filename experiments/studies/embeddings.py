@@ -219,10 +219,7 @@ def _layouts(device: AbstractDevice, settings: ProbeSettings, seed: int) -> list
 
 
 def _labels(sets: Sequence[Touches]) -> np.ndarray:
-    if any(touches.labels is None for touches in sets):
-        raise InputError("touches without labels cannot be probed: record them with labels")
-    labels = [touches.labels.numpy() for touches in sets if touches.labels is not None]
-    return np.concatenate(labels).astype(int)
+    return np.concatenate([touches.known_labels.numpy() for touches in sets]).astype(int)
 
 
 def levels(readings: np.ndarray, count: int) -> np.ndarray:

@@ -109,15 +109,14 @@ class Accuracy:
         from skin.evaluation.metrics import compute_metrics, encode
 
         touches = subject.device.touches("test")
-        assert touches.labels is not None
         task = subject.device.task
         point = subject.point() if subject.trained.point else None
         try:
             chances = subject.learner.probabilities(touches)
         except InputError as reason:  # another number of sensors, for example
             return Measurement({}, cannot=str(reason))
-        values = compute_metrics(chances, touches.labels, task, point)
-        outcomes = encode(chances, touches.labels, task, point)
+        values = compute_metrics(chances, touches.known_labels, task, point)
+        outcomes = encode(chances, touches.known_labels, task, point)
         return Measurement({f"same/{name}": value for name, value in values.items()}, outcomes=outcomes)
 
 
@@ -228,7 +227,6 @@ class TouchAlarms:
         )
         from skin.hardware.live.engine import DebounceSettings
         from skin.touch.labels import TOUCH
-        from skin.touch.sampler import balanced
 
         trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
@@ -240,7 +238,7 @@ class TouchAlarms:
         touch = choose_for_touches(subject.learner, device, watching, target)
         window = choose_operating_point(subject.learner, device, settings)
         assert window is not None  # it has the label
-        labels = balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
+        labels = device.sampler.balanced(2 * max(self.safe, self.dangerous), generator(Stream.TEST, 7))
         danger = labels[:, TOUCH.names.index(LABEL)]
         counted = np.concatenate([labels[~danger][: self.safe], labels[danger][: self.dangerous]])
         scores = touch_scores(subject.learner, device, watching, counted, _COUNTED)

@@ -290,7 +290,7 @@ def _compare(study: Study, config: Config, folder: Path) -> bool:
     from rich.console import Console
     from rich.progress import track
 
-    from experiments.studies.trials import find_runs, run_trials, train_study, votes
+    from experiments.studies.trials import find_runs, log_summary, run_trials, train_study, votes
     from skin.core.files import whole
     from skin.runs.store import Store
     from skin.runs.sweep import Shard
@@ -317,26 +317,28 @@ def _compare(study: Study, config: Config, folder: Path) -> bool:
     if shard:
         print(f"shard {config.shard} is measured: the same command without shard= writes the results")
     else:
-        _publish(study, [*trials, *votes(study, trials)], config, folder)
+        paths = _publish(study, [*trials, *votes(study, trials)], config, folder)
+        if study.measure or any(trial.condition for trial in trials):
+            log_summary(store, study, trials, paths)
     return any(run.run is None for run in planned)
 
 
-def _publish(study: Study, trials: Sequence["TrialResult"], config: Config, folder: Path) -> None:
-    """Write and print the results of a study."""
+def _publish(study: Study, trials: Sequence["TrialResult"], config: Config, folder: Path) -> list[Path]:
+    """Write and print the results of a study, and return the paths of its tables."""
     from experiments.studies.study_page import draw_report, publish_files, publish_study
 
     path = folder / f"study_{study.name}"
     if not study.metrics:
-        publish_files(study, trials, path.with_suffix(".csv"))
+        paths = publish_files(study, trials, path.with_suffix(".csv"))
     else:
         smoke = "SMOKE, one epoch on little data, ignore the scores: " * bool(config.smoke)
         settings = [word for word in passed_overrides() if not word.startswith("tracking.")]
         small = study.small if smoke else ()
         title = smoke + ", ".join([f"{study.name}: {study.about}", *small, *settings])
-        publish_study(study, title, trials, path)
+        paths = publish_study(study, title, trials, path)
     if study.report_figures:
-        paths = draw_report(trials, folder)
-        print(f"{len(paths)} figures of the report in {folder}")
+        print(f"{len(draw_report(trials, folder))} figures of the report in {folder}")
+    return paths
 
 
 def _measure_skin(study: Study, folder: Path) -> None:

@@ -414,9 +414,8 @@ def draw_skin(device: AbstractSimulated, folder: Path, name: str = "fem") -> lis
     """Draw figures 10 and 11 from the gestures of a skin whose simulator has a name."""
     recording = device.recording("test", complete=False)
     touches, drawn = recording.touches, recording.parameters
-    assert touches.labels is not None
     assert recording.force is not None
-    labels = dict(zip(device.task.names, touches.labels.T.bool(), strict=True))
+    labels = dict(zip(device.task.names, touches.known_labels.T.bool(), strict=True))
     movie = device.sampler.sample(64, np.random.default_rng(0))
     chosen = int((movie.labels[:, 1:].all(1) & (movie.labels[:, 0] == 0)).nonzero()[0])
     simulators = {"naive": Naive(device.body, device.sensors), name: device.model}

@@ -24,7 +24,6 @@ from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
-from mlflow.artifacts import download_artifacts
 from mlflow.entities import Run
 
 from experiments.studies.measures import Accuracy, StudyMeasure, Subject
@@ -183,11 +182,7 @@ def load_outcomes(store: Store, run: Run) -> np.ndarray | None:
     if OUTCOMES not in {file.path for file in store.client.list_artifacts(run.info.run_id)}:
         return None
     with TemporaryDirectory() as folder:
-        path = download_artifacts(
-            run_id=run.info.run_id, artifact_path=OUTCOMES, dst_path=folder, tracking_uri=store.uri
-        )
-        outcomes: np.ndarray = np.load(path)
-        return outcomes
+        return np.load(FinishedRun(store, run).fetch(OUTCOMES, folder))
 
 
 def _look(store: Store, every: Sequence[Variant]) -> list[Planned]:
@@ -376,6 +371,23 @@ class RestoredRun:
             "outcomes": None if result.outcomes is None else result.outcomes.tobytes(),
             "files": files,
         }
+
+
+def log_summary(store: Store, study: Study, trials: Sequence[TrialResult], files: Sequence[Path]) -> None:
+    """Log what a study measured as one run: its files, and the mean of every metric over its trials.
+
+    The next summary of this study replaces it.
+    """
+    values: dict[str, list[float]] = {}
+    for trial in trials:
+        for metric, value in trial.metrics.items():
+            name = "/".join(part for part in (trial.variant.name, trial.condition, metric) if part)
+            values.setdefault(re.sub(r"[^\w./: -]", "-", name), []).append(value)
+    before = store.find("FINISHED", study=study.name)
+    with store.run(f"study {study.name}", {"study": study.name}, again=next(iter(before), None)) as run:
+        store.log_metrics(run, {name: float(np.mean(numbers)) for name, numbers in values.items()})
+        for path in files:
+            store.client.log_artifact(run.info.run_id, str(path))
 
 
 def read_row(path: Path) -> dict[str, Any] | None:

@@ -1,17 +1,15 @@
 """The result of checking a law: our number, the reference and the tolerance; and the page of all results."""
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from skin.core.files import whole, write
+from skin.core.files import json_line, whole, write
 from skin.plot.figures import MARKS
 
 
@@ -159,18 +157,7 @@ def as_json(results: Results) -> str:
         for law, outcome in results
         for finding in outcome.findings
     ]
-    return json.dumps(_finite(lines), indent=1, allow_nan=False) + "\n"
-
-
-def _finite(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return lines with null instead of values that are not finite, which JSON does not have."""
-    return [
-        {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in line.items()
-        }
-        for line in lines
-    ]
+    return json_line(lines, indent=1) + "\n"
 
 
 def physics_page(results: Results) -> str:
@@ -180,10 +167,7 @@ def physics_page(results: Results) -> str:
 
 def _line(result: tuple[Law, CheckResult]) -> str:
     law, outcome = result
-    worst = max(
-        outcome.findings,
-        key=_excess,
-    )
+    worst = max(outcome.findings, key=_excess)
     verdict = "holds" if all(finding.ok for finding in outcome.findings) else "**fails**"
     return (
         f"| [{law.name}](#{law.name}) | {law.reference} | {_error(worst)} | "

@@ -37,6 +37,8 @@ LAWS = (
         "the same closed form", solid.no_locking),
     Law("mesh", "The default mesh gives the readings of the default skin under a square load.",
         "sums of exact waves of both layers", solid.default_mesh),
+    Law("discs", "The default cells give readings under discs as small as a fingertip, wherever they press.",
+        "Hankel integral of exact waves of both layers", solid.discs),
     Law("boussinesq", "Pressure on a thick soft block: displacement and stress below and beside the load.",
         "Boussinesq, integrated over the square", solid.boussinesq),
     Law("cerruti", "Tangential traction on a thick soft block: displacement and stress.",

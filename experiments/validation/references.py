@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.special import j1
 from skfem import BilinearForm, CellBasis, ElementHex1, ElementVector, MeshHex
 from skfem.helpers import ddot, div, sym_grad, trace
 
@@ -224,6 +225,27 @@ def patch(
     number = np.pi * np.hypot(order[:, None] / size[0], order / size[1])
     answer = waves(number.ravel(), slabs, depth).reshape(count, count, 2)
     return np.einsum("m,n,mnk->k", weights[0], weights[1], answer)
+
+
+def disc(slabs: Sequence[Slab], radius: float, beside: np.ndarray, side: float, depth: float) -> np.ndarray:
+    """Return the force on squares under 1 Pa on a disc on endless layers, (P,), N/Pa, by a Hankel integral.
+
+    Args:
+        slabs: from the surface down.
+        radius: of the disc, m.
+        beside: (P, 2), from the middle of the disc to that of each square, m.
+        side: of the squares, m.
+        depth: of the squares, m; where pressure waves shorter than 1 / 40 of it have died away.
+    """
+    share, weight = np.polynomial.legendre.leggauss(400)
+    longest = 40 / depth
+    number, weight = (share + 1) / 2 * longest, weight / 2 * longest
+    strength = -waves(number, slabs, depth)[:, 1] * 2 * np.pi * radius * j1(number * radius) * weight
+    angle = (np.arange(96) + 0.5) * 2 * np.pi / 96
+    x, y = (np.outer(number, way(angle)) for way in (np.cos, np.sin))
+    square = np.sinc(x * side / 2 / np.pi) * np.sinc(y * side / 2 / np.pi) * side**2
+    shift = np.cos(beside[:, :1, None] * x + beside[:, 1:, None] * y)
+    return np.einsum("k,ka,pka->p", strength, square, shift) / (2 * np.pi * len(angle))
 
 
 def _even(slabs: Sequence[Slab], depth: float) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from experiments.validation.references import (
     Slab,
     block,
     bonded_layer,
+    disc,
     graded,
     held,
     locking,
@@ -32,6 +33,7 @@ from skin.mechanics.contact.rigid import solve_contact as press
 from skin.mechanics.contact.rigid import stabilise_checkerboard
 from skin.mechanics.simulator._hexahedra import Hexahedra
 from skin.mechanics.simulator.solid import Elastic, build_mesh, reading_rows
+from skin.touch.shapes import Shapes
 
 # The default skin, from the surface down.
 SLABS = (Slab(0.005, 170e3, 0.499), Slab(0.010, 560e3, 0.49))
@@ -106,8 +108,8 @@ def even_pressure(quick: bool) -> CheckResult:
     body = default_sheet(16 if quick else 24, 0.24)
     depths = (0.0025, 0.005, 0.012)
     sensors = Sensors(np.array([[0.12, 0.12, depth] for depth in depths]), (0.01, 0.01))
-    mesh = build_mesh(body, 2, {})
-    felt = Elastic(mesh).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
+    mesh = build_mesh(body, 2, {}, 2)
+    felt = Elastic(mesh, 2).transfer(reading_rows(mesh, sensors), (2,))[0].sum(axis=1) / 1e-4
     return CheckResult(
         [
             relative_finding(f"reading / p A, {1e3 * depth:g} mm deep", reading, 1, 2e-3)
@@ -284,6 +286,10 @@ def convergence(quick: bool) -> CheckResult:
     return CheckResult(findings, (), (picture,))
 
 
+_FOOTPRINT = 0.01  # m
+_DISCS = {0.005: 0.05, 0.008: 0.02, 0.02: 0.02}  # tolerance by radius, m
+
+
 def default_mesh(quick: bool) -> CheckResult:
     """Compare readings of the default skin under a square load with the exact layers, on several meshes."""
     meshes = ((16, 3), (32, 2)) if quick else ((16, 3), (32, 1), (32, 3), (64, 3))
@@ -310,6 +316,38 @@ def default_mesh(quick: bool) -> CheckResult:
         relative_finding("D_t under the middle, m/Pa", ours[2, 0], exact[2, 0], 0.05),
     ]  # fmt: skip
     return CheckResult(findings, remarks)
+
+
+def discs(quick: bool) -> CheckResult:
+    """Compare readings under pictures of small discs on the default cells with endless exact layers."""
+    body = default_sheet(16, 0.08) if quick else default_sheet(32)
+    middle = body.size[0] / 2
+    # The sensors stand in different places within a cell.
+    places = middle + np.array([[0, 0], [2.5, 2.5], [2.5, 0], [1.2, -1.3], [-0.8, 1.9]]) * 1e-3
+    deep = np.column_stack([places, np.full(len(places), SLABS[0].thickness)])
+    sensors = Sensors(deep, (_FOOTPRINT, _FOOTPRINT))
+    mesh = build_mesh(body, 2, {}, 2)
+    operator = Elastic(mesh, 2).transfer(reading_rows(mesh, sensors), (2,))[0]
+    shapes = Shapes(("disc",), body, fine=True)
+    spread = np.sqrt(4 * float(shapes.levels[0].double().mean()) / np.pi)  # radius over scale
+    beside = np.array([[0.0, 0.0], [0.003, 0.0], [0.005, 0.005]])
+    findings = []
+    for radius, tolerance in _DISCS.items():
+        exact = disc(SLABS, radius, beside, _FOOTPRINT, SLABS[0].thickness)
+        at = (places[:, None] + beside).reshape(-1, 2)
+        turn = np.zeros(len(at))
+        moments = shapes.press(turn.astype(int), turn, turn + radius / spread, at).moments.flatten(1).double()
+        felt = (moments.numpy() @ operator.T).reshape(*(len(places), len(beside)), -1)
+        ours = np.stack([felt[sensor, :, sensor] for sensor in range(len(places))])
+        ours *= np.pi * radius**2 / np.prod(body.cell)
+        error = np.abs(ours - exact) / exact[0]
+        for number, (x, y) in enumerate(1e3 * beside):
+            worst = error[:, number].argmax()
+            case = f"reading / p, m^2, radius {1e3 * radius:g} mm, {x:g}, {y:g} mm beside"
+            findings.append(
+                Finding(case, ours[worst, number], exact[number], error[worst, number], tolerance)
+            )
+    return CheckResult(findings, ("errors beside a sensor are shares of the reading above it",))
 
 
 def _list(errors: np.ndarray) -> str:

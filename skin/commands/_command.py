@@ -134,9 +134,9 @@ def check_quickly(config: Config, overrides: Sequence[str]) -> None:
     if config.run is not None and not config.run.endswith(".onnx"):
         check_groups({name: groups[name] for name in ("device", "contact") if name in groups.keys() & named})
         if "touch" in named:
-            from skin.touch.gesture import GestureSettings
+            from skin.touch.fingertips import read_touch
 
-            GestureSettings.of(groups["touch"])
+            read_touch(groups["touch"])
 
 
 _VERSION = "1.3"  # of Hydra, whose defaults hold

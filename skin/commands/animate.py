@@ -29,7 +29,7 @@ def main(config: Config) -> None:
         scene = read_scene(device, config.index or 0)
     else:
         field = config.view == "skin3d"
-        scene = simulate_scene(device.simulation, list(config.labels or ()), config.shape, config.seed, field)
+        scene = simulate_scene(device.simulation, config.labels, config.shape, config.seed, field)
     path = Path(config.out).expanduser()
     path = (still if path.suffix == ".png" else write_animation)(scene, str(config.view), path)
     print(f"{path}: {scene.title}, {len(scene.readings)} frames at {scene.rate:g} Hz")

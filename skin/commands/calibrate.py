@@ -1,9 +1,13 @@
 """Fit the simulated device to bench measurements of a real one.
 
     skin calibrate session=bench.csv presses=gauge.csv
+    skin calibrate session=bench.csv weight=2.0 base=0.02
+    skin calibrate session=bench.csv board=500
     skin calibrate session=demo.csv calibrate.demo=true
 
-Writes out=, for device.calibration=. Exits with 1 if it does not predict held-out presses better.
+A known weight (kg) on a round base (radius, m) that lay on every sensor, or a board over the whole skin with
+a known force (N), replaces the gauge. Writes out=, for device.calibration=. With a gauge, exits with 1 if it
+does not predict held-out presses better.
 calibrate.demo=true first writes the session of an emulated device: no hardware is needed.
 """
 
@@ -15,24 +19,65 @@ from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
 
+_UNITS = ("force_scale", "time_scale")
+_LOADS = ("weight", "base", "board")
 _CONFIRMED = ("places", "channels", "broken")
 
 
 @command("calibrate")
 def main(config: Config) -> None:
-    """Print the errors on held-out presses, and write a calibration with all presses."""
+    """Print the errors on held-out presses, or what a known load gives, and write the calibration."""
     if config.session is None:
         raise InputError("which session? add session=bench.csv, or try session=demo.csv calibrate.demo=true")
     files = [config.presses, None if config.calibrate["demo"] else config.session]
     if missing := [name for name in files if name and not Path(name).expanduser().is_file()]:
         raise InputError(f"no file {missing[0]}: calibrate.demo=true makes a session without hardware")
 
+    if any(getattr(config, name) is not None for name in _LOADS):
+        _calibrate_by_load(config, config.session)
+    else:
+        _calibrate_by_gauge(config, config.session)
+
+
+def _calibrate_by_load(config: Config, path: str) -> None:
+    """Calibrate from placements of a weight or a board."""
+    from skin.core.settings import configured
+    from skin.device.calibration import write_calibration
+    from skin.hardware.bench import Units, read_bench_session, write_bench_session
+    from skin.hardware.known_loads import KnownLoad, emulate_known_load, fit_known_load, print_known_load
+    from skin.hardware.wiring import Confirmed, device_channels
+    from skin.runs.build import build_device
+
+    if config.presses is not None:
+        raise InputError("a known load replaces the gauge: leave out presses=, or weight=, base= and board=")
+    settings = config.calibrate
+    load = configured(KnownLoad, {name: getattr(config, name) for name in _LOADS}, "calibrate")
+    confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
+    device = build_device(config).simulated("a calibration fits the simulation to a skin")
+    load.check(device.size)
+    if settings["demo"]:
+        session = emulate_known_load(device, load, settings)
+        print(f"{write_bench_session(session, path)}: {session.time[-1]:.0f} s")
+    units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
+    shape = settings["indenter"], settings["radius"]
+    session = read_bench_session(path, *shape, settings["unit"], units)
+    result = fit_known_load(device, confirmed.ordered(session), load)
+    print_known_load(result)
+    about = dict(result.calibration.about) | {"session": path}
+    calibration = replace(result.calibration, about=about, channels=device_channels(session, confirmed))
+    print(write_calibration(calibration, str(config.out)))
+
+
+def _calibrate_by_gauge(config: Config, path: str) -> None:
+    """Calibrate from presses of a force gauge."""
     from rich.console import Console
 
     from skin.core.settings import configured
     from skin.device.calibration import write_calibration
-    from skin.hardware.bench import read_bench_session, read_gauge, write_demo_session
+    from skin.hardware.bench import Units, read_bench_session, read_gauge
+    from skin.hardware.bench_protocol import write_demo_session
     from skin.hardware.calibration import (
+        check_force,
         evaluate_held_out,
         fit_calibration,
         print_calibration,
@@ -44,14 +89,17 @@ def main(config: Config) -> None:
     confirmed = configured(Confirmed, {name: settings[name] for name in _CONFIRMED}, "calibrate")
     device = build_device(config).simulated("a calibration fits the simulation to a skin")
     if settings["demo"]:
-        print(write_demo_session(device, settings, config.session))
+        print(write_demo_session(device, settings, path))
     shape = settings["indenter"], settings["radius"]
-    session = read_bench_session(config.session, *shape, settings["unit"])
-    rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"])
+    units = configured(Units, {name: settings[name] for name in _UNITS}, "calibrate")
+    session = read_bench_session(path, *shape, settings["unit"], units)
+    rows = None if config.presses is None else read_gauge(config.presses, *shape, settings["delay"], units)
     with Console(stderr=True).status("fitting"):
         bench = wired_bench(device, session, rows, confirmed)
         calibration = fit_calibration(bench)
         check_usable(calibration)
+        if units.force_scale is None:
+            check_force(calibration, device.imperfection.clip)
         outcome = evaluate_held_out(bench, settings["held_out"])
     print_calibration(calibration, outcome)
     if not outcome.helps:
@@ -62,6 +110,6 @@ def main(config: Config) -> None:
         sys.exit(1)
     rmse = {name: round(getattr(outcome, name), 6) for name in ("simulated", "tared", "calibrated")}
     about = dict(calibration.about) | {"held_out": list(outcome.held_out), "rmse": rmse}
-    about |= {"session": config.session, "presses_file": config.presses}
+    about |= {"session": path, "presses_file": config.presses}
     channels = device_channels(session, confirmed)
     print(write_calibration(replace(calibration, about=about, channels=channels), str(config.out)))

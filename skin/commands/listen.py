@@ -1,16 +1,25 @@
-"""Check a port: print frame rate, errors and channel values.
+"""Check a port: print frame rate, errors and channel values; or propose an adapter for a board.
 
     skin listen device.port=/dev/ttyACM0
+    skin listen device.port=/dev/ttyACM0 adapter=auto > board.yaml
+    skin listen device.port=/dev/ttyACM0 device.adapter=board.yaml
 
 Listens for seconds=, or until Ctrl-C.
 """
 
 import signal
+import sys
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from skin.commands._command import command
 from skin.errors import InputError
 from skin.runs.configuration import Config
+
+if TYPE_CHECKING:
+    from skin.hardware.wire.reader import PortSettings
+
+_ENOUGH = 5.0  # s of a stream that show what a board sends
 
 
 @command("listen")
@@ -26,8 +35,12 @@ def main(config: Config) -> None:
     from skin.hardware.wire.skin import PortMonitor, open_skin
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    settings = PortSettings.select(device)
+    if settings.frames.kind == "auto":
+        _propose(settings, config.seconds)
+        return
     sensors = None if config.n is None else range(config.n)
-    with open_skin(PortSettings.select(device), sensors) as skin:
+    with open_skin(settings, sensors) as skin:
         listener = PortMonitor(skin)
         try:
             with suppress(KeyboardInterrupt):
@@ -36,3 +49,18 @@ def main(config: Config) -> None:
         except (SkinTimeout, SkinDisconnected) as error:
             raise InputError(f"{device['port']}: {error}") from error
         print(listener.summary())
+
+
+def _propose(settings: "PortSettings", seconds: float | None) -> None:
+    """Print an adapter that reads the board, as YAML to paste; what it makes of it goes to standard error."""
+    from skin.hardware.wire.proposal import listen_raw, propose
+    from skin.hardware.wire.reader import open_stream
+
+    stream = open_stream(str(settings.port), settings.baudrate)
+    try:
+        pieces = listen_raw(stream, _ENOUGH if seconds is None else min(seconds, _ENOUGH))
+    finally:
+        stream.close()
+    proposal = propose(pieces)
+    print(f"# {proposal.summary}", proposal.adapter.describe(), sep="\n")
+    print("save it, as board.yaml, and give device.adapter=board.yaml", file=sys.stderr)

@@ -4,7 +4,7 @@ import errno
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -79,7 +79,7 @@ def write(text: str, path: Path) -> Path:
 
 def json_text(content: Any) -> str:
     """Return JSON with numbers to six digits; further ones depend on the processor."""
-    return json_line(_rounded(content), indent=2) + "\n"
+    return json_line(_map_floats(content, lambda number: float(f"{number:.6g}")), indent=2) + "\n"
 
 
 def json_line(content: Any, **settings: Any) -> str:
@@ -92,23 +92,17 @@ def json_line(content: Any, **settings: Any) -> str:
     try:
         return json.dumps(content, allow_nan=False, **settings)
     except ValueError:  # seldom: the copy is made only where it is needed
-        return json.dumps(_finite(content), allow_nan=False, **settings)
+        finite = _map_floats(content, lambda number: number if math.isfinite(number) else None)
+        return json.dumps(finite, allow_nan=False, **settings)
 
 
-def _finite(value: Any) -> Any:
+def _map_floats(value: Any, change: Callable[[float], float | None]) -> Any:
+    """Return a copy of plain containers with every float changed."""
     if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: _map_floats(entry, change) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _rounded(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(entry) for entry in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
+        return [_map_floats(entry, change) for entry in value]
+    return change(value) if isinstance(value, float) else value
 
 
 def unwritable(path: Path | str, error: OSError, place: str) -> InputError:

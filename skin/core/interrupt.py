@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -59,22 +60,23 @@ def ends_on_signal(last: Callable[[], object] | None = None) -> Iterator[None]:
 @contextmanager
 def _watched(answered: Event, last: Callable[[], object] | None) -> Iterator[None]:
     """End the process where a signal is not answered while the block runs."""
-    read, write = os.pipe()
-    os.set_blocking(write, False)
+    # A pair of sockets, because Windows has no pipes that do not block before Python 3.12.
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
     # The interpreter writes the numbers of signals at once, whatever the main thread does.
-    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    watch = Thread(target=_watch, args=(read, answered, last), name="skin-signals", daemon=True)
+    before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    watch = Thread(target=_watch, args=(receiver, answered, last), name="skin-signals", daemon=True)
     watch.start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
-        os.close(write)
+        sender.close()
 
 
-def _watch(read: int, answered: Event, last: Callable[[], object] | None) -> None:
-    with open(read, "rb", buffering=0) as signals:
-        while numbers := signals.read(64):
+def _watch(receiver: socket.socket, answered: Event, last: Callable[[], object] | None) -> None:
+    with receiver:
+        while numbers := receiver.recv(64):
             if signal.SIGTERM in numbers and not answered.wait(_PATIENCE):
                 if last is not None:
                     ending = Thread(target=_try, args=(last,), daemon=True)

@@ -64,7 +64,9 @@ def to_input_error(error: Exception) -> InputError | None:
     if isinstance(cause, InputError):
         return cause
     reason = cause or error
-    if isinstance(reason, TypeError) and "argument" not in str(reason):
+    # Hydra's own TypeErrors are about words such as _partial_ of a configuration.
+    hydras = str(reason).startswith("Instantiation:")
+    if isinstance(reason, TypeError) and "argument" not in str(reason) and not hydras:
         return InputError(one_line(error)) if isinstance(error, InstantiationException) else None
     if isinstance(error, InstantiationException) and cause is not None and not isinstance(cause, TypeError):
         return InputError(one_line(error)) if isinstance(cause, _UNFIT) else None

@@ -136,8 +136,6 @@ def check_groups(config: Mapping[str, Any]) -> None:
         InputError: as :func:`check_settings`, or a class that cannot be imported.
     """
     for name, part in _parts(config, ""):
-        if not isinstance(part.get("_partial_", False), bool):
-            raise InputError(f"{name}._partial_={part['_partial_']} must be true or false")
         # The model is inside the learner, but is set by the name of its group.
         inner = name.split(".")[-1]
         label = inner if inner in _INNER else name
@@ -168,6 +166,8 @@ def _parts(value: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     if isinstance(value, Mapping):
         for key, entry in value.items():
             yield from _parts(entry, f"{name}.{key}" if name else str(key))
+        if not isinstance(value.get("_partial_", False), bool):
+            raise InputError(f"{name}._partial_={value['_partial_']} must be true or false")
         target = value.get("_target_")
         if target is None and (option := name.rpartition(".")[2]) in _INNER:
             raise InputError(f"{option} chooses no option: leave it out, or give one that --help lists")
@@ -294,9 +294,10 @@ def check_targets(config: Any, where: str) -> None:
     Raises:
         InputError: another class is named, or a value is an interpolation, which could become a name.
     """
-    for path, value in _iterate_values(config, ()):
-        if isinstance(value, str) and "${" in value:
-            _refuse(where, path, f"has the interpolation {value!r}, stored values are final")
+    for path, value in walk_settings(config):
+        for text in (*path[-1:], value):
+            if isinstance(text, str) and "${" in text:
+                _refuse(where, path, f"has the interpolation {text!r}, stored values are final")
         if path and path[-1] == "_target_" and not _is_allowed(value):
             _refuse(where, path, f"names {value!r}, which could run any code")
     row = config.get("row") if isinstance(config, dict) else None
@@ -310,18 +311,14 @@ def _refuse(where: str, path: tuple[str, ...], reason: str) -> None:
     )
 
 
-def _iterate_values(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield every key with its value and every entry of a list, however deep."""
-    if isinstance(value, dict):
-        for key, entry in value.items():
-            if isinstance(key, str) and "${" in key:
-                yield (*path, key), key
-            yield (*path, str(key)), entry
-            yield from _iterate_values(entry, (*path, str(key)))
-    elif isinstance(value, list):
-        for number, entry in enumerate(value):
-            yield (*path, str(number)), entry
-            yield from _iterate_values(entry, (*path, str(number)))
+def walk_settings(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield plain containers and every value in them, however deep, with their paths."""
+    yield path, value
+    entries = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
+    for key, entry in entries:
+        yield from walk_settings(entry, (*path, str(key)))
 
 
 def _is_allowed(name: Any) -> bool:

@@ -14,8 +14,7 @@ from rich.table import Table
 from torch import Tensor
 
 from skin.body.base import AbstractBody, Sensors
-from skin.design.precision import Findings
-from skin.design.sweep import Step
+from skin.design.precision import Findings, Step
 from skin.plot.figures import COLOURS, MARKS, save_figure
 
 _NOTE = (

@@ -29,7 +29,6 @@ from skin.plot.figures import save_figure
 from skin.runs.build import build_device
 from skin.runs.configuration import Config
 from skin.touch.movie import Movie
-from skin.touch.sampler import balanced
 
 # The readings that sampled touches give at any sites of a skin, and their covariance.
 
@@ -72,7 +71,7 @@ def sampled_readings(
         clip: largest reading, N.
     """
     read = _reader(device, sensors)
-    wanted_labels = balanced(touches, generator(Stream.PLACEMENT, seed, 0))
+    wanted_labels = device.sampler.balanced(touches, generator(Stream.PLACEMENT, seed, 0))
     parts = range(0, touches, _BATCH)
     console, interactive = Console(stderr=True), sys.stderr.isatty()
     for number, first in enumerate(

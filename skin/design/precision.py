@@ -1,29 +1,35 @@
-"""The local precision of a skin for fingertips, blind touches and the receptive radius.
+"""The local precision of a skin for fingertips, blind touches and the receptive radius; a sweep over designs.
 
 The local precision describes touches near the true one. It is no limit for estimators
 (:mod:`skin.design.precision`).
 """
 
+import csv
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge, Gt, MinLen
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from rich.console import Console
+from rich.progress import track
 from scipy.stats.qmc import Halton
 from torch import Tensor
 
-from skin.body.base import AbstractBody
-from skin.core.files import json_text, write
+from skin.body.base import AbstractBody, Layer
+from skin.body.layout import Footprint, Grid
+from skin.body.material import Material
+from skin.core.files import json_text, whole, write
 from skin.core.settings import RISING, checked
 from skin.errors import InputError
 from skin.inference.noise import Noise
 from skin.mechanics.geometry import PARAMETERS, Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.runs.build import build_skin
+from skin.runs.build import SkinModel, build_skin
 from skin.runs.configuration import Config
 
 # Covariance of the parameters given the readings, to first order: (J' R^-1 J + P)^-1, with the slopes J, the
@@ -60,7 +66,7 @@ def sensitivity(simulator: AbstractSimulator, fingertip: Fingertip, touches: Ten
 
     Args:
         simulator: maps pressure to readings; its buffers become float64.
-        fingertip: the pressure of a touch.
+        fingertip: the loads of a touch.
         touches: (B, 4).
     """
     simulator.double()
@@ -77,7 +83,7 @@ def _parts(
             along = torch.zeros_like(part)
             along[:, axis] = 1
             # Touches do not influence each other, so one direction serves all of them.
-            pair = torch.func.jvp(lambda touch: simulator(fingertip(touch)).readings, (part,), (along,))
+            pair = torch.func.jvp(lambda touch: simulator.press(fingertip(touch)).readings, (part,), (along,))
             slopes.append(pair[1])
         yield pair[0], torch.stack(slopes, dim=-1)
 
@@ -193,7 +199,7 @@ class LocalPrecision:
             InputError: the margin leaves no place.
         """
         touches = self.sample(body)
-        felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
+        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), touches)
         area = math.prod(self._extent(body))
         return [self._findings(felt.of_force(force), force, body, area) for force in self.forces]
 
@@ -254,6 +260,103 @@ class LocalPrecision:
         down, across = torch.meshgrid(y, x, indexing="ij")
         constants = torch.tensor([sum(self.radii) / 2, 1.0]).expand(across.numel(), 2)
         touches = torch.cat([torch.stack([across, down], -1).flatten(0, 1), constants], dim=1)
-        felt = sensitivity(simulator, Fingertip(body, self.rim), touches)
+        felt = sensitivity(simulator, Fingertip(body, self.rim, simulator.smooth), touches)
         places = [self._deviations(felt.of_force(force), force, body)[0] for force in self.forces]
         return torch.stack(places).unflatten(1, body.shape)
+
+
+Pair = tuple[PositiveInt, PositiveInt]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One combination of thickness and sensors.
+
+    Attributes:
+        thickness: of the layer, m.
+        grid: rows and columns of sensors.
+        pitch: distance of neighbouring sensors, the mean of both directions, m.
+        findings: for each force.
+    """
+
+    thickness: float
+    grid: tuple[int, int]
+    pitch: float
+    findings: list[Findings]
+
+    def lines(self) -> Iterator[dict[str, float]]:
+        """Yield one line of a table per force."""
+        rows, columns = self.grid
+        for finding in self.findings:
+            about = {"thickness_m": self.thickness, "rows": rows, "columns": columns, "pitch_m": self.pitch}
+            yield about | asdict(finding)
+
+
+@checked("design")
+@dataclass(frozen=True, kw_only=True)
+class Sweep(LocalPrecision):
+    """Computes the local precision of one layer for several thicknesses and regular grids of sensors.
+
+    Args:
+        material: of the layer, as in ``body.layers``.
+        thicknesses: of the layer, m.
+        grids: rows and columns of sensors.
+        footprint: extent (x, y) of the sensitive area of a sensor, m.
+        height: of the sensors above the base, m.
+    """
+
+    material: str | Mapping[str, Any] = "EcoFlex 00-30"
+    thicknesses: Annotated[Sequence[PositiveFloat], MinLen(1)] = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
+    grids: Annotated[Sequence[Pair], MinLen(1)] = tuple((count, count) for count in range(3, 9))
+    footprint: Footprint = (0.01, 0.01)
+    height: PositiveFloat = 0.0005
+
+    def run(self, config: Config, folder: Path) -> None:
+        """Write design_sweep.csv and design_sweep.png.
+
+        Raises:
+            InputError: a skin that cannot be built, a simulator without mechanics, or sensors outside the
+                layer.
+        """
+        from skin.design.drawing import draw_sweep, print_sweep
+
+        skin = build_skin(config)
+        cases = [
+            (thickness, (rows, columns)) for thickness in self.thicknesses for rows, columns in self.grids
+        ]
+        console, interactive = Console(stderr=True), sys.stderr.isatty()
+        steps = [
+            self.step(skin, *case)
+            for case in track(cases, "solving", console=console, disable=not interactive)
+        ]
+        print_sweep(steps)
+        path = folder / "design_sweep.csv"
+        with whole(path) as partial, partial.open("w", newline="") as file:
+            lines = [line for step in steps for line in step.lines()]
+            writer = csv.DictWriter(file, list(lines[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(lines)
+        print(path, draw_sweep(steps, folder / "design_sweep.png"), sep="\n")
+
+    def step(self, skin: SkinModel, thickness: float, grid: tuple[int, int]) -> Step:
+        """Return the findings of one layer with a grid of sensors.
+
+        Args:
+            skin: its body gives extent and cells, and its simulator the mechanics.
+            thickness: m.
+            grid: rows and columns.
+
+        Raises:
+            InputError: as of :meth:`run`.
+        """
+        if thickness <= self.height:
+            raise InputError(
+                f"design.height={self.height:g} m is not inside a layer of {thickness:g} m: give less"
+            )
+        body = replace(skin.body, layers=(Layer(Material.of(self.material), thickness),))
+        sensors = Grid(*grid, footprint=self.footprint, depth=thickness - self.height).sensors(body)
+        simulator = skin.simulator(body, sensors)
+        if not simulator.mechanical:
+            raise InputError("a sweep over thickness needs a simulator with mechanics: set simulator=solid")
+        pitch = sum(side / count for side, count in zip(body.size, grid[::-1], strict=True)) / 2
+        return Step(thickness, grid, pitch, self.find(simulator, body))

@@ -14,6 +14,7 @@ from skin.device.touches import Recording, only_touches
 from skin.errors import InputError
 from skin.touch.gesture import GestureSettings
 from skin.touch.labels import OPPOSITE
+from skin.touch.sampler import AbstractSampler
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ def report_balance(device: AbstractDevice, recording: Recording | None = None, s
     balance = class_balance(recording or device.recording(None, complete=False), sampler.shapes.names)
     if shown:
         _log.info("\n".join(balance_table(balance)))
-    check_label_leakage(balance, sampler.settings)
+    check_label_leakage(balance, sampler)
 
 
 def class_balance(recording: Recording, shapes: tuple[str, ...]) -> dict[str, Any]:
@@ -142,7 +143,7 @@ def _cells(side: dict[str, Any]) -> list[str]:
     return [*shares, f"{side['force']:.0f}", *places, *lost]
 
 
-def check_label_leakage(report: dict[str, Any], settings: GestureSettings) -> None:
+def check_label_leakage(report: dict[str, Any], settings: AbstractSampler | GestureSettings) -> None:
     """Warn if the shape alone predicts a label.
 
     A label leaks if its balanced accuracy is above ``settings.leak`` by more than two standard errors; the

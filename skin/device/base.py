@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skin.device.imperfection import Constants, Imperfection
     from skin.device.touches import TouchStream
     from skin.mechanics.simulator.base import AbstractSimulator
-    from skin.touch.sampler import TouchSampler
+    from skin.touch.sampler import AbstractSampler
 
 
 Split = Literal["train", "validation", "holdout", "test"]
@@ -37,6 +37,8 @@ class AbstractDevice(ABC):
         size: extent (x, y) of the sheet, m.
         surface: the touched body, for plots; None: a flat sheet of ``size``.
         name: of the source of :meth:`strips`, for the live view.
+        split: in words, what its splits keep apart.
+        configured: whether its sensors and its body are those of the configuration.
         real: whether touches are read from a real skin, which may ask a person for them.
     """
 
@@ -44,6 +46,8 @@ class AbstractDevice(ABC):
     size: tuple[float, float]
     surface: AbstractBody | None = None
     name: str = "simulator"
+    split: str = "by gesture"
+    configured: bool = True
     real: bool = False
 
     @property
@@ -127,7 +131,7 @@ class AbstractSimulated(AbstractDevice):
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
         sensors: S sensors, at the positions that touches report.
         model: maps pressure to the true readings of the sensors at their true positions.
-        sampler: draws the gestures.
+        sampler: draws the touches.
         window: frames per touch.
         model_rate: frames per second of touches, Hz.
         rate: frames per second of the sensors, Hz; touches are resampled to ``model_rate``.
@@ -144,7 +148,7 @@ class AbstractSimulated(AbstractDevice):
     simulator: Callable[[AbstractBody, Sensors], "AbstractSimulator"]
     sensors: Sensors
     model: "AbstractSimulator"
-    sampler: "TouchSampler"
+    sampler: "AbstractSampler"
     window: int
     model_rate: float
     rate: float
@@ -242,6 +246,35 @@ def split_rows(split: Split, count: int, seed: int) -> Tensor:
     """Return the shuffled indices of the gestures of a split; the order depends on ``seed`` alone."""
     order = generator(Stream.SPLIT, seed).permutation(count)
     return torch.from_numpy(order[split_slices(count)[split]])
+
+
+def split_groups(groups: Tensor, seed: int, test: Sequence[int] | None = None) -> dict[Split, Tensor]:
+    """Return the shuffled indices of the gestures of each split; the gestures of a group stay together.
+
+    About a tenth of the groups is the holdout, and another tenth the validation. If the holdout leaves fewer
+    than five groups, the validation is a tenth of their gestures.
+
+    Args:
+        groups: (B,), number of the group of each gesture; at least two groups.
+        seed: the order depends on it alone.
+        test: groups of the holdout; None draws them.
+    """
+    source = generator(Stream.SPLIT, seed)
+    order = source.permutation(groups.unique().tolist()).tolist()
+    tenth = max(1, round(0.1 * len(order)))
+    held = order[:tenth] if test is None else list(test)
+    left = [group for group in order if group not in held]
+    rows = torch.from_numpy(source.permutation(len(groups)))
+    numbers = groups[rows]
+    holdout, others = torch.isin(numbers, torch.tensor(held)), rows[torch.isin(numbers, torch.tensor(left))]
+    if len(left) < _FEW_GROUPS:
+        edge = max(1, round(0.1 * len(others)))
+        return {"train": others[edge:], "validation": others[:edge], "holdout": rows[holdout]}
+    middle = torch.isin(groups[others], torch.tensor(left[:tenth]))
+    return {"train": others[~middle], "validation": others[middle], "holdout": rows[holdout]}
+
+
+_FEW_GROUPS = 5  # with fewer, a whole group for validation would leave too little to train on
 
 
 def split_shards(split: Split, counts: Sequence[int], seed: int) -> Iterator[tuple[int, Tensor]]:

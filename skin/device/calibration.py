@@ -13,12 +13,13 @@ from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import candidates
 from skin.core.safe_loading import TEXT, ChecksumError, check_text, parse_yaml, read_file, text_sum
+from skin.device.curves import Curves, Table, read_tables
 from skin.errors import InputError
 
 FORMAT = 1
 _KEYS = (
-    *("format", "sha256", "count", "scale", "zero", "polarity", "channels", "sensors", "broken", "ranges"),
-    "about",
+    *("format", "sha256", "count", "scale", "zero", "polarity", "channels", "exponent_at", "sensors"),
+    *("tables", "broken", "ranges", "about"),
 )
 QUANTITIES = {
     "gain": 1.0,
@@ -29,6 +30,7 @@ QUANTITIES = {
     "time_constant": 0.0,
     "clip": math.inf,
     "quantum": 0.0,
+    "exponent": 1.0,
 }
 """Quantities per sensor, as in :class:`skin.device.imperfection.Constants`, with defaults."""
 _SIGNED = ("offset", "drift")
@@ -53,6 +55,8 @@ class Calibration:
         polarity: 1 or -1 per sensor: -1 where the raw value falls with force. Readings in N rise with force
             either way. Empty: 1 for all.
         channels: the device's channel, from 0, of every sensor of the layout. Empty: the same order.
+        exponent_at: N, at which the curves of all exponents meet (:class:`skin.device.curves.Curves`).
+        tables: curves of sensors, from 0, that follow no power law.
 
     Raises:
         InputError: an unknown name, different lengths, or a number out of range.
@@ -66,6 +70,8 @@ class Calibration:
     about: Mapping[str, Any] = field(default_factory=dict)
     polarity: Sequence[int] = ()
     channels: Sequence[int] = ()
+    exponent_at: float = 1.0
+    tables: Mapping[int, Table] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _known(self.sensors, QUANTITIES, "sensors")
@@ -89,6 +95,11 @@ class Calibration:
                 f"above 0, got sensors {wrong}, scale {self.scale}, zero {self.zero}"
             )
         self._check_wiring()
+        if not 0 < self.exponent_at < math.inf or (self.known("exponent") <= 0).any():
+            raise InputError(
+                "exponent and exponent_at must be above 0, as those of sensors that follow force^0.5"
+            )
+        read_tables(self.tables, len(self))
 
     def __len__(self) -> int:
         return len(next(iter(self.sensors.values())))
@@ -99,7 +110,7 @@ class Calibration:
     def newtons(self, raw: np.ndarray) -> np.ndarray:
         """Return raw values (..., S), in the layout's order, in N, with offsets and gains.
 
-        They are like the readings of a simulated device: they rise with force.
+        They are like the readings of a simulated device: they rise with force, along the sensor's curve.
         """
         return (raw - self.zero) * (self.scale * self.signs)
 
@@ -107,6 +118,14 @@ class Calibration:
     def signs(self) -> np.ndarray:
         """The polarity of every sensor, (S,), float64: 1 or -1."""
         return np.array(self.polarity, dtype=float) if self.polarity else np.ones(len(self))
+
+    @property
+    def curves(self) -> Curves | None:
+        """The curves of the sensors; None: all are linear."""
+        exponent = self.known("exponent")
+        if not self.tables and (exponent == 1).all():
+            return None
+        return Curves(exponent, np.full(len(self), self.exponent_at), self.tables)
 
     def _check_wiring(self) -> None:
         """Raise InputError unless polarity and channels fit the number of sensors."""
@@ -123,7 +142,8 @@ class Calibration:
     def corrected(self, raw: np.ndarray) -> np.ndarray:
         """Return the true readings of raw values, (..., S), N: no offset, gain 1; NaN for broken sensors."""
         values = self.values()
-        true = (self.newtons(raw) - values["offset"]) / values["gain"]
+        linear = self.newtons(raw) - values["offset"]
+        true = (linear if self.curves is None else self.curves.straighten(linear)) / values["gain"]
         return np.where(values["dead"], np.nan, true)
 
     def fits(self, sensors: int) -> None:
@@ -225,7 +245,8 @@ def _calibration(stored: Mapping[str, Any]) -> Calibration:
     polarity = [polarity] * count if isinstance(polarity, int) else polarity
     if not isinstance(polarity, list) or not isinstance(channels, list):
         raise InputError("polarity and channels must be lists")
-    return Calibration(sensors, broken, ranges, scale, zero, about, tuple(polarity), tuple(channels))
+    curves = float(stored.get("exponent_at", 1.0)), read_tables(stored.get("tables") or {}, count)
+    return Calibration(sensors, broken, ranges, scale, zero, about, tuple(polarity), tuple(channels), *curves)
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
@@ -242,6 +263,11 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
         lines.append(f"polarity: {json.dumps(list(calibration.polarity))}  # -1: falls with force")
     if calibration.channels:
         lines.append(f"channels: {json.dumps(list(calibration.channels))}  # of the device, by sensor")
+    if calibration.curves is not None:
+        lines.append(f"exponent_at: {calibration.exponent_at!r}  # N, where curves of all exponents meet")
+    if calibration.tables:
+        lines.append("tables:  # by sensor: linear readings and values, N")
+        lines += [f"  {number}: {json.dumps(table)}" for number, table in calibration.tables.items()]
     for group, values in groups.items():
         lines.append(f"{group}:" + ("" if values else " {}"))
         lines += [f"  {name}: {json.dumps(list(value))}" for name, value in values.items()]

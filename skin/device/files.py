@@ -2,10 +2,11 @@
 
 Columns: ``simulation``, ``frame``, one per label, ``reading_00`` ... (N, in the layout's order), ``force``
 (N), ``D_s_00`` ... and ``D_t_00`` ... (m), then ``gesture_*``: each gesture's parameters, repeated in its
-rows, then ``saturated_00`` ...: 1 where a sensor is at its limit. What is unknown has no column; a reading
-that means nothing (a dead sensor) is empty and is read back as 0 and invalid. Everything else (units,
-layout, rate, seeds, versions) is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in
-``x.csv.json``.
+rows, then ``saturated_00`` ...: 1 where a sensor is at its limit, then ``contact_00_x``, ``_y``, ``_radius``
+(m), ``_force`` (N), ``_peak`` (Pa), ``contact_01_x`` ...: fingertips, empty where there is none. What is
+unknown has no column; a reading that means nothing (a dead sensor) is empty and is read back as 0 and
+invalid; an empty label or parameter is unknown, NaN. Everything else (units, layout, rate, seeds, versions)
+is JSON: in the Parquet file's schema under ``skin``, beside ``x.csv`` in ``x.csv.json``.
 
 Both have checksums of everything: a Parquet file as of :mod:`skin.core.safe_loading`, and ``x.csv.json``
 under ``sha256`` of the table and of itself. What has none, of older versions or made by hand, is read
@@ -17,6 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import accumulate
+from math import nan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,6 +37,7 @@ from skin.core.safe_loading import ChecksumError, check_seal, file_sha256, read_
 from skin.core.settings import ONCE, check_settings
 from skin.device.touches import Recording, Touches
 from skin.errors import InputError
+from skin.touch.fingertips import CONTACT
 from skin.touch.labels import Task
 
 # The schema of recordings, and checks of their JSON metadata before memory is allocated for the rows.
@@ -68,6 +71,7 @@ class _Description:
     metadata: dict
     first: Annotated[int, Ge(0), Le(2**31 - 1)]
     sha256: Any = None
+    contacts: Annotated[int, Ge(0), Le(2**31 - 1)] = 0
 
 
 def check_metadata(about: Any, where: str) -> Task:
@@ -124,6 +128,8 @@ def describe_recording(recording: Recording, first: int = 0) -> dict[str, Any]:
         "saturated": touches.saturated is not None,
         "parameters": list(recording.parameters),
         "metadata": recording.metadata,
+        # Only with contacts, so that a file without them is what earlier versions write and read.
+        **({} if touches.contacts is None else {"contacts": touches.contacts.shape[2]}),
     }
 
 
@@ -146,10 +152,17 @@ def column_types(about: dict[str, Any]) -> dict[str, pa.DataType]:
     if about["displacement"]:
         names += numbered("D_s", sensors) + numbered("D_t", sensors)
     names += [f"gesture_{name}" for name in about["parameters"]]
-    return columns | dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
+    columns |= dict.fromkeys(names, pa.float32()) | dict.fromkeys(limits, pa.int8())
+    return columns | dict.fromkeys(_contact_names(about), pa.float32())
 
 
-_EACH_FRAME = ("reading_", "force", "D_s_", "D_t_")
+def _contact_names(about: dict[str, Any]) -> list[str]:
+    """Return the columns of contacts, one contact after the other."""
+    count = about.get("contacts", 0)
+    return [f"{contact}_{name}" for contact in numbered("contact", count) for name in CONTACT]
+
+
+_EACH_FRAME = ("reading_", "force", "D_s_", "D_t_", "contact_")
 
 
 def write_recording(recording: Recording, path: str | Path, first: int = 0) -> Path:
@@ -249,8 +262,8 @@ def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
     touches = recording.touches
     batch, time, sensors = touches.readings.shape
 
-    def per_gesture(values: Tensor) -> np.ndarray:
-        return np.repeat(values.cpu().numpy(), time)
+    def per_gesture(values: Tensor) -> np.ma.MaskedArray:
+        return np.ma.masked_invalid(np.repeat(values.cpu().numpy(), time))
 
     arrays = [np.repeat(np.arange(batch) + about["first"], time), np.tile(np.arange(time), batch)]
     arrays += [] if touches.labels is None else [per_gesture(column) for column in touches.labels.unbind(1)]
@@ -264,6 +277,8 @@ def _table(recording: Recording, about: dict[str, Any]) -> pa.Table:
     arrays += [per_gesture(values) for values in recording.parameters.values()]
     if touches.saturated is not None:
         arrays += list(touches.saturated.reshape(-1, sensors).T.cpu().numpy())
+    if touches.contacts is not None:
+        arrays += map(np.ma.masked_invalid, touches.contacts.flatten(2).flatten(0, 1).T.cpu().numpy())
     columns = column_types(about)
     return pa.table(
         {
@@ -317,17 +332,26 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
     def column(name: str) -> Tensor:
         return torch.from_numpy(table[name].fill_null(0).to_numpy().astype(np.float32)).view(batch, time)
 
+    def per_gesture(name: str) -> Tensor:
+        values = np.array(table[name].cast(pa.float32()).to_numpy())  # null becomes NaN
+        return torch.from_numpy(values).view(batch, time)[:, 0].clone()
+
     def columns(name: str) -> Tensor:
         return torch.stack([column(column_name) for column_name in numbered(name, sensors)], dim=-1)
 
+    contacts = [
+        column(name).where(torch.from_numpy(table[name].is_valid().to_numpy()).view(batch, time), nan)
+        for name in _contact_names(about)
+    ]
     present = [table[name].is_valid().to_numpy() for name in numbered("reading", sensors)]
     touches = Touches(
         columns("reading"),
         torch.from_numpy(np.stack(present, axis=-1)).view(batch, time, sensors),
         torch.tensor(about["positions"], dtype=torch.float32),
-        torch.stack([column(name)[:, 0] for name in task.names], dim=1) if about["labelled"] else None,
+        torch.stack([per_gesture(name) for name in task.names], dim=1) if about["labelled"] else None,
         about["rate"],
         saturated=columns("saturated") > 0.5 if about["saturated"] else None,
+        contacts=torch.stack(contacts, dim=-1).unflatten(-1, (-1, len(CONTACT))) if contacts else None,
     )
     return Recording(
         touches,
@@ -336,7 +360,7 @@ def _recording(table: pa.Table, about: dict[str, Any], task: Task) -> Recording:
         tuple(about["footprint"]),
         column("force") if about["force"] else None,
         torch.stack([columns("D_s"), columns("D_t")], dim=-1) if about["displacement"] else None,
-        {name: column(f"gesture_{name}")[:, 0] for name in about["parameters"]},
+        {name: per_gesture(f"gesture_{name}") for name in about["parameters"]},
         about["metadata"],
     )
 

@@ -1,17 +1,18 @@
-"""Imperfections of a real device: lag, gain, clip, noise, offset, rounding, dead sensors, tare."""
+"""Imperfections of a real device: lag, gain, curve, clip, noise, offset, rounding, dead sensors, tare."""
 
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
-from pydantic import NonNegativeFloat, NonNegativeInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from scipy.special import ndtri
 from torch import Tensor
 
 from skin.core.settings import RISING, checked
 from skin.device.calibration import Calibration, read_calibration
+from skin.device.curves import Curves, check_table
 from skin.device.resampling import resample
 from skin.errors import InputError
 from skin.mechanics.relaxation import apply_hysteresis, first_order_lag, quantize
@@ -34,6 +35,7 @@ class Constants(NamedTuple):
         hysteresis: mean gap between unloading and loading, share of the touch's peak.
         time_constant: of a first-order lag, s; 0: none.
         quantum: step of the converter, N; 0: none.
+        exponent, exponent_at: of the sensor's curve (:class:`skin.device.curves.Curves`); 1, N: linear.
     """
 
     gain: Tensor
@@ -47,6 +49,8 @@ class Constants(NamedTuple):
     hysteresis: Tensor
     time_constant: Tensor
     quantum: Tensor
+    exponent: Tensor
+    exponent_at: Tensor
 
     def to(self, device: torch.device | str) -> "Constants":
         """Return these constants on ``device``."""
@@ -55,7 +59,7 @@ class Constants(NamedTuple):
 
 _IDLE_FRAMES = 30
 
-_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant")
+_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent")
 
 Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
 """A number, or a range (least, most) of which each device draws its own."""
@@ -83,6 +87,11 @@ class ImperfectionSettings:
             sensor measures x + 6 hysteresis x (P - x) / P: no gap at rest and none at the peak.
         time_constant: of a first-order lag behind the force, s.
         quantum: step of the converter, N.
+        exponent: of the sensors' curve: a force F reads as ``exponent_at`` (F / ``exponent_at``) ^ exponent,
+            before the clip; about 0.5 for force-sensitive resistors.
+        exponent_at: N.
+        table: another curve of all sensors: forces and readings, each rising from 0, N; None: the exponent's.
+        polarity: -1: the values that the device sends fall with force.
         rate: frames per second, Hz.
     """
 
@@ -98,6 +107,10 @@ class ImperfectionSettings:
     hysteresis: Spread = 0.0
     time_constant: Spread = 0.0
     quantum: Annotated[float, Ge(0)] = 0.0
+    exponent: Annotated[float, Gt(0)] | Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = 1.0
+    exponent_at: Annotated[float, Gt(0)] = 2.0
+    table: list[list[float]] | None = None
+    polarity: Literal[1, -1] = 1
     rate: Annotated[float, Gt(0)] = 10.0
 
 
@@ -106,8 +119,8 @@ class ImperfectionSettings:
 class Imperfection(ImperfectionSettings):
     """A device's imperfections, in the report's order (2.1.4): clip the force, then add noise and offset.
 
-    Hysteresis, a first-order lag and the gain of the sensor are applied before the clip; drift and rounding
-    after the noise. These are additions to the report and are off by default.
+    Hysteresis, a first-order lag, the gain and the curve of the sensor are applied before the clip; drift and
+    rounding after the noise. These are additions to the report and are off by default.
 
     Attributes:
         calibration: of a real device; replaces all settings but ``rate``, ``tare`` and ``dead``, which breaks
@@ -118,6 +131,24 @@ class Imperfection(ImperfectionSettings):
     """
 
     calibration: Calibration | None = None
+
+    def __post_init__(self) -> None:
+        if self.table is not None:
+            check_table(self.table)
+
+    def signs(self, sensors: int) -> np.ndarray:
+        """Return 1 or -1 per sensor, (S,): -1 where the values that the device sends fall with force."""
+        return np.full(sensors, float(self.polarity)) if self.calibration is None else self.calibration.signs
+
+    def _curves(self, constants: Constants, sensors: int) -> Curves | None:
+        """Return the curves of the sensors; None: all are linear."""
+        if self.calibration is not None:
+            tables = self.calibration.tables
+        else:
+            tables = {} if self.table is None else dict.fromkeys(range(sensors), self.table)
+        if not tables and (constants.exponent == 1).all():
+            return None
+        return Curves(constants.exponent, constants.exponent_at, tables)
 
     @property
     def dead_range(self) -> tuple[int, int]:
@@ -173,8 +204,8 @@ class Imperfection(ImperfectionSettings):
         if self.stuck:
             stuck = (rank >= count) & (rank < count + self.stuck)
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
-        values = {name: np.asarray(float(getattr(self, name))) for name in ("clip", "quantum")}
-        values |= {name: spread[name] for name in ("noise", "hysteresis", "time_constant")}
+        values = {name: np.asarray(float(getattr(self, name))) for name in ("clip", "quantum", "exponent_at")}
+        values |= {name: spread[name] for name in ("noise", "hysteresis", "time_constant", "exponent")}
         dead = rank < count + self.stuck + self.saturated
         return values | {
             "gain": gain, "offset": offset, "dead": dead, "level": level, "drift": drift, "idle": idle
@@ -190,6 +221,7 @@ class Imperfection(ImperfectionSettings):
         also_dead = rank < generator.integers(*self.dead_range, (*shape[:-1], 1), endpoint=True)
         values["level"] = np.where(also_dead, 0.0, values["level"])
         values["dead"] = values["dead"] | also_dead
+        values["exponent_at"] = np.asarray(calibration.exponent_at)
         return values | {"idle": generator.standard_normal(shape)}
 
     def apply(
@@ -250,6 +282,8 @@ class Imperfection(ImperfectionSettings):
         if constants.time_constant.any():
             force = first_order_lag(force, constants.time_constant, time)
         scaled = force * constants.gain
+        if (curves := self._curves(constants, readings.shape[-1])) is not None:
+            scaled = curves.bend(scaled)
         output, saturated = scaled.clamp(-constants.clip, constants.clip), scaled.abs() > constants.clip
         output += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
         if constants.drift.any():

@@ -1,6 +1,6 @@
 """Touches from a file or a data set."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,24 +10,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skin.body.base import AbstractBody, require_memory
+from skin.body.base import AbstractBody, Sensors, require_memory
 from skin.body.layout import AbstractLayout
 from skin.core.settings import checked
-from skin.device.base import AbstractDevice, Blank, Split, split_rows, split_shards
+from skin.device.base import AbstractDevice, Blank, Split, split_groups, split_rows, split_shards
 from skin.device.files import DataSet, read_recording
 from skin.device.touches import Part, Recording, Touches, concatenate
 from skin.errors import InputError
 
 _SAME_PLACE = 1e-6  # m: the file's positions are float32
-_BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated
+_BYTES = 8.0  # of a reading, whether it is valid and whether it is saturated; of a number of a contact
 
 
 @checked("device")
 class Recorded(AbstractDevice):
-    """Yields the touches of a recording or a data set, split 80/10/10 by gesture.
+    """Yields the touches of a recording or a data set, split 80/10/10 by group or by gesture.
 
-    ``test`` is ``holdout``, the last part. A network is trained on a data set shard by shard, so that its
-    touches need not fit into memory; its validation and holdout have at most 32,768 gestures each.
+    ``test`` is ``holdout``, the last part. A recording of ``skin convert`` brings its sensors, and body and
+    layout have no effect, unless it was made with ``positions: layout``. A network is trained on a data set
+    shard by shard, so that its touches need not fit into memory; its validation and holdout have at most
+    32,768 gestures each.
 
     Args:
         path: ``x.parquet``, ``x.csv`` or the folder of a data set (:mod:`skin.device.files`).
@@ -35,6 +37,9 @@ class Recorded(AbstractDevice):
         layout: positions of the sensors; they are compared with the file's.
         split_seed: seed of the split.
         test: ``holdout``, or ``all`` touches, for a run that was trained on others.
+        group: whose touches stay together, such as ``session``, or ``gesture``; None: the first group of the
+            file, if it has one.
+        test_groups: groups of ``holdout``; None draws a tenth of them.
 
     Attributes:
         sensors: as ``layout`` gives them.
@@ -43,7 +48,8 @@ class Recorded(AbstractDevice):
 
     Raises:
         InputError: no file given, unreadable, too few touches, or another sheet or other sensors than the
-            configuration's. Methods raise it if touches do not fit into memory.
+            configuration's; groups that the file lacks, or that leave none to train on. Methods raise it if
+            touches do not fit into memory, or if those to train on have a label of one class.
     """
 
     def __init__(
@@ -53,6 +59,8 @@ class Recorded(AbstractDevice):
         path: str | None = None,
         split_seed: int = 0,
         test: Literal["holdout", "all"] = "holdout",
+        group: str | None = None,
+        test_groups: str | Sequence[str | int] | None = None,
     ) -> None:
         if path is None:
             raise InputError(
@@ -69,11 +77,71 @@ class Recorded(AbstractDevice):
                 "run that was trained on others and device.test=all"
             )
         self._example = self._stored.read(0)[torch.tensor([0])]  # a copy: a slice would keep the whole
-        self.sensors = layout.sensors(body)
-        self._compare(body)
-        self.name = str(self._stored.path(0))
-        self.surface, self.task, self.size = body, self._example.task, body.size
+        self._groups: dict[Split, Tensor] = {}
+        if self._example.metadata.get("positions") in ("unknown", "stated"):
+            places = self._example.touches.positions.double().numpy()
+            self.sensors, self.size = Sensors(places, self._example.footprint), self._example.size
+            self.configured = False
+        else:
+            self.sensors, self.surface, self.size = layout.sensors(body), body, body.size
+            self._compare(body)
+        self.name, self.task = str(self._stored.path(0)), self._example.task
+        self._divide(group, test_groups)
         self.rate, self.window = self._example.touches.rate, self._example.touches.readings.shape[1]
+
+    def _divide(self, group: str | None, test_groups: str | Sequence[str | int] | None) -> None:
+        """Assign the groups of the file, if it has any, to the splits."""
+        groups: dict[str, list[str]] = self._example.metadata.get("groups", {})
+        if self._test == "all":
+            self.split = "none: all touches are for the test"
+            return
+        name = next(iter(groups), "gesture") if group is None else group
+        if name != "gesture" and name not in groups:
+            raise InputError(
+                f"{self.path} has no group {name}: give device.group={', '.join([*groups, 'gesture'])}"
+            )
+        if name == "gesture":
+            if test_groups is not None:
+                raise InputError(
+                    "device.test_groups needs a recording with groups, and not device.group=gesture"
+                )
+            return
+        values = groups[name]
+        if len(values) < 2:
+            raise InputError(
+                f"{self.path} has the single {name} {values[0]}: device.group=gesture splits it by gesture"
+            )
+        tested = (
+            [test_groups] if isinstance(test_groups, str) else [str(value) for value in test_groups or ()]
+        )
+        if unknown := [value for value in tested if value not in values]:
+            raise InputError(
+                f"device.test_groups: {self.path} has no {name} {unknown[0]}, it has {_few(values)}"
+            )
+        if len(set(tested)) == len(values):
+            raise InputError(f"device.test_groups has every {name}: leave out some to train on")
+        numbers = self._stored.read(0).parameters[f"group_{name}"].long()
+        chosen = [values.index(value) for value in tested] or None
+        self._groups = split_groups(numbers, self.split_seed, chosen)
+        trained, held, judged = (
+            [values[number] for number in numbers[self._groups[split]].unique()]
+            for split in ("train", "validation", "holdout")
+        )
+        apart = (
+            f"{len(held)} for validation"
+            if not set(trained) & set(held)
+            else "a tenth of their touches validates"
+        )
+        self.split = f"by {name}: {len(trained)} to train ({apart}), {len(judged)} to test ({_few(judged)})"
+
+    def _check_classes(self, labels: Tensor | None) -> None:
+        """Raise InputError where the touches to train on have a label of one class."""
+        for label, column in zip(self.task.binary, () if labels is None else labels.T, strict=False):
+            if len(column[~column.isnan()].unique()) < 2:
+                raise InputError(
+                    f"split {self.split}: {label} lacks a class in the touches to train on: give other "
+                    "device.test_groups, or device.group=gesture"
+                )
 
     def _compare(self, body: AbstractBody) -> None:
         stored, size = self._example.touches.positions, self._example.size
@@ -106,7 +174,9 @@ class Recorded(AbstractDevice):
 
     def blank(self) -> AbstractDevice:
         """Return a device that has labels, which the file may lack."""
-        return Blank.of(self.task, self.size, self._example.touches)
+        blank = Blank.of(self.task, self.size, self._example.touches)
+        blank.configured = self.configured
+        return blank
 
     def strips(self) -> Iterator[Touches]:
         """Yield the touches of the file, or of the first shard."""
@@ -117,9 +187,10 @@ class Recorded(AbstractDevice):
         parts = self._parts(split, complete)
         if self._whole:
             return parts[0].make()
-        count = sum(part.count for part in parts)
+        count, example = sum(part.count for part in parts), self._example.touches
+        numbers = example.readings.numel() + (0 if example.contacts is None else example.contacts.numel())
         require_memory(
-            2.0 * _BYTES * count * self._example.touches.readings.numel(),  # joining shards copies them
+            2.0 * _BYTES * count * numbers,  # joining shards copies them
             f"{self.path}, {count} gestures at once,",
             "train a network, which reads shard by shard, or generate fewer gestures",
         )
@@ -140,11 +211,24 @@ class Recorded(AbstractDevice):
             return [Part(count, partial(self._stored.read, n, complete)) for n, count in enumerate(counts)]
         part: Split = "holdout" if split == "test" else split
         seed = self.split_seed
-        rows = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
-        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in rows]
+        if self._groups:
+            rows = self._groups[part]
+            if part == "train":
+                self._check_classes(self._rows(0, complete, rows).touches.labels)
+            return [Part(len(rows), partial(self._rows, 0, complete, rows))]
+        shares = [(0, split_rows(part, counts[0], seed))] if self._whole else split_shards(part, counts, seed)
+        return [Part(len(selected), partial(self._rows, n, complete, selected)) for n, selected in shares]
 
     def _rows(self, number: int, complete: bool, rows: Tensor) -> Recording:
         return self._stored.read(number, complete)[rows]
+
+
+def _few(values: Sequence[str]) -> str:
+    """Return the first of some names."""
+    return ", ".join(values[:_SHOWN]) + ", ..." * (len(values) > _SHOWN)
+
+
+_SHOWN = 4
 
 
 class _File:

@@ -73,13 +73,15 @@ class FrameError(Exception):
     """A frame that cannot be used.
 
     Attributes:
-        reason: ``checksum``, ``fields`` (their count), ``number``, ``long``, ``structure`` or ``repeat``.
+        reason: ``checksum``, ``fields`` (their count), ``number``, ``long``, ``structure``, ``rows`` or
+            ``repeat``.
         found: number of fields, for the reason ``fields``.
+        word: the field, for the reason ``number``.
     """
 
-    def __init__(self, reason: str, count: int | None = None) -> None:
+    def __init__(self, reason: str, count: int | None = None, word: str = "") -> None:
         super().__init__(reason)
-        self.reason, self.found = reason, count
+        self.reason, self.found, self.word = reason, count, word
 
 
 _SLOWER = 1.05  # tolerance for the error of a ceramic resonator and for lost frames

@@ -27,10 +27,12 @@ from skin.mechanics.contact.prescribed import Prescribed
 from skin.mechanics.geometry import sensor_geometry
 from skin.mechanics.relaxation import Relaxing, relaxes
 from skin.mechanics.simulator.base import AbstractSimulator
-from skin.touch.gesture import GestureSettings
+from skin.touch.fingertips import read_touch
+from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING
 from skin.touch.movie import Movie
-from skin.touch.sampler import TouchSampler, balanced
+from skin.touch.sampler import AbstractSampler
+from skin.touch.splines import footprints
 
 # The true sensors of a simulated device and its model of them.
 
@@ -125,7 +127,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         body, layout: the sheet, and the positions of its sensors.
         simulator: ``simulator(body, sensors)`` gives the map from pressure to true readings.
         contact: ``contact(body, simulator)`` gives the pressure of a gesture.
-        touch: difficulty of the gestures (``conf/touch.yaml``).
+        touch: kind and difficulty of the touches (``conf/touch``).
         gestures, test_gestures: number of gestures of the budget and of ``test``.
         padded: gestures begin at a random frame of the window, not at its first.
         fresh: ``train`` draws new gestures, with new noise, in every epoch.
@@ -149,7 +151,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     layout: AbstractLayout
     simulator: Callable[[AbstractBody, Sensors], AbstractSimulator]
     contact: Callable[[AbstractBody, AbstractSimulator], AbstractContact] = Prescribed
-    touch: Mapping[str, Any] | GestureSettings | None = None
+    touch: Mapping[str, Any] | TouchSettings | None = None
     gestures: Annotated[int, Ge(10)] = 4038
     test_gestures: Annotated[int, Ge(1)] = 4000
     padded: bool = True
@@ -173,7 +175,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
         self.true_sensors = misplace(self.sensors, self.size, self.position_error, self.seed)
-        settings = GestureSettings.of(self.touch)
+        settings = read_touch(self.touch)
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
         check_rate(self.rate, self.model_rate, "device.rate")
         self.model = build_model(self.simulator, self.body, self.true_sensors, self.model_rate)
@@ -185,10 +187,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self.constants = draw_constants(self.imperfection, len(self.sensors), self.model_rate, drawn)
         self._kept: dict[str, Recording] = {}
 
-    def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> TouchSampler:
-        contact, settings = self.contact(body, model), GestureSettings.of(self.touch)
+    def _sampler(self, body: AbstractBody, sensors: Sensors, model: AbstractSimulator) -> AbstractSampler:
+        contact, settings = self.contact(body, model), read_touch(self.touch)
         judged = sensors if settings.over_sensors else cover_surface(body, sensors.footprint)
-        return TouchSampler(body, body.footprints(judged), contact, settings, self.padded)
+        moments = footprints(body, judged) if model.smooth else None
+        return settings.sampler(body, body.footprints(judged), contact, self.padded, moments)
 
     @cached_property
     def geometry(self) -> Tensor:
@@ -293,7 +296,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         if self.stream:
             jobs = [partial(self._windows, cut, complete, stream, (*key, n)) for n, cut in enumerate(cuts)]
         else:
-            labels = balanced(count, generator(stream, *key, 0))
+            labels = self.sampler.balanced(count, generator(stream, *key, 0))
             arguments = complete, stream
             jobs = [
                 partial(self._batch, labels[cut], *arguments, (*key, 1 + n)) for n, cut in enumerate(cuts)
@@ -341,7 +344,15 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         positions = torch.from_numpy(self.sensors.positions).float()
         valid = torch.ones_like(readings, dtype=torch.bool)
         labels = torch.cat([movie.labels, movie.slides], dim=1) if self.direction else movie.labels
-        touches = Touches(readings, valid, positions, labels, self.model_rate, geometry=self.geometry)
+        touches = Touches(
+            readings,
+            valid,
+            positions,
+            labels,
+            self.model_rate,
+            geometry=self.geometry,
+            contacts=movie.contacts,
+        )
         strain = self.model.strain(movie.frames, movie.shear) if complete else None
         true_values = {} if strain is None else {"strain": (strain[movie.index] * movie.scale).amax(1)}
         # Windows of streams get other labels.

@@ -24,13 +24,14 @@ from skin.core.settings import RISING, checked, configured
 from skin.device.base import AbstractDevice, Blank, Split, in_threads, split_slices
 from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.simulated import Simulated
-from skin.device.touches import Touches
+from skin.device.touches import Touches, join_contacts
 from skin.errors import InputError
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive
 from skin.mechanics.simulator.solid import Solid
-from skin.touch.gesture import GestureSettings
+from skin.touch.fingertips import read_touch
+from skin.touch.gesture import TouchSettings
 from skin.touch.labels import TOUCH
 
 Range = Annotated[tuple[PositiveFloat, PositiveFloat], RISING]
@@ -300,7 +301,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     count: Annotated[int, Ge(1)] = 200
     test_skins: Annotated[int, Ge(1)] = 20
     skin_seed: Annotated[int, Ge(0)] = 0
-    touch: Mapping[str, Any] | GestureSettings | None = None
+    touch: Mapping[str, Any] | TouchSettings | None = None
     gestures: Annotated[int, Ge(10)] = 40_000
     test_gestures: Annotated[int, Ge(1)] = 4000
     padded: bool = True
@@ -310,7 +311,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
     def __post_init__(self) -> None:
         self.distribution = configured(SkinDistribution, self.skins, "device.skins")
         self.task, self.size, self.sensors = TOUCH, self.body.size, self.layout.sensors(self.body)
-        self.window = GestureSettings.of(self.touch).frames.window
+        self.window = read_touch(self.touch).frames.window
         self._kept: dict[str, Touches] = {}
 
     @cached_property
@@ -397,7 +398,7 @@ class Skins(ImperfectionSettings, AbstractDevice):
         empty = torch.zeros(1, self.window, sensors)
         geometry = torch.ones(sensors, len(GEOMETRY))
         positions = torch.from_numpy(self.sensors.positions).float()
-        rate = float(GestureSettings.of(self.touch).rate)
+        rate = float(read_touch(self.touch).rate)
         touches = Touches(empty, empty == 0, positions, None, rate, geometry=geometry)
         return Blank.of(self.task, self.size, touches)
 
@@ -425,6 +426,7 @@ def join_skins(parts: Sequence[Touches]) -> Touches:
         first.rate,
         saturated=together("saturated", 2),
         geometry=expanded("geometry"),
+        contacts=join_contacts([part.contacts for part in parts]),
     )
 
 

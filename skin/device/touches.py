@@ -4,17 +4,20 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from math import nan
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from skin.body.base import GEOMETRY
 from skin.errors import InputError
+from skin.touch.fingertips import CONTACT
 from skin.touch.labels import TOUCH_OR_NOT, Task
 from skin.touch.movie import Movie, join_movies
-from skin.touch.sampler import TouchSampler
+from skin.touch.sampler import AbstractSampler
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,8 @@ class Touches:
         saturated: (B, T, S), bool: the sensor is at its limit, so the force is at least its reading; None
             if unknown.
         geometry: (S, G) or (B, S, G), the columns :data:`GEOMETRY` of each sensor; None if unknown.
+        contacts: (B, T, K, 5), the columns :data:`skin.touch.fingertips.CONTACT` of up to K contacts, NaN
+            where there is none; None if unknown.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -46,6 +51,7 @@ class Touches:
     motion: Tensor | None = None
     saturated: Tensor | None = None
     geometry: Tensor | None = None
+    contacts: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.readings.ndim != 3:
@@ -60,6 +66,8 @@ class Touches:
         _expect(self.geometry, "geometry", geometry_shape, (batch, *geometry_shape))
         _expect(self.motion, "motion", moving)
         _expect(self.saturated, "saturated", scalars)
+        if self.contacts is not None:
+            _expect(self.contacts, "contacts", (batch, time, *self.contacts.shape[2:3], len(CONTACT)))
         if self.labels is not None and (self.labels.ndim != 2 or len(self.labels) != batch):
             raise ValueError(f"labels must be (B, L), B = {batch}, got {tuple(self.labels.shape)}")
 
@@ -77,6 +85,7 @@ class Touches:
             None if self.motion is None else self.motion[index],
             None if self.saturated is None else self.saturated[index],
             self.geometry if self.geometry is None or self.geometry.ndim == 2 else self.geometry[index],
+            None if self.contacts is None else self.contacts[index],
         )
 
     @property
@@ -183,6 +192,7 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
         labels=together(part.touches.labels for part in parts),
         motion=together(part.touches.motion for part in parts),
         saturated=together(part.touches.saturated for part in parts),
+        contacts=join_contacts([part.touches.contacts for part in parts]),
     )
     return replace(
         first,
@@ -191,6 +201,15 @@ def concatenate(parts: Sequence[Recording]) -> Recording:
         displacement=together(part.displacement for part in parts),
         parameters={name: torch.cat([part.parameters[name] for part in parts]) for name in first.parameters},
     )
+
+
+def join_contacts(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """Return contacts (B, T, K, 5) of all parts; None if those of one part are unknown."""
+    tensors = [part for part in parts if part is not None]
+    if len(tensors) < len(parts):
+        return None
+    most = max(tensor.shape[2] for tensor in tensors)
+    return torch.cat([pad(tensor, (0, 0, 0, most - tensor.shape[2]), value=nan) for tensor in tensors])
 
 
 def touches_hash(touches: Touches) -> str:
@@ -235,14 +254,14 @@ class Timeline:
         """The frame after the last one of each gesture, (G,)."""
         return self.begin + self.duration
 
-    def spread(self, values: Tensor) -> Tensor:
-        """Return values per gesture and frame, (G, T, ...), along the stream, (F, ...); 0 in the gaps."""
+    def spread(self, values: Tensor, gap: float = 0.0) -> Tensor:
+        """Return values of gestures, (G, T, ...), along the stream, (F, ...), and ``gap`` between."""
         gesture = torch.arange(len(self.begin)).repeat_interleave(self.duration)
         step = torch.arange(len(gesture)) - (self.duration.cumsum(0) - self.duration)[gesture]
         frame = self.begin[gesture] + step
         inside = frame < self.length
         column = (self.movie.parameters["onset"].long()[gesture] + step)[inside]
-        result = values.new_zeros(self.length, *values.shape[2:])
+        result = values.new_full((self.length, *values.shape[2:]), gap)
         result[frame[inside]] = values[gesture[inside], column]
         return result
 
@@ -269,7 +288,7 @@ class Timeline:
 
 
 def draw_timeline(
-    sampler: TouchSampler, length: int, gap: Sequence[int], generator: np.random.Generator
+    sampler: AbstractSampler, length: int, gap: Sequence[int], generator: np.random.Generator
 ) -> Timeline:
     """Draw a stream of ``length`` frames that begins with a gap.
 
@@ -318,8 +337,8 @@ class TouchStream:
             gestures: (G, T, ...), 0 without contact, so without noise or offset.
         """
 
-        def along(values: Tensor | None) -> Tensor | None:
-            return None if values is None else timeline.spread(values)[None]
+        def along(values: Tensor | None, gap: float = 0.0) -> Tensor | None:
+            return None if values is None else timeline.spread(values, gap)[None]
 
         readings = timeline.spread(gestures.touches.readings)[None]
         valid = torch.ones_like(readings, dtype=torch.bool)
@@ -331,6 +350,7 @@ class TouchStream:
                 valid=valid,
                 labels=None,
                 motion=along(gestures.touches.motion),
+                contacts=along(gestures.touches.contacts, nan),
             ),
             task=TOUCH_OR_NOT,
             force=along(gestures.force),
@@ -368,6 +388,7 @@ class TouchStream:
                 labels=labels,
                 motion=windows(felt.motion),
                 saturated=saturated,
+                contacts=windows(felt.contacts),
             ),
             force=windows(whole.force),
             displacement=windows(whole.displacement),

@@ -108,8 +108,7 @@ def measure_margins(
     recording = simulation.replace(test_gestures=gestures, stream=False, direction=False).recording(
         "test", complete=False
     )
-    touches, labels = recording.touches, recording.touches.labels
-    assert labels is not None
+    touches, labels = recording.touches, recording.touches.known_labels
     places = [device.task.names.index(name) for name in TOUCH.names]
     chances = learner.probabilities(touches)[:, places]
     predicted, parameters = chances > 0.5, recording.parameters

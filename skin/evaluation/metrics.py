@@ -29,7 +29,7 @@ def compute_metrics(
 
     Args:
         probabilities: (B, L); for a direction the mean cosines.
-        labels: (B, L), 0 or 1; for a direction the cosines.
+        labels: (B, L), 0 or 1; for a direction the cosines; NaN where unknown, which does not count.
         task: meaning of the labels.
         point: operating point of the alarm; None: no metrics of the alarm.
 
@@ -50,7 +50,10 @@ def compute_metrics(
         alarm[f"{LABEL}/alarm_recall"] = reached.recall
         alarm[f"{LABEL}/false_alarm_rate"] = reached.false_alarm_rate
     if task.kind == "exclusive":
-        right = multiclass_accuracy(probabilities, labels.argmax(1), len(task), average="micro")
+        rows = task.counts(labels)[:, 0]
+        if not rows.any():
+            return {"overall/accuracy": math.nan} | alarm
+        right = multiclass_accuracy(probabilities[rows], labels[rows].argmax(1), len(task), average="micro")
         return {"overall/accuracy": float(right)} | alarm
     values: dict[str, float] = {}
     pairs = _pairs(probabilities, labels, task)
@@ -61,9 +64,11 @@ def compute_metrics(
             recall, specificity = binary_recall(chance, label), binary_specificity(chance, label)
             values[f"{name}/balanced_accuracy"] = float((recall + specificity) / 2)
         values[f"{name}/ece"] = calibration_error(chance, label)
+    # A label that is unknown in all test touches does not count in the overall values.
+    unknown = {name for name, column in zip(task.names, labels.T, strict=True) if column.isnan().all()}
     for metric in ("accuracy", "balanced_accuracy", "ece"):
-        scores = [values[f"{name}/{metric}"] for name in task.gated]
-        values[f"overall/{metric}"] = sum(scores) / len(scores)
+        scores = [values[f"{name}/{metric}"] for name in task.gated if name not in unknown]
+        values[f"overall/{metric}"] = sum(scores) / len(scores) if scores else math.nan
     if task.direction:
         degrees = measure_angles(probabilities, labels, task)
         values["direction/degrees"] = float(degrees.mean())
@@ -139,9 +144,10 @@ def encode(
         point: operating point of the alarm; None: no alarm is raised.
 
     Returns:
-        None for labels that are not binary or not always defined, or more than 6.
+        None for labels that are not binary, or not always defined and known, or more than 6.
     """
-    if task.kind != "binary" or task.gate or task.direction or len(task) > _MOST_LABELS:
+    undefined = task.gate or task.direction or bool(labels.isnan().any())
+    if task.kind != "binary" or undefined or len(task) > _MOST_LABELS:
         return None
     wrong = ((probabilities > 0.5) != (labels > 0.5)).numpy()
     code = (wrong << np.arange(len(task))).sum(axis=1)

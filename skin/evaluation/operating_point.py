@@ -27,7 +27,6 @@ from skin.evaluation.decisions import DECISIONS, RELEASE, as_press, held_frames,
 from skin.evaluation.settings import ENOUGH, Evaluation, check_evaluation
 from skin.touch.labels import TOUCH, Task
 from skin.touch.movie import Movie
-from skin.touch.sampler import balanced
 
 LABEL = "dangerous"
 _APART = 1e-6  # scores closer than this may have another order on another processor
@@ -212,8 +211,7 @@ def threshold_gestures(device: AbstractDevice, settings: Evaluation) -> Touches:
     count = 2 * settings.safe_gestures
     for _ in range(_MOST_DRAWS):
         touches = simulation.fresh_touches(count)
-        assert touches.labels is not None
-        _, dangerous = _column(touches.labels, touches.labels, device.task)
+        _, dangerous = _column(touches.known_labels, touches.known_labels, device.task)
         if int((~dangerous).sum()) >= settings.safe_gestures:
             break
         count *= 2
@@ -233,14 +231,13 @@ def choose_operating_point(
     if LABEL not in device.task.names:
         return None
     touches, target = threshold_gestures(device, settings), settings.false_alarm_rate
-    assert touches.labels is not None  # the learner was trained on them
-    chances = learner.probabilities(touches)
-    chance, dangerous = _column(chances, touches.labels, device.task)
+    labels, chances = touches.known_labels, learner.probabilities(touches)
+    chance, dangerous = _column(chances, labels, device.task)
     if dangerous.all():
         return OperatingPoint.default(target)
     seed = None if device.simulation is None else device.simulation.data_seed
     point = OperatingPoint(lowest_threshold(chance[~dangerous], target), target, 0, 0, seed)
-    return replace(point, **asdict(point.reached(chances, touches.labels, device.task)))
+    return replace(point, **asdict(point.reached(chances, labels, device.task)))
 
 
 def lowest_threshold(safe: Tensor, target: float) -> float:
@@ -314,7 +311,7 @@ def choose_for_touches(
         target: largest share of safe touches that raise the alarm.
         count: number of safe touches.
     """
-    labels = balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
+    labels = device.sampler.balanced(2 * count, generator(Stream.ALARM, device.data_seed, 1))
     safe = labels[~labels[:, TOUCH.names.index(LABEL)]][:count]
     scores = touch_scores(learner, device, watching, safe, device.data_seed)
     point = OperatingPoint(lowest_threshold(scores, target), target, len(scores), 0, device.data_seed)

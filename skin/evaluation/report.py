@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -50,6 +50,7 @@ class Report:
         reached: the alarms on the gestures of ``same``; None without ``point``.
         outcomes: of the gestures of ``same`` (:func:`skin.evaluation.metrics.encode`); None where the labels
             have none.
+        split: in words, what training and test keep apart.
     """
 
     metrics: dict[str, float]
@@ -59,14 +60,15 @@ class Report:
     point: OperatingPoint | None = None
     reached: Reached | None = None
     outcomes: np.ndarray | None = None
+    split: str = ""
 
 
 def touch_sets(device: AbstractDevice, settings: Evaluation) -> dict[str, Iterator[Touches]]:
-    """Return the sets of touches of each column of a report, drawn lazily.
+    """Return the sets of touches of each further column of a report, drawn lazily.
 
     Those of ``unseen_layout`` raise InputError where the sensors cannot form a grid.
     """
-    sets = {"same": _once(device, "same"), "holdout": _once(device, "holdout")}
+    sets = {"holdout": _holdout(device)}
     if (simulation := device.simulation) is not None:
         sets["device_shift"] = _devices(simulation, settings)
         sets["unseen_layout"] = _layouts(simulation, settings)
@@ -87,12 +89,10 @@ def evaluate(
     task, metrics, cannot = device.task, dict[str, float](), dict[str, str]()
     same, drawn = _test(device)
     chances = learner.probabilities(same)
-    metrics |= _add_prefix("same", compute_metrics(chances, _labels(same), task, point))
-    others = touch_sets(device, settings)
-    del others["same"]
-    for column, sets in others.items():
+    metrics |= _add_prefix("same", compute_metrics(chances, same.known_labels, task, point))
+    for column, sets in touch_sets(device, settings).items():
         try:
-            pairs = [(learner.probabilities(touches), _labels(touches)) for touches in sets]
+            pairs = [(learner.probabilities(touches), touches.known_labels) for touches in sets]
         except InputError as reason:
             cannot[column] = str(reason)
             continue
@@ -100,10 +100,11 @@ def evaluate(
             predicted, true = (torch.cat(parts) for parts in zip(*pairs, strict=True))
             metrics |= _add_prefix(column, compute_metrics(predicted, true, task, point))
     cannot |= {name: _UNDEFINED for name, value in metrics.items() if isnan(value) and name.endswith(_SHOWN)}
-    table = count_confusions(chances, _labels(same), task) if task.kind == "binary" else None
-    reached = None if point is None else point.reached(chances, _labels(same), task)
-    outcomes = encode(chances, _labels(same), task, point)
-    return Report(metrics, cannot, table, _predictions(chances, same, task, drawn), point, reached, outcomes)
+    table = count_confusions(chances, same.known_labels, task) if task.kind == "binary" else None
+    reached = None if point is None else point.reached(chances, same.known_labels, task)
+    outcomes = encode(chances, same.known_labels, task, point)
+    predictions = _predictions(chances, same, task, drawn)
+    return Report(metrics, cannot, table, predictions, point, reached, outcomes, device.split)
 
 
 def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
@@ -114,9 +115,8 @@ def _test(device: AbstractDevice) -> tuple[Touches, dict[str, Tensor]]:
     return recording.touches, recording.parameters
 
 
-def _once(device: AbstractDevice, column: Literal["same", "holdout"]) -> Iterator[Touches]:
-    """Yield the one set of a column."""
-    yield _test(device)[0] if column == "same" else device.touches("holdout")
+def _holdout(device: AbstractDevice) -> Iterator[Touches]:
+    yield device.touches("holdout")
 
 
 def _devices(device: AbstractSimulated, settings: Evaluation) -> Iterator[Touches]:
@@ -162,21 +162,16 @@ def _share(touches: Touches, number: int, count: int) -> Touches:
     return touches[torch.arange(number, len(touches), count)]
 
 
-def _labels(touches: Touches) -> Tensor:
-    if touches.labels is None:
-        raise InputError("touches without labels cannot be scored: record them with labels")
-    return touches.labels
-
-
 def _add_prefix(column: str, values: dict[str, float]) -> dict[str, float]:
     return {f"{column}/{name}": value for name, value in values.items()}
 
 
 def _predictions(chances: Tensor, touches: Touches, task: Task, drawn: dict[str, Tensor]) -> pa.Table:
-    columns: dict[str, np.ndarray] = {}
-    for name, label, chance in zip(task.names, _labels(touches).T, chances.T, strict=True):
-        truth = label.to(torch.int8) if name in task.binary else label
-        columns |= {name: truth.numpy(), f"p_{name}": chance.numpy()}
+    columns: dict[str, Any] = {}
+    for name, label, chance in zip(task.names, touches.known_labels.T, chances.T, strict=True):
+        kind = pa.int8() if name in task.binary else pa.float32()
+        truth = pa.array(label.numpy(), kind, mask=label.isnan().numpy(), safe=False)  # null where unknown
+        columns |= {name: truth, f"p_{name}": chance.numpy()}
     columns |= {name: np.asarray(values) for name, values in drawn.items() if np.ndim(values) == 1}
     return pa.table(columns)
 
@@ -191,6 +186,8 @@ def print_report(report: Report, title: str, console: Console | None = None) -> 
     """
     console = console or Console()
     console.print(metrics_table(report.metrics, title))
+    if report.split:
+        console.print(f"split: {report.split}", markup=False, highlight=False, soft_wrap=True)
     if report.point is not None and report.reached is not None:
         sentence = f"{report.point.sentence()}; {report.reached.sentence()}"
         console.print(sentence, markup=False, highlight=False, soft_wrap=True)
@@ -234,7 +231,8 @@ def evaluation_markdown(report: Report, task: Task, title: str, about: str) -> s
         about: a sentence on where the touches came from.
     """
     (_, *columns), *rows = metric_rows(report.metrics, "°")
-    lines = [f"# {title}", "", about, "", "Per cent:", "", f"| | {' | '.join(columns)} |"]
+    lines = [f"# {title}", "", about, "", *([f"Split {report.split}.", ""] if report.split else [])]
+    lines += ["Per cent:", "", f"| | {' | '.join(columns)} |"]
     lines.append("|---" * (len(columns) + 1) + "|")
     lines += [f"| {' | '.join(row)} |" for row in rows]
     if report.point is not None and report.reached is not None:

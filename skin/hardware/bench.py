@@ -2,8 +2,8 @@
 
 import json
 import logging
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,15 +14,14 @@ import pyarrow.csv
 import pyarrow.parquet
 import torch
 from annotated_types import Ge, Le
-from pydantic import PositiveFloat
 
 from skin.body.base import AbstractBody, require_memory
 from skin.core.files import tabular, whole, write
-from skin.core.settings import checked, configured
+from skin.core.settings import checked
 from skin.device.base import AbstractSimulated
 from skin.errors import InputError
-from skin.hardware.emulator import Converter
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch.fingertips import half_extents, peak_per_newton
 from skin.touch.shapes import Shapes
 
 _KEY = b"skin_session"
@@ -32,6 +31,9 @@ _log = logging.getLogger("skin.hardware.record")
 GAUGE = ("force", "x_m", "y_m", "indenter", "radius_m", "angle", "press")
 """Columns besides ``time``; the first three are required."""
 _PAUSE = 1.0  # s without a row end a press
+_SLOWEST, _FASTEST = 1.0, 5000.0  # Hz of a bench's files
+_UNITS = {"ms": 1e-3, "microseconds": 1e-6, "minutes": 60.0, "ms in place of microseconds": 1e3}
+"""Units that a time may have by mistake, in s."""
 _OTHER = ("time", "t_us", "seq", *GAUGE)
 
 
@@ -138,8 +140,65 @@ class Gauge:
         press[(time < self.time[0]) | (time > self.time[-1])] = -1
         return np.where(press >= 0, np.interp(time, self.time, self.force), 0.0), press
 
+    def contacts(self, time: np.ndarray, peaks: np.ndarray) -> np.ndarray:
+        """Return the presses as contacts at times (T,), s, (T, 1, 5), NaN without force.
 
-def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+        Args:
+            time: s.
+            peaks: (P,), highest pressure of each press under 1 N, Pa (:func:`pressed_peaks`).
+
+        Returns:
+            The columns :data:`skin.touch.fingertips.CONTACT`.
+        """
+        force, press = self.at(time)
+        rows = self.first[np.maximum(press, 0)]
+        values = np.column_stack([self.place[rows], self.radius[rows], force, force * peaks[press]])
+        return np.where((force > 0)[:, None], values, np.nan)[:, None]
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of force and time in the files of a bench.
+
+    Attributes:
+        force_scale: N per unit of the gauge, negative where pressing is; None: N.
+        time_scale: s per unit of ``time``; None: s, and a rate that no bench has is refused.
+    """
+
+    force_scale: float | None = None
+    time_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.force_scale == 0 or (self.time_scale is not None and not self.time_scale > 0):
+            raise InputError("calibrate.force_scale must not be 0, and calibrate.time_scale must be above 0")
+
+    def seconds(self, time: np.ndarray, where: str) -> np.ndarray:
+        """Return times (N,) in s.
+
+        Raises:
+            InputError: their steps are those of another unit.
+        """
+        if self.time_scale is not None or len(time) < 3:
+            return time * (1.0 if self.time_scale is None else self.time_scale)
+        step = float(np.median(np.diff(time)))
+        if not step > 0 or _SLOWEST <= 1 / step <= _FASTEST:
+            return time
+        fits = {name: unit for name, unit in _UNITS.items() if _SLOWEST <= 1 / (step * unit) <= _FASTEST}
+        near = sorted(fits, key=lambda name: abs(np.log(100 * step * fits[name])))
+        hint = "check the column time"
+        if near:
+            unit = fits[near[0]]
+            rate = 1 / (step * unit)
+            hint = f"{near[0]} would be {rate:.4g} Hz: add calibrate.time_scale={unit:g}"
+        raise InputError(
+            f"{where}: a row every {step:.4g} s is no rate of a bench "
+            f"({_SLOWEST:g} to {_FASTEST:g} Hz); {hint}"
+        )
+
+
+def read_gauge(
+    path: str | Path, indenter: str, radius: float, delay: float = 0.0, units: Units | None = None
+) -> Gauge:
     """Read a gauge file with the columns ``time``, ``force``, ``x_m``, ``y_m`` and others of ``GAUGE``.
 
     Args:
@@ -147,16 +206,25 @@ def read_gauge(path: str | Path, indenter: str, radius: float, delay: float = 0.
         indenter: of a file without this column.
         radius: m, of a file without this column.
         delay: s, added to the times of the file to match the session's.
+        units: of the file; None: N and s.
 
     Raises:
         InputError: the file is invalid.
     """
     table, _ = load_table(path, "gauge file")
-    return gauge_from_table(table, str(path), indenter, radius, delay)
+    return gauge_from_table(table, str(path), indenter, radius, delay, units)
 
 
-def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, delay: float = 0.0) -> Gauge:
+def gauge_from_table(
+    table: pa.Table,
+    where: str,
+    indenter: str,
+    radius: float,
+    delay: float = 0.0,
+    units: Units | None = None,
+) -> Gauge:
     """Return a gauge from the complete rows of a table; see :func:`read_gauge`."""
+    units = units or Units()
     columns = {name: numbers(table, name, where) for name in ("time", "force", "x_m", "y_m")}
     for name, spare in (("radius_m", radius), ("angle", 0.0), ("press", 0.0)):
         present = name in table.column_names
@@ -170,9 +238,15 @@ def gauge_from_table(table: pa.Table, where: str, indenter: str, radius: float, 
     if not rows.any():
         raise InputError(f"{where}: no row has a time, a force and a place")
     complete = {name: values[rows] for name, values in columns.items()}
-    time, force = complete["time"] + delay, complete["force"]
+    time = units.seconds(complete["time"], where) + delay
+    force = complete["force"] * (units.force_scale or 1.0)
     if (np.diff(time) <= 0).any():
         raise InputError(f"{where}: time must grow from row to row, in s")
+    if -force.min() > 2 * force.max():
+        raise InputError(
+            f"{where}: force goes down to {force.min():g}, so pressing seems to be negative: add "
+            f"calibrate.force_scale={-(units.force_scale or 1.0):g}"
+        )
     if force.min() < -0.05 * force.max():
         raise InputError(f"{where}: force must be at least 0 N, got {force.min():g}: zero the gauge")
     place = np.stack([complete["x_m"], complete["y_m"]], axis=1)
@@ -209,14 +283,24 @@ def per_newton(simulator: AbstractSimulator, body: AbstractBody, gauge: Gauge) -
         )
     if not (radius > 0).all():
         raise InputError(f"radius_m must be above 0 m, got {radius.min():g}")
-    names, kind = np.unique(gauge.indenter[rows], return_inverse=True)
-    shapes = Shapes(names.tolist(), body)
-    # The image has a black border, so its outline is smaller than its texture.
-    reach = np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
-    scale, area = radius / reach[kind], float(np.prod(body.cell))
+    shapes, kind, scale = _indenters(body, gauge)
+    area = float(np.prod(body.cell))
     pieces = [slice(number, number + 1) for number in range(len(kind))]
     images = (shapes.render(kind[n], angle[n], scale[n], place[n]) / area for n in pieces)
     return torch.cat([simulator(image).readings for image in images]).double().numpy()
+
+
+def pressed_peaks(body: AbstractBody, gauge: Gauge) -> np.ndarray:
+    """Return the highest pressure of each press under 1 N, (P,), Pa, by the picture of its indenter."""
+    shapes, kind, _ = _indenters(body, gauge)
+    return peak_per_newton(shapes, kind, gauge.radius[gauge.first])
+
+
+def _indenters(body: AbstractBody, gauge: Gauge) -> tuple[Shapes, np.ndarray, np.ndarray]:
+    """Return the shapes that press, and of each press the shape's index and the scale, m."""
+    names, kind = np.unique(gauge.indenter[gauge.first], return_inverse=True)
+    shapes = Shapes(names.tolist(), body)
+    return shapes, kind, gauge.radius[gauge.first] / half_extents(shapes)[kind]
 
 
 @checked("session")
@@ -261,7 +345,7 @@ class BenchSession:
 
 
 def read_bench_session(
-    path: str | Path, indenter: str, radius: float, unit: str | None = None
+    path: str | Path, indenter: str, radius: float, unit: str | None = None, units: Units | None = None
 ) -> BenchSession:
     """Read a session.
 
@@ -274,6 +358,7 @@ def read_bench_session(
         indenter: of gauge rows without one.
         radius: m, of gauge rows without one.
         unit: ``N`` or ``adc``; None: the unit in the file, else N.
+        units: of the columns of a gauge, and of ``time``; None: N and s.
 
     Raises:
         InputError: the file is invalid.
@@ -284,12 +369,15 @@ def read_bench_session(
         raise InputError(f"{path}: no column of a sensor beside {', '.join(table.column_names)}")
     in_microseconds = "time" not in table.column_names and "t_us" in table.column_names
     time = numbers(table, "t_us" if in_microseconds else "time", str(path))
-    time = 1e-6 * time if in_microseconds else time
+    units = units or Units()
+    time = units.seconds(1e-6 * time if in_microseconds else time, str(path))
     raw = np.stack([numbers(table, name, str(path)) for name in names], axis=1)
     inside = "force" in table.column_names
-    if inside and in_microseconds:
-        table = table.append_column("time", [time])
-    rows = gauge_from_table(table, str(path), indenter, radius) if inside else None
+    if inside:
+        present = [name for name in table.column_names if name != "time"]
+        table = table.select(present).append_column("time", [time])
+    in_seconds = replace(units, time_scale=1.0)
+    rows = gauge_from_table(table, str(path), indenter, radius, units=in_seconds) if inside else None
     try:
         unit_of_values: Any = unit or about.get("unit", "N")
         return BenchSession(time, raw, unit_of_values, rows, about.get("bits"), about.get("channels"))
@@ -328,105 +416,10 @@ _FEWEST = 50  # idle frames
 _SUDDEN = 2  # frames that a release may take
 
 
-@dataclass(frozen=True)
-class Protocol:
-    """Idle time, then a staircase at each place: up, down, up to the peak, and a sudden release.
-
-    The upward steps determine gains, the downward steps hysteresis, the release the lag, and idle time
-    offset, noise and drift.
-
-    Attributes:
-        peak: largest force of every press, N.
-        steps: shares of the peak on the way up, and reversed on the way down.
-        hold: at every step, s.
-        ramp: from one step to the next, s; the release takes none.
-        idle: before the first press, s.
-        rest: after every press, s.
-        indenter: name as in ``touch.shapes``.
-        radius: half its larger extent, m.
-        rate: of gauge and session, Hz.
-    """
-
-    peak: PositiveFloat = 120.0
-    steps: Sequence[float] = (0.1, 0.2, 0.4, 0.7, 1.0)
-    hold: PositiveFloat = 0.3
-    ramp: PositiveFloat = 0.05
-    idle: PositiveFloat = 3.0
-    rest: PositiveFloat = 2.0
-    indenter: str = "blurred_disc"
-    radius: PositiveFloat = 0.01
-    rate: PositiveFloat = 100.0
-
-    def gauge(self, places: np.ndarray) -> Gauge:
-        """Return a gauge's rows for presses at places (P, 2), m."""
-        levels = [0.0, *self.steps, *list(self.steps)[-2::-1], self.steps[-1]]
-        corners = np.cumsum([0.0, *[self.ramp, self.hold] * (len(levels) - 1)])
-        heights = self.peak * np.repeat(levels, 2)[1:]
-        inside = np.arange(0, corners[-1], 1 / self.rate)
-        press = np.concatenate(
-            [np.interp(inside, corners, heights), np.zeros(max(2, round(0.2 * self.rate)))]
-        )
-        pause, start = round(self.rest * self.rate), round(self.idle * self.rate)
-        starts = start + np.arange(len(places)) * (len(press) + pause)
-        frame = (starts[:, None] + np.arange(len(press))).ravel()
-        rows = len(frame)
-        return Gauge(
-            frame / self.rate,
-            np.tile(press, len(places)),
-            np.repeat(places, len(press), axis=0),
-            np.full(rows, self.radius),
-            np.zeros(rows),
-            np.full(rows, self.indenter),
-            np.repeat(np.arange(len(places)), len(press)),
-        )
-
-    def places(self, device: AbstractSimulated, generator: np.random.Generator) -> np.ndarray:
-        """Return two places per sensor, on it and up to 3 mm beside it, (2 S, 2), m, inside the sheet."""
-        centre = device.sensors.positions[:, :2]
-        beside = centre + generator.uniform(-0.003, 0.003, centre.shape)
-        return np.clip(np.concatenate([centre, beside]), 0, device.size)
-
-
-def emulate_session(
-    device: AbstractSimulated,
-    gauge: Gauge,
-    protocol: Protocol,
-    generator: np.random.Generator,
-    bits: int | None = None,
-) -> BenchSession:
-    """Simulate a session of a device under the presses of a gauge, in N, or in counts of ``bits``."""
-    frames = round((gauge.time[-1] + protocol.rest) * protocol.rate)
-    time = np.arange(frames) / protocol.rate
-    true = true_readings(gauge, per_newton(device.model, device.body, gauge), time)
-    measured = device.imperfection.raw(
-        torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
-    )[0].numpy()
-    values = Converter(bits, device.imperfection.clip)(measured)
-    return BenchSession(time, values, "N" if bits is None else "adc", gauge, bits)
-
-
 def true_readings(gauge: Gauge, each: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return true readings (T, S), N, of presses that give ``each`` (P, S) per N; 0 outside of them."""
     force, press = gauge.at(time)
     return np.where(press[:, None] >= 0, force[:, None] * each[press], 0.0)
-
-
-def write_demo_session(device: AbstractSimulated, settings: Mapping[str, Any], path: str) -> str:
-    """Write the simulated session of a device under the protocol; return a summary.
-
-    Args:
-        device: the simulated device.
-        settings: ``conf/calibrate.yaml`` under ``calibrate``.
-        path: .csv or .parquet.
-
-    Raises:
-        InputError: the protocol is invalid.
-    """
-    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
-    randomness = np.random.default_rng(device.seed)
-    rows = protocol.gauge(protocol.places(device, randomness))
-    session = emulate_session(device, rows, protocol, randomness, settings["bits"])
-    return f"{write_bench_session(session, path)}: {len(rows)} presses in {session.time[-1]:.0f} s"
 
 
 @dataclass(frozen=True)
@@ -519,7 +512,11 @@ def build_bench_data(device: AbstractSimulated, session: BenchSession, gauge: Ga
     model = device.simulator(device.body, device.sensors)
     bench = BenchData(session, rows, per_newton(model, device.body, rows))
     if not bench.loading.any():
-        raise InputError("no frame of the session falls into a press: check the clocks, see calibrate.delay")
+        spans = [np.ptp(values) for values in (session.time, rows.time)]
+        raise InputError(
+            f"no frame of the session ({spans[0]:.4g} s long) falls into a press of the gauge "
+            f"({spans[1]:.4g} s): check the clocks and their units, see calibrate.delay"
+        )
     if bench.idle.sum() < _FEWEST:
         raise InputError(
             f"{bench.idle.sum()} idle frames, needed are {_FEWEST}: do not touch the skin for some seconds"

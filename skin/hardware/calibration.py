@@ -3,7 +3,8 @@
 import math
 import warnings
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from skin.device.calibration import QUANTITIES, Calibration
+from skin.device.curves import Curves
 from skin.device.imperfection import Imperfection
 from skin.errors import InputError
 from skin.hardware.bench import BenchData
+from skin.hardware.response_fit import Shape, curves_of, describe_shapes, fit_shape
 from skin.hardware.wiring import (
     _MAD,
     _MEDIAN,
@@ -32,7 +35,9 @@ _RESPONDING = 0.05  # of the press's strongest reading: sensors that count
 _LOADED = 0.2  # of a press's peak: frames in which its force is estimated
 _CLIPPED = 0.95  # of the limit: a reading above may be cut off
 _TOO_FAR = 0.25  # error of a held-out force; positions off by 2 mm cause less
+_NEAR = 0.2  # of the strongest press's reading: presses that show the shape of a response
 _WEAK = 0.05  # of the median gain: such a channel has 20 times the noise of others
+_GAUGES, _LIKE = {"kg": 9.80665, "g": 0.00980665}, 1.5  # N; factor within which a unit explains
 _UNITS = {"gain": "", "hysteresis": "of peak", "time_constant": "s", "drift": "N/s"}
 
 
@@ -49,6 +54,7 @@ class _Channel:
     hysteresis: float | None = None
     broken: str | None = None
     polarity: float = 1.0
+    shape: Shape = field(default_factory=Shape)
 
 
 def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) -> Calibration:
@@ -72,13 +78,16 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
     driven = np.where(used[:, None], bench.true, 0.0)
     pressed = driven.max(axis=0) >= _PRESSED * driven.max()
     answering = [int(n) for n in np.flatnonzero(pressed) if channels[n].broken is None]
-    for number in answering:
-        channels[number].time_constant = _fit_time_constant(bench, used, number, channels[number])
+    measured = np.stack(
+        [_subtract_rest(bench, number, channel) for number, channel in enumerate(channels)], 1
+    )
+    curves = _fit_shapes(bench, used, answering, channels, measured)
+    linear = measured if curves is None else curves.straighten(measured)
     lagged, bends = _simulate_lag(
         bench.true, [channel.time_constant for channel in channels], bench.session.time
     )
     for number in answering:
-        _fit_branches(bench, used, number, channels[number], lagged[:, number], bends[:, number])
+        _fit_branches(bench, used, number, channels[number], linear, (lagged, bends), curves)
     gains = [gain for n in answering if (gain := channels[n].gain)]
     typical = float(np.median(gains)) if gains else 0.0
     if not gains:
@@ -86,7 +95,43 @@ def fit_calibration(bench: BenchData, presses: Collection[int] | None = None) ->
             "no channel responds to a press below its limit: check layout, indenter, the forces and the "
             "session's clock"
         )
-    return _convert_to_newton(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical)
+    return _convert_to_newton(bench, channels, 1.0 if bench.session.unit == "N" else 1 / typical, curves)
+
+
+def _fit_shapes(
+    bench: BenchData, used: np.ndarray, answering: list[int], channels: list[_Channel], measured: np.ndarray
+) -> Curves | None:
+    """Set time constants and shapes of channels; return the curves, in the session's unit, or None.
+
+    The lag bends the response while the force rises, and a curve changes the decay after a release: each is
+    fitted twice.
+    """
+    curves = None
+    for _ in range(2):
+        linear = measured if curves is None else curves.straighten(measured)
+        for number in answering:
+            channel = channels[number]
+            floor = max(8 * channel.idle.noise, 3 * channel.quantum, 1e-9)
+            if curves is not None:
+                floor = float(curves.straighten(np.full(len(channels), floor))[number])
+            channel.time_constant = _fit_time_constant(bench, used, linear[:, number], floor)
+        lagged, _ = _simulate_lag(bench.true, [entry.time_constant for entry in channels], bench.session.time)
+        for number in answering:
+            channel, true = channels[number], lagged[:, number]
+            near = bench.each[:, number] >= _NEAR * bench.each[:, number].max()
+            rows = used & bench.loading & (true > 0) & np.isfinite(measured[:, number])
+            rows &= near[bench.applied[1]]
+            channel.shape = fit_shape(
+                true[rows],
+                measured[rows, number],
+                bench.applied[1][rows],
+                channel.idle.noise,
+                channel.quantum,
+            )
+        previous, curves = curves, curves_of([channel.shape for channel in channels])
+        if previous is None and curves is None:
+            break
+    return curves
 
 
 def _measure_rest(bench: BenchData, number: int) -> _Channel:
@@ -128,18 +173,17 @@ def _subtract_rest(bench: BenchData, number: int, channel: _Channel) -> np.ndarr
     return channel.polarity * (bench.session.raw[:, number] - idle)
 
 
-def _fit_time_constant(bench: BenchData, used: np.ndarray, number: int, channel: _Channel) -> float:
-    """Return the weighted mean over releases of presses that reach the channel, s."""
-    measured, time = _subtract_rest(bench, number, channel), bench.session.time
+def _fit_time_constant(bench: BenchData, used: np.ndarray, linear: np.ndarray, floor: float) -> float:
+    """Return the weighted mean over releases of presses that reach a channel with linear changes (T,), s."""
+    time = bench.session.time
     # Clipped readings contain no information on the lag.
-    most = 0.8 * np.nanmax(measured)
+    most = 0.8 * np.nanmax(linear)
     decays = []
     for release in bench.releases:
         if not used[release.start - 2] and not used[release.start - 1]:
             continue
-        values = measured[release]
+        values = linear[release]
         start = int(np.argmax(values < most)) if len(values) and (values < most).any() else 0
-        floor = max(8 * channel.idle.noise, 3 * channel.quantum, 1e-9)
         decays.append(fit_decay(time[release][start:], np.nan_to_num(values[start:]), floor))
     weight = sum(share for _, share in decays)
     return sum(value * share for value, share in decays) / weight if weight else 0.0
@@ -223,22 +267,34 @@ def _simulate_lag(
 
 
 def _fit_branches(
-    bench: BenchData, used: np.ndarray, number: int, channel: _Channel, lagged: np.ndarray, bend: np.ndarray
+    bench: BenchData,
+    used: np.ndarray,
+    number: int,
+    channel: _Channel,
+    linear: np.ndarray,
+    simulated: tuple[np.ndarray, np.ndarray],
+    curves: Curves | None,
 ) -> None:
-    """Fit gain and clip on the loading branch, hysteresis on the unloading branch."""
-    measured = _subtract_rest(bench, number, channel)
+    """Fit gain and clip on the loading branch, hysteresis on the unloading one, of linear changes (T, S)."""
+    measured, lagged, bend = (values[:, number] for values in (linear, *simulated))
     true = np.where(used, bench.true[:, number], 0.0)
     # In a solid, every press reaches every sensor a little; such readings are noise.
     pressed = np.isfinite(measured) & (true > _PRESSED * true.max())
     up = pressed & bench.loading & (lagged > 0)
     if up.sum() < 10:
         return
-    gain, channel.error, channel.clip = fit_clip_and_gain(lagged[up], measured[up], channel.idle.noise)
+    noise = channel.idle.noise
+    if channel.shape.kind != "linear":  # under load, where the curve has another slope than at rest
+        noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(measured[up]))))
+    gain, channel.error, plateau = fit_clip_and_gain(lagged[up], measured[up], noise)
+    channel.clip = plateau
+    if plateau is not None and curves is not None:
+        channel.clip = float(curves.bend(np.full(linear.shape[1], plateau))[number])
     if np.isnan(gain):  # every reading is at the limit
         return
     # A slope within its error may be noise.
     channel.gain = gain if gain > _SURE * channel.error else None
-    limit = np.inf if channel.clip is None else 0.9 * channel.clip
+    limit = np.inf if plateau is None else 0.9 * plateau
     # A gap no larger than the noise is not used.
     down = pressed & bench.unloading & (measured < limit) & (bend > 0.05 * lagged.max())
     if down.sum() < 10 or not channel.gain:
@@ -250,7 +306,9 @@ def _fit_branches(
     channel.hysteresis = share if share > 2 * error else 0.0
 
 
-def _convert_to_newton(bench: BenchData, channels: list[_Channel], scale: float) -> Calibration:
+def _convert_to_newton(
+    bench: BenchData, channels: list[_Channel], scale: float, curves: Curves | None
+) -> Calibration:
     """Convert channels to N, and compute ranges over the working ones."""
     alive = [channel.broken is None for channel in channels]
     # Counts have an unknown zero, common to all channels; readings in N do not.
@@ -271,7 +329,13 @@ def _convert_to_newton(bench: BenchData, channels: list[_Channel], scale: float)
     sensors["time_constant"] = [
         _round(channel.time_constant if channel.gain else None) for channel in channels
     ]
-    for name in ("gain", "clip", "hysteresis", "time_constant"):
+    if curves is not None:
+        fitted = [channel.gain is not None for channel in channels]
+        sensors["exponent"] = [
+            _round(float(value)) if live else None
+            for value, live in zip(curves.exponent, fitted, strict=True)
+        ]
+    for name in sensors.keys() & {"gain", "clip", "hysteresis", "time_constant", "exponent"}:
         sensors[name] = [value if live else None for value, live in zip(sensors[name], alive, strict=True)]
     broken = {
         kind: [n for n, channel in enumerate(channels) if channel.broken == kind]
@@ -283,10 +347,19 @@ def _convert_to_newton(bench: BenchData, channels: list[_Channel], scale: float)
         ranges |= {name: [min(working), max(working)]} if working else {}
     error = 2 * scale * float(np.median([channel.error for channel in channels if channel.gain]))
     ranges["gain"] = [max(ranges["gain"][0] - error, 0.0), ranges["gain"][1] + error]
-    about = {"unit": bench.session.unit, "presses": len(bench.gauge), "frames": len(bench.session.time)}
+    about: dict[str, Any] = {
+        "unit": bench.session.unit,
+        "presses": len(bench.gauge),
+        "frames": len(bench.session.time),
+    }
     polarity = [int(channel.polarity) for channel in channels]
     signs = polarity if min(polarity) < 0 else ()
-    return Calibration(sensors, broken, ranges, scale, zero, about, polarity=signs)
+    calibration = Calibration(sensors, broken, ranges, scale, zero, about, polarity=signs)
+    if curves is None:
+        return calibration
+    about["responses"] = describe_shapes([channel.shape for channel in channels])
+    tables = {n: (scale * np.array(table)).tolist() for n, table in curves.tables.items()}
+    return replace(calibration, about=about, exponent_at=float(curves.at[0]) * scale, tables=tables)
 
 
 def _round(value: float | None, scale: float = 1.0) -> float | None:
@@ -403,16 +476,49 @@ def _estimate_forces(bench: BenchData, presses: Sequence[int], calibration: Cali
     return np.array([np.median(ratios) for ratios in finite if len(ratios)])
 
 
+def check_force(calibration: Calibration, clip: float) -> None:
+    """Compare the unit of the gauge with what this skin can give.
+
+    Args:
+        calibration: fitted to the gauge.
+        clip: largest force that a sensor of this skin measures, N.
+
+    Raises:
+        InputError: gains of sensors in N, or limits of sensors in counts, are those of a gauge in another
+            unit.
+    """
+    if calibration.about.get("unit") == "N":
+        ratio = float(np.median([gain for gain in calibration.sensors["gain"] if gain is not None]))
+        words = f"the readings, in N, are {ratio:.3g} times what the gauge's force makes of them"
+    else:
+        limits = np.array([np.nan if value is None else value for value in calibration.sensors["clip"]])
+        if not np.isfinite(limits).any():
+            return
+        if calibration.curves is not None:
+            limits = calibration.curves.straighten(limits)
+        limit = float(np.nanmedian(limits))
+        ratio = clip / limit
+        words = f"sensors reach their limit at {limit:.3g} N, and device.clip is {clip:g} N"
+    fits = [name for name, unit in _GAUGES.items() if abs(math.log(ratio / unit)) < math.log(_LIKE)]
+    if fits:
+        raise InputError(
+            f"{words}: the force of the gauge seems to be in {fits[0]}; add "
+            f"calibrate.force_scale={_GAUGES[fits[0]]:g}, or calibrate.force_scale=1 if it is in N"
+        )
+
+
 def print_calibration(calibration: Calibration, outcome: HeldOutErrors) -> None:
     """Print the constants of working sensors, the broken, inverse and weak ones, and held-out errors."""
     table = Table("", "median", "least", "largest", "", box=None, pad_edge=False)
     for name in QUANTITIES:
-        values = [value for value in calibration.sensors[name] if value is not None]
+        values = [value for value in calibration.sensors.get(name, []) if value is not None]
         if values and name in calibration.ranges:
             low, high = calibration.ranges[name]
             middle = f"{np.median(values):.4g}"
             table.add_row(name, middle, f"{low:.4g}", f"{high:.4g}", _UNITS.get(name, "N"))
     Console().print(table)
+    for line in calibration.about.get("responses", []):
+        print(line)
     gains = {n: gain for n, gain in enumerate(calibration.sensors["gain"]) if gain is not None}
     weak = [n for n, gain in gains.items() if gain < _WEAK * float(np.median(list(gains.values())))]
     broken = {number for group in calibration.broken.values() for number in group}

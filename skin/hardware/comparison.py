@@ -21,7 +21,7 @@ from skin.device.base import AbstractSimulated
 from skin.device.resampling import resample
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.hardware.bench import BenchData, build_bench_data, read_bench_session, read_gauge
+from skin.hardware.bench import BenchData, build_bench_data, pressed_peaks, read_bench_session, read_gauge
 from skin.hardware.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.hardware.recorder import check_session
 from skin.hardware.session import read_session
@@ -269,11 +269,20 @@ def compare_presses(device: AbstractSimulated, bench: BenchData, scale: float | 
     if not pairs:
         raise InputError("no press has frames in the session: check the clocks, see compare.delay")
     begins = [bench.gauge.time[bench.gauge.first[pair.number]] for pair in pairs]
-    touches = (
+    contacts = torch.from_numpy(_contacts(device, bench, begins)).float()
+    sides = (
         _resample(device, session.time, simulated, np.isfinite(simulated) & working, begins),
         _resample(device, session.time, measured, valid, begins),
     )
-    return SessionComparison("presses", True, pairs, touches)
+    simulation, recording = (replace(side, contacts=contacts) for side in sides)
+    return SessionComparison("presses", True, pairs, (simulation, recording))
+
+
+def _contacts(device: AbstractSimulated, bench: BenchData, begins: list[float]) -> np.ndarray:
+    """Return the contacts in the middle of each frame of the model, from the beginning of each press."""
+    middles = (np.arange(device.window) + 0.5) / device.model_rate
+    peaks = pressed_peaks(device.body, bench.gauge)
+    return np.stack([bench.gauge.contacts(begin + middles, peaks) for begin in begins])
 
 
 def _subtract_idle(values: np.ndarray, idle: np.ndarray) -> np.ndarray:

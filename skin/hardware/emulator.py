@@ -23,6 +23,7 @@ from skin.core.rng import Stream, generator
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import Check
 from skin.errors import InputError
+from skin.hardware.wire.contact_lines import contact_lines, encode_contact_line
 from skin.hardware.wire.protocol import (
     Announcement,
     Header,
@@ -33,7 +34,6 @@ from skin.hardware.wire.protocol import (
     encode_line,
 )
 from skin.hardware.wire.segmentation import label_text
-from skin.touch.sampler import balanced
 
 _BATCH = 16  # every combination of the labels once
 _EDGE = 0.25  # of a frame, in which force rises and falls
@@ -47,11 +47,13 @@ class Gesture:
         labels: name -> 0 or 1.
         force: true readings, (T, S), N, at the model's rate.
         applied: total force on the skin, (T,), N.
+        contacts: (T, K, 5), as of :class:`skin.device.touches.Touches`; None if unknown.
     """
 
     labels: Mapping[str, int]
     force: np.ndarray
     applied: np.ndarray
+    contacts: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Converter:
 
 
 def emulated_gestures(device: AbstractSimulated, seed: int = 0) -> Iterator[Gesture]:
-    """Yield gestures that are not used for training, balanced in batches of 16."""
+    """Yield touches that are not used for training, balanced in batches of 16."""
     with ThreadPoolExecutor(1, "skin-gestures") as ahead:
         # Drawn while the previous ones are sent, so that there is no pause.
         coming = ahead.submit(_batch, device, seed, 0)
@@ -99,7 +101,7 @@ def gestures_with_labels(device: AbstractSimulated, labels: np.ndarray, seed: in
 
 def _batch(device: AbstractSimulated, seed: int, number: int) -> list[Gesture]:
     draw = generator(Stream.TEST, 2, seed, number)
-    return _draw_gestures(device, balanced(_BATCH, draw), draw)
+    return _draw_gestures(device, device.sampler.balanced(_BATCH, draw), draw)
 
 
 @torch.no_grad()
@@ -107,9 +109,10 @@ def _draw_gestures(device: AbstractSimulated, labels: np.ndarray, draw: np.rando
     movie = device.sampler.sample(len(labels), draw, labels)
     readings = device.model.respond(movie, displacement=False).readings.double().numpy()
     names, rows, force = device.task.names, movie.labels.int().tolist(), movie.force.double().numpy()
+    contacts = [None] * len(movie) if movie.contacts is None else movie.contacts.numpy()
     return [
-        Gesture(dict(zip(names, row, strict=True)), reading, applied)
-        for row, reading, applied in zip(rows, readings, force, strict=True)
+        Gesture(dict(zip(names, row, strict=True)), *values)
+        for row, *values in zip(rows, readings, force, contacts, strict=True)
     ]
 
 
@@ -390,7 +393,7 @@ class EmulatorSettings:
         check: checksum of a line: ``crc16``, ``xor`` or ``none``.
         idle: before the first gesture, s.
         gap: between two windows, s.
-        announce: send an announcement before each gesture, in the text format.
+        announce: send an announcement before each gesture, with its contacts, in the text format.
         seed: of the gestures and of the faults; the device's own noise follows ``device.seed``.
         id: its name.
     """
@@ -478,7 +481,7 @@ class Emulator:
         output = self.device.imperfection.raw(
             torch.from_numpy(true)[None].float(), self.device.constants, self._noise, time
         )
-        return self.converter(output[0].double().numpy())
+        return self.converter(output[0].double().numpy() * self.device.imperfection.signs(true.shape[1]))
 
     def _play(self, values: np.ndarray, end: int | None) -> bool:
         """Send frames when they are due; return whether the run is over."""
@@ -547,6 +550,9 @@ class Emulator:
         if self.settings.announce and not self.binary:
             seq, frames = self._number - self._zero, round(len(gesture.force) * rate / self.device.model_rate)
             self._send(encode_announcement(Announcement(number, seq, frames, gesture.labels)))
+            if gesture.contacts is not None:
+                for line in contact_lines(number, gesture.contacts, self.device.model_rate):
+                    self._send(encode_contact_line(line))
 
     def _silence(self) -> None:
         self._on_event(self._number / self.settings.rate, f"silent for {self.faults.silent:g} s")

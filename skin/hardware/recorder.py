@@ -20,8 +20,15 @@ from skin.device.files import write_recording
 from skin.device.resampling import Frame
 from skin.device.touches import concatenate
 from skin.errors import InputError
-from skin.hardware.serial import Serial
-from skin.hardware.session import StoredSession, encode_event, line_sum, read_session, write_about
+from skin.hardware.serial import Serial, warn_of_contacts
+from skin.hardware.session import (
+    StoredSession,
+    describe_contacts,
+    encode_event,
+    line_sum,
+    read_session,
+    write_about,
+)
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.protocol import Header
 from skin.hardware.wire.reader import SkinDisconnected, SkinTimeout
@@ -188,6 +195,8 @@ class SessionLog:
         """Write the conversion of the following values to N; its ``zero`` is the baseline."""
         # What a tare tells of the noise is for those who watch.
         arrays = {name: getattr(conversion, name).tolist() for name in ("scale", "zero", "broken")}
+        if conversion.curves is not None:
+            arrays["curves"] = conversion.curves.to_json()
         line, self._conversion_checksum = encode_event("meaning", **arrays)
         self._lines.add(line)
 
@@ -195,7 +204,8 @@ class SessionLog:
         """Write that the window of a gesture begins at or just before a frame."""
         begin = round(self._time(frame) - (frame.t - gesture.begin), 9)
         about = {"number": gesture.number, "time": begin, "labels": gesture.labels}
-        self.mark("begin", **about, meaning=self._conversion_checksum, **self._marked)
+        contacts = {} if gesture.contacts is None else {"contacts": describe_contacts(gesture.contacts)}
+        self.mark("begin", **about, **contacts, meaning=self._conversion_checksum, **self._marked)
         self._sums = []
 
     def end(self, gesture: RecordedGesture) -> None:
@@ -348,6 +358,7 @@ def convert_session(device: Serial, path: Path) -> tuple[Path, int]:
     now = {"positions": device.sensors.positions.tolist(), "window": device.window, "rate": device.model_rate}
     check_session(path, stored.about, now)
     gestures = _same_labels(device.task.names, path, stored)
+    warn_of_contacts([gesture for gesture, _ in gestures])
     whole = concatenate([device.to_recording([gesture], conversion) for gesture, conversion in gestures])
     about = stored.about | {
         "source": "session",

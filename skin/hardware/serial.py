@@ -14,7 +14,7 @@ from skin.body.base import AbstractBody
 from skin.body.layout import AbstractLayout
 from skin.device.base import AbstractDevice, Blank, Split
 from skin.device.resampling import Frame, Window
-from skin.device.touches import Recording, Touches
+from skin.device.touches import Recording, Touches, join_contacts
 from skin.errors import InputError
 from skin.hardware.wire.channels import UnitConversion
 from skin.hardware.wire.reader import PortSettings, SkinDisconnected, SkinTimeout
@@ -29,7 +29,7 @@ from skin.hardware.wire.segmentation import (
     label_text,
 )
 from skin.hardware.wire.skin import SerialSource, Source, play
-from skin.touch.gesture import GestureSettings, model_window
+from skin.touch.gesture import TouchSettings, model_window
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT
 
 
@@ -75,7 +75,7 @@ class Serial(PortSettings, AbstractDevice):
         gestures: number of gestures.
         seed: of the order of prompts.
         trigger: force above which a window begins with ``labels=none``, N.
-        touch: rate and window of the model (``conf/touch.yaml``).
+        touch: rate and window of the model (``conf/touch``).
         stream: add the label ``touch``.
 
     Raises:
@@ -90,7 +90,7 @@ class Serial(PortSettings, AbstractDevice):
     gestures: int = 16
     seed: int = 0
     trigger: float = 0.3
-    touch: Mapping[str, Any] | GestureSettings | None = None
+    touch: Mapping[str, Any] | TouchSettings | None = None
     stream: bool = False
 
     def __post_init__(self) -> None:
@@ -172,6 +172,11 @@ class Serial(PortSettings, AbstractDevice):
         if gestures and gestures[0].labels is not None:
             rows = [list(map(float, gesture.labels.values())) for gesture in gestures if gesture.labels]
             touches = replace(touches, labels=torch.tensor(rows))
+        contacts = [
+            None if gesture.contacts is None else torch.from_numpy(gesture.contacts)[None].float()
+            for gesture in gestures
+        ]
+        touches = replace(touches, contacts=join_contacts(contacts) if contacts else None)
         about = {"source": "serial", "lost": [gesture.lost for gesture in gestures]}
         return Recording(touches, self.task, self.size, self.sensors.footprint, metadata=about)
 
@@ -197,9 +202,17 @@ class Serial(PortSettings, AbstractDevice):
                         break
             except (SkinTimeout, SkinDisconnected) as end:
                 _print(str(end))
+        warn_of_contacts(gestures)
         if not gestures:
             raise InputError("no gesture was read: does the emulator announce, is the skin touched?")
         return self.to_recording(gestures, conversion)
+
+
+def warn_of_contacts(gestures: Sequence[RecordedGesture]) -> None:
+    """Warn where the contacts of some gestures are unknown, so that a recording of all has none."""
+    unknown = sum(gesture.contacts is None for gesture in gestures)
+    if 0 < unknown < len(gestures):
+        _print(f"contacts are left out: of {unknown} of {len(gestures)} gestures a line was lost or damaged")
 
 
 def _print(text: str) -> None:

@@ -25,10 +25,13 @@ from skin.body.base import MOST
 from skin.core import files
 from skin.core.files import json_line
 from skin.core.safe_loading import parse_json, read_file, regular, sha256
+from skin.device.curves import Curves
 from skin.device.resampling import Frame, Window
 from skin.errors import InputError
 from skin.hardware.wire.channels import UnitConversion
+from skin.hardware.wire.contact_lines import MOST_CONTACTS
 from skin.hardware.wire.segmentation import RecordedGesture
+from skin.touch.fingertips import CONTACT
 
 _SUM = ', "sum": "'
 
@@ -254,12 +257,14 @@ class _Reading:
     def _event(self, content: dict[str, Any], token: str) -> None:
         match content.pop("event"):
             case "meaning":
+                bent = content.pop("curves", None)
+                curves = None if bent is None else Curves.of_json(bent, self._sensors)
                 arrays = {name: np.array(value) for name, value in content.items()}
                 if any(
                     len(array) != self._sensors or not np.isfinite(array).all() for array in arrays.values()
                 ):
                     raise ValueError("a conversion of other sensors")
-                self._conversion = token, UnitConversion(**arrays)
+                self._conversion = token, UnitConversion(**arrays, curves=curves)
                 self._marked = {"invalid": [], "saturated": []}
                 self._gesture, self._doubtful = None, False
             case "begin":
@@ -289,7 +294,11 @@ class _Reading:
         number, labels = int(content["number"]), content["labels"]
         if not isfinite(content["time"]) or not set((labels or {}).values()) <= {0, 1}:
             raise ValueError("no gesture")
-        self._gesture, self._spoilt = RecordedGesture(number, labels, float(content["time"]), 0), 0
+        contacts = content.get("contacts")  # sessions of earlier versions and of people have none
+        if contacts is not None:
+            contacts = _decode_contacts(contacts, self.stored.about.get("window", 30))
+        self._gesture = RecordedGesture(number, labels, float(content["time"]), 0, contacts=contacts)
+        self._spoilt = 0
         self._sums = {}
         # Older sessions do not refer to a conversion.
         meant = content.get("meaning")
@@ -329,6 +338,26 @@ class _Reading:
             gesture.resampled = window.since(gesture.begin)
             self.stored.left_out.pop(number, None)
             self.stored.gestures[number] = gesture, conversion
+
+
+def describe_contacts(contacts: np.ndarray) -> dict[str, Any]:
+    """Return contacts (T, K, 5), NaN where there is none, as JSON data: each that is there in a row."""
+    places = np.argwhere(np.isfinite(contacts).all(axis=2))
+    rows = [[*place, *contacts[tuple(place)].tolist()] for place in places.tolist()]
+    return {"most": contacts.shape[1], "rows": rows}
+
+
+def _decode_contacts(content: dict[str, Any], frames: int) -> np.ndarray:
+    """Return the contacts (T, K, 5) of a window of T ``frames``; an error of _BAD if they are invalid."""
+    most = content["most"]
+    if not isinstance(most, int) or not 1 <= most <= MOST_CONTACTS:
+        raise ValueError("no number of contacts")
+    contacts = np.full((frames, most, len(CONTACT)), np.nan)
+    for frame, place, *values in content["rows"]:
+        if not (0 <= frame < frames and 0 <= place < most and len(values) == len(CONTACT)):
+            raise ValueError("no contact of the window")
+        contacts[frame, place] = values
+    return contacts
 
 
 def line_sum(text: str) -> str:

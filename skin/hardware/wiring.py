@@ -322,6 +322,22 @@ class Confirmed:
         """Return the column of the session of every sensor."""
         return list(range(sensors) if self.channels is None else self.channels)
 
+    def ordered(self, session: BenchSession) -> BenchSession:
+        """Return a session with its columns in the order of the layout, broken ones without values.
+
+        Raises:
+            InputError: channels or sensors that it does not have.
+        """
+        sensors = session.raw.shape[1]
+        channels = self.order(sensors)
+        if sorted(channels) != list(range(sensors)):
+            raise InputError(f"calibrate.channels must hold each of 0 to {sensors - 1} once, got {channels}")
+        if wrong := [number for number in self.broken if not 0 <= number < sensors]:
+            raise InputError(f"calibrate.broken takes sensors from 0 to {sensors - 1}, got {wrong[0]}")
+        ordered = session.raw[:, channels].astype(float)
+        ordered[:, list(self.broken)] = np.nan
+        return replace(session, raw=ordered)
+
 
 @dataclass(frozen=True)
 class _Explanation:
@@ -379,14 +395,7 @@ def wired_bench(
     """
     rows = session.gauge if rows is None else rows
     if session.raw.shape[1] == len(device.sensors):
-        sensors, channels = session.raw.shape[1], confirmed.order(session.raw.shape[1])
-        if sorted(channels) != list(range(sensors)):
-            raise InputError(f"calibrate.channels must hold each of 0 to {sensors - 1} once, got {channels}")
-        if wrong := [number for number in confirmed.broken if not 0 <= number < sensors]:
-            raise InputError(f"calibrate.broken takes sensors from 0 to {sensors - 1}, got {wrong[0]}")
-        ordered = session.raw[:, channels].astype(float)
-        ordered[:, list(confirmed.broken)] = np.nan
-        session = replace(session, raw=ordered)
+        session = confirmed.ordered(session)
     if rows is None:
         return build_bench_data(device, session, rows)
     gauge = turn_gauge(rows, confirmed.places, device.size)

@@ -10,7 +10,7 @@ import torch
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
-from skin.mechanics.geometry import Fingertip
+from skin.mechanics.geometry import fingertip_readings
 from skin.mechanics.simulator.base import AbstractSimulator
 
 
@@ -73,14 +73,11 @@ def disc_readings(
 
     The only place where candidates meet the mechanics.
     """
-    fingertip, parts = Fingertip(body, rim), []
     touches = torch.from_numpy(np.column_stack([discs, np.ones(len(discs))])).float()
-    home = next(simulator.buffers())
+    home = next(simulator.buffers()).device
     with torch.no_grad():
-        for part in touches.split(256):
-            pressure = fingertip(part).to(home.device)
-            parts.append(simulator(pressure).readings.cpu().numpy().astype(np.float64))
-    return np.concatenate(parts)
+        readings = fingertip_readings(simulator, body, touches.to(home), rim)
+    return readings.cpu().numpy().astype(np.float64)
 
 
 class Boxes(NamedTuple):

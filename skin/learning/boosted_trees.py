@@ -136,7 +136,10 @@ class BoostedTrees(AbstractLearner):
             rows, held = trained[:, label], checked[:, label]
             truth = table["train_labels"][rows, label]
             if len(np.unique(truth)) < 2:
-                raise InputError(f"all training touches have the same label {name}: give more touches")
+                raise InputError(
+                    f"all training touches have the same label {name}: give more touches, or "
+                    "touches of every label, as touch=gestures draws them"
+                )
             if not held.any():
                 raise InputError(f"no validation touch has a label {name}: give more touches")
             model = _KINDS[name in task.binary](**self._settings)

@@ -15,13 +15,13 @@ from skin.core.settings import checked
 from skin.device.base import AbstractDevice, Split
 from skin.device.touches import Touches, touches_hash
 from skin.errors import InputError
-from skin.learning.classifier import Batch
 from skin.learning.representation import AbstractRepresentation, Frames, idle_level
 from skin.touch.labels import Task
 
 # Data augmentation: changes of a touch that keep its labels.
 
 
+Batch = tuple[Frames, Tensor]
 _MARGIN = 2  # frames that a touch may last beyond what stands out
 
 
@@ -70,7 +70,10 @@ class Augmentation:
         if self.noise:
             readings = readings + self.noise * torch.randn(readings.shape, generator=generator)
         saturated = None if touches.saturated is None else touches.saturated.gather(1, order)
-        return replace(touches, readings=readings, valid=valid, saturated=saturated)
+        contacts = touches.contacts
+        if contacts is not None:
+            contacts = contacts.gather(1, order[..., :1, None].expand(-1, -1, *contacts.shape[2:]))
+        return replace(touches, readings=readings, valid=valid, saturated=saturated, contacts=contacts)
 
     def _shifts(self, touches: Touches, generator: torch.Generator) -> Tensor:
         """Draw the shift of each touch, (B,), frames, such that none is cut."""

@@ -22,8 +22,8 @@ from skin.touch.labels import Task
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger
 
-    from skin.learning.classifier import TouchClassifier
     from skin.learning.data import TouchData
+    from skin.learning.network import TouchClassifier
 
 
 class AbstractLearner(ABC):
@@ -289,7 +289,7 @@ class Ensemble(AbstractLearner):
 
     def pipeline(self, positions: Tensor) -> nn.Module:
         """Return the mean of the members' pipelines."""
-        from skin.learning.classifier import Mean
+        from skin.learning.network import Mean
 
         return Mean([member.pipeline(positions) for member in self._members])
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from skin.body.base import GEOMETRY, REACHES, AbstractBody, Sensors
 from skin.mechanics.simulator.base import AbstractSimulator
+from skin.touch import splines
 
 # The pressure of a fingertip, differentiable in its place, radius and force.
 
@@ -17,42 +18,69 @@ PARAMETERS = ("x", "y", "radius", "force")
 
 
 class Fingertip:
-    """Pressure of discs with a soft rim on the cells of a body.
+    """Loads of discs with a soft rim on the cells of a body.
 
     The pressure at a distance d from the centre is proportional to 1 / (1 + exp((d - radius) / rim)). A cell
-    has the mean of samples that are at most two rims apart. The part of a disc beyond the edge of the body is
-    cut off, and the rest carries the whole force.
+    has the mean of samples that are at most two rims apart, or their moment, of samples at most one rim
+    apart. The part of a disc beyond the edge of the body is cut off, and the rest carries the whole force.
 
     Args:
         body: what is touched; distances are those of its chart.
         rim: m, over which the pressure falls by about a quarter of its maximum.
+        smooth: whether loads are moments of the pressure (:mod:`skin.touch.splines`), as
+            ``AbstractSimulator.smooth`` says, instead of mean pressures of cells.
     """
 
-    def __init__(self, body: AbstractBody, rim: float) -> None:
-        self._shape, self._rim = body.shape, rim
-        self._area = math.prod(body.cell)
-        x, y = (_samples(count, cell, rim) for count, cell in zip(body.cells, body.cell, strict=True))
-        self._x, self._y = x, y
+    def __init__(self, body: AbstractBody, rim: float, smooth: bool = False) -> None:
+        self._rim, self._area = rim, math.prod(body.cell)
+        apart = rim if smooth else 2 * rim
+        samples = [max(1, math.ceil(cell / apart)) for cell in body.cell]
+        self._x, self._y = (
+            (torch.arange(count * number, dtype=torch.float64) + 0.5) * (cell / number)
+            for count, cell, number in zip(body.cells, body.cell, samples, strict=True)
+        )
+        self._shape = body.shape
+        self._splines: tuple[Tensor, ...] = ()
+        if smooth:
+            axes = zip((self._x, self._y), body.cells, body.cell, samples, strict=True)
+            self._splines = tuple(
+                torch.from_numpy(splines.spline_values(places.numpy() / cell, count) / number)
+                for places, count, cell, number in axes
+            )
 
     def __call__(self, touches: Tensor) -> Tensor:
-        """Return the pressure (B, H, W), Pa, of touches (B, 4) as in :data:`PARAMETERS`, in their dtype."""
+        """Return the loads (B, H, W), Pa, of touches (B, 4) as in :data:`PARAMETERS`, in their dtype."""
         x, y, radius, force = touches[:, :, None, None].unbind(1)
         across, down = self._x.to(touches) - x, self._y.to(touches)[:, None] - y
         # The root of 0 has no derivative; a micrometre changes nothing.
         distance = (across.square() + down.square() + 1e-12).sqrt()
         share = torch.sigmoid((radius - distance) / self._rim)
-        height, width = self._shape
-        cells = share.unflatten(1, (height, -1)).unflatten(3, (width, -1)).mean((2, 4))
+        if self._splines:
+            across, down = (values.to(touches) for values in self._splines)
+            cells = down.T @ (share @ across)
+        else:
+            height, width = self._shape
+            cells = share.unflatten(1, (height, -1)).unflatten(3, (width, -1)).mean((2, 4))
         return force * cells / (self._area * cells.sum((1, 2), keepdim=True))
 
 
-def _samples(count: int, cell: float, rim: float) -> Tensor:
-    """Return sample points along an axis, m: equally many in each cell."""
-    samples = max(1, math.ceil(cell / (2 * rim)))
-    return (torch.arange(count * samples, dtype=torch.float64) + 0.5) * (cell / samples)
+def fingertip_readings(
+    simulator: AbstractSimulator, body: AbstractBody, touches: Tensor, rim: float
+) -> Tensor:
+    """Return the readings (B, S), N, of discs with a soft rim (:class:`Fingertip`), differentiable in them.
+
+    Args:
+        simulator: of the body and S sensors; its dtype is that of the readings.
+        body: what is touched.
+        touches: (B, 4), as in :data:`PARAMETERS`.
+        rim: of the discs, m.
+    """
+    fingertip = Fingertip(body, rim, simulator.smooth)
+    return torch.cat([simulator.press(fingertip(part)).readings for part in touches.split(_AT_ONCE)])
 
 
 _RADIUS, _RIM = 0.008, 0.0015  # m, of the fingertip that probes a skin
+_AT_ONCE = 64  # touches
 _AROUND = 8  # places at each distance from a sensor
 _UNIFORM = 1000.0  # Pa
 
@@ -101,7 +129,6 @@ def _response(body: AbstractBody, sensors: Sensors, model: AbstractSimulator, re
     touches = torch.from_numpy(np.concatenate([places[owner, number].clip(0, body.size), constants], axis=1))
     rows = torch.arange(len(owner))
     index = torch.from_numpy(owner)
-    fingertip = Fingertip(body, _RIM)
-    felt = torch.cat([model(fingertip(part).float()).readings for part in touches.split(64)])
+    felt = fingertip_readings(model, body, touches, _RIM)
     total = torch.zeros(len(sensors)).index_add(0, index, felt[rows, index].float())
     return total / torch.bincount(index, minlength=len(sensors))

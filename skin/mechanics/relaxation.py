@@ -147,12 +147,25 @@ class Relaxing(AbstractSimulator):
         return self._relaxed.feels_shear
 
     @property
+    def smooth(self) -> bool:  # type: ignore[override]
+        """That of the elastic body."""
+        return self._relaxed.smooth
+
+    @property
     def _relaxed(self) -> AbstractSimulator:
         return self.models[0]  # type: ignore[return-value]
 
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
         """Return the steady-state response to pressure (..., H, W), Pa."""
         return self._relaxed(pressure, shear)
+
+    def loads(self, pressure: Tensor) -> Tensor:
+        """Return mean pressures of cells as loads of the elastic body."""
+        return self._relaxed.loads(pressure)
+
+    def press(self, loads: Tensor, shear: Tensor | None = None) -> Response:
+        """Return the steady-state response to loads (..., H, W), Pa."""
+        return self._relaxed.press(loads, shear)
 
     def motion(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the steady-state displacement of sensors, (..., S, 3), m."""
@@ -162,9 +175,13 @@ class Relaxing(AbstractSimulator):
         """Return the steady-state compliance, (H*W, H*W), m/Pa."""
         return self._relaxed.compliance()
 
-    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
+    def surface(self, loads: Tensor) -> Tensor | None:
+        """Return the steady-state displacement of the surface, (F, H + 1, W + 1), m."""
+        return self._relaxed.surface(loads)
+
+    def strain(self, loads: Tensor, shear: Tensor | None = None) -> Tensor | None:
         """Return the largest steady-state strain, (U,), an upper bound for all loads."""
-        return self._relaxed.strain(pressure, shear)
+        return self._relaxed.strain(loads, shear)
 
     def play(
         self,

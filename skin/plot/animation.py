@@ -41,6 +41,7 @@ _FASTEST, _LONGEST = 25.0, 100  # frames per second, frames
 _PIXELS = 48
 _COLOURS = 96
 _NAMED = 40  # sensors whose readings can be read as numbers beside them
+_SHOWN_LABELS = ("big", "dynamic", "press")
 _SHOWN = 0.15  # share of the strongest reading
 _HALO = (withStroke(linewidth=2, foreground="white"),)
 
@@ -208,13 +209,14 @@ def _between(scene: Scene) -> np.ndarray:
 
 @torch.no_grad()
 def simulate_scene(
-    device: AbstractSimulated, labels: Sequence[str], shape: str | None, seed: int, field: bool
+    device: AbstractSimulated, labels: Sequence[str] | None, shape: str | None, seed: int, field: bool
 ) -> Scene:
     """Draw a touch as a simulated device feels it.
 
     Args:
         device: whose skin, sensors and imperfections are shown.
-        labels: those of ``skin.touch.labels.TOUCH`` that hold; the others do not.
+        labels: those of ``skin.touch.labels.TOUCH`` that hold; the others do not. None: those of a press
+            that slides, of a big object where the touches are drawn to be big.
         shape: what presses, a name in ``data/shapes`` or the path of a picture; None: any of the device's.
         seed: of the touch.
         field: solve for the movement of the whole surface too (``skin.plot.plot3d.surface_motion``).
@@ -222,6 +224,8 @@ def simulate_scene(
     Raises:
         InputError: an unknown label, or a shape of which no such touch can be made.
     """
+    if labels is None:
+        labels = [name for name in _SHOWN_LABELS if name in device.sampler.chosen]
     if unknown := sorted(set(labels) - set(TOUCH.names)):
         raise InputError(f"no label {', '.join(unknown)}: labels may list {', '.join(TOUCH.names)}")
     if shape is not None:

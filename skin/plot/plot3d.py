@@ -133,23 +133,20 @@ def deflection(body: AbstractBody, pressure: Tensor, constraint: Constraint = "v
     return np.moveaxis(down.reshape(*structure.grid, len(pressure)), -1, 0)
 
 
-def surface_motion(model: AbstractSimulator, body: AbstractBody, pressure: Tensor) -> np.ndarray | None:
+def surface_motion(model: AbstractSimulator, body: AbstractBody, loads: Tensor) -> np.ndarray | None:
     """Return how far the surface moves into the skin, (F, ny + 1, nx + 1), m, or None where nobody knows.
 
-    By the simulator's own compliance if it has one, else by plates and beams if the body is flat.
+    By the simulator if it computes it, else by plates and beams if the body is flat.
 
     Args:
         model: the simulator.
         body: what is pressed.
-        pressure: (F, H, W), Pa; friction is left out.
+        loads: (F, H, W), of the simulator, Pa; friction is left out.
     """
-    try:
-        compliance = model.compliance()
-    except InputError:
-        return deflection(body, pressure)[:, -1] if body.flat else None
-    cells = (pressure.flatten(1).to(compliance) @ compliance).reshape(pressure.shape).numpy()
-    around = np.pad(cells, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    return (around[:, 1:, 1:] + around[:, :-1, 1:] + around[:, 1:, :-1] + around[:, :-1, :-1]) / 4
+    moved = model.surface(loads)
+    if moved is not None:
+        return moved.numpy()
+    return deflection(body, loads)[:, -1] if body.flat else None
 
 
 def draw_surface(

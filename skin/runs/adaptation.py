@@ -35,8 +35,8 @@ from skin.evaluation.metrics import compute_metrics
 from skin.evaluation.operating_point import OperatingPoint, choose_operating_point
 from skin.evaluation.report import evaluate, metrics_table
 from skin.evaluation.settings import check_evaluation
-from skin.learning.classifier import TouchClassifier, probabilities
 from skin.learning.data import TouchData
+from skin.learning.network import TouchClassifier, probabilities
 from skin.runs.build import build_data, build_device, build_learner
 from skin.runs.configuration import Config
 from skin.runs.finished_run import TAG, FinishedRun

@@ -82,7 +82,7 @@ def build_data(config: Config, device: AbstractDevice) -> "TouchData":
     augmentation = configured(Augmentation, config.data.augment, "data.augment")
     _check_options(config, "representation")
     representation = instantiate(config.representation)
-    geometry = partial(_geometry, config)
+    geometry = partial(_geometry, config) if device.configured else None
     return TouchData(device, representation, config.data.batch_size, config.seed, augmentation, geometry)
 
 

@@ -9,9 +9,10 @@ import platform
 import re
 import socket
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from keyword import iskeyword
 from math import isnan
 from pathlib import Path
 from typing import Any, cast
@@ -28,6 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 from skin import __version__
 from skin.core.files import BUNDLED, CONF, MANIFEST, ROOT, candidates
 from skin.core.messages import one_line
+from skin.core.settings import walk_settings
 from skin.errors import InputError
 from skin.evaluation.settings import Evaluation
 
@@ -41,7 +43,8 @@ _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing 
 
 def config_hash(content: dict[str, Any]) -> str:
     """Return the hash of a configuration in plain containers, 16 hexadecimal digits."""
-    files = {value: _hash_of(value) for value in _strings(content) if _file(value)}
+    texts = (value for _, value in walk_settings(content) if isinstance(value, str))
+    files = {text: _hash_of(text) for text in texts if _file(text)}
     text = json.dumps([_without_machine(content), files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -52,17 +55,6 @@ def _without_machine(value: Any, group: str = "") -> Any:
         return value
     left_out = MACHINE if group == "trainer" else ()
     return {key: _without_machine(entry, key) for key, entry in value.items() if key not in left_out}
-
-
-def _strings(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict):
-        for entry in value.values():
-            yield from _strings(entry)
-    elif isinstance(value, list):
-        for entry in value:
-            yield from _strings(entry)
 
 
 def _file(name: str) -> Path | None:
@@ -200,9 +192,15 @@ class Config:
     shape: str | None = None
     index: int | None = None
     session: str | None = None
+    from_: str | None = None  # a Python keyword: from= on the command line
+    path: str | None = None
     presses: str | None = None
+    weight: float | None = None
+    base: float | None = None
+    board: float | None = None
     calibrate: dict[str, Any] = field(default_factory=dict)
     port: str | None = None
+    adapter: dict[str, Any] = field(default_factory=dict)
     link: str | None = None
     seconds: float | None = None
     web: bool | None = None
@@ -264,13 +262,24 @@ def validate_config(config: Any) -> Config:
         InputError: a key or a value does not fit, or an interpolation cannot be resolved.
     """
     try:
-        whole = OmegaConf.merge(OmegaConf.structured(Config), config)
+        whole = OmegaConf.merge(OmegaConf.structured(Config), _without_keywords(config))
         # NaN would pass most comparisons, and numbers of more than 64 bits overflow in arrays.
-        for name, reason in _not_numbers(OmegaConf.to_container(whole)):
-            raise InputError(f"{name} is {reason}: give a number")
+        for path, value in walk_settings(OmegaConf.to_container(whole)):
+            unfit = isinstance(value, int) and abs(value) >= _TOO_LARGE
+            if unfit or (isinstance(value, float) and isnan(value)):
+                reason = "too large" if unfit else "nan"
+                raise InputError(f"{'.'.join(path)} is {reason}: give a number")
         return cast(Config, OmegaConf.to_object(whole))
     except OmegaConfBaseException as error:
         raise InputError(one_line(error)) from error
+
+
+def _without_keywords(config: Any) -> Any:
+    """Return a configuration whose keys are names in Python, as ``from_`` is for ``from``."""
+    if not isinstance(config, Mapping) or not any(iskeyword(str(name)) for name in config):
+        return config
+    plain: Any = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
+    return {f"{name}_" if iskeyword(str(name)) else name: value for name, value in plain.items()}
 
 
 def refuse_null_groups(config: DictConfig) -> None:
@@ -287,17 +296,6 @@ def refuse_null_groups(config: DictConfig) -> None:
             raise InputError(
                 f"{name}=null leaves nothing to use: give settings or an option, or leave it out"
             )
-
-
-def _not_numbers(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the names of settings that are NaN or too large, with what they are."""
-    if isinstance(value, float) and isnan(value):
-        yield name, "nan"
-    elif isinstance(value, int) and abs(value) >= _TOO_LARGE:
-        yield name, "too large"
-    elif isinstance(value, dict | list):
-        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _not_numbers(entry, f"{name}.{key}" if name else str(key))
 
 
 def settings_of(config: Config) -> dict[str, Any]:

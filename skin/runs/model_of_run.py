@@ -212,8 +212,14 @@ def alarm_point_for_touches(
 
 
 def _remaining(calibration: Calibration) -> dict[str, Any]:
-    """Return the imperfections that a calibrated device is left with: its gains are known to 2 %."""
-    values = calibration.values()
+    """Return the imperfections that a calibrated device is left with: its gains are known to 2 %.
+
+    Readings are linear after the conversion: the limit is that of the force, and the noise is that at the
+    reading at which the curves meet.
+    """
+    values, curves = calibration.values(), calibration.curves
+    if curves is not None:
+        values |= {"clip": curves.straighten(values["clip"]), "noise": values["noise"] / values["exponent"]}
     names = ("noise", "hysteresis", "time_constant")
     left = {name: float(np.median(values[name])) for name in names}
     clip = float(np.median(values["clip"]))
@@ -295,8 +301,7 @@ class RunModel(TrainedModel):
             )
         streams = self.device.reference.replace(stream=True, direction=False, tare=True, gestures=_MANY)
         touches = streams.touches("validation")
-        assert touches.labels is not None
-        return ContactThreshold.tuned(rise(touches), touches.labels[:, -1] > 0.5).least
+        return ContactThreshold.tuned(rise(touches), touches.known_labels[:, -1] > 0.5).least
 
     @property
     def longest(self) -> float:

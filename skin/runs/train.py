@@ -320,6 +320,7 @@ def log_report(store: Store, run: Run, report: Report, task: Task, values: dict[
         if point.warning():
             _log.warning("warning: %s", point.warning())
     store.client.set_tag(run.info.run_id, TAG, "null" if point is None else point.text())
+    store.client.set_tag(run.info.run_id, "split", report.split)
     defined = {name: value for name, value in report.metrics.items() if not math.isnan(value)}
     store.log_metrics(run, defined | values)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,11 @@
 """Gesture settings, random draws of shape, timing and path, and the frames sampled from them."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import ceil, inf
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -12,10 +13,14 @@ from annotated_types import Ge, Le, MinLen
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from skin.body.base import AbstractBody
 from skin.core.settings import RISING, check_settings, checked, configured
 from skin.errors import InputError
 from skin.touch.labels import Thresholds
 from skin.touch.shapes import Fit, Shapes, draw_bodies
+
+if TYPE_CHECKING:
+    from skin.touch.sampler import AbstractSampler, ContactModel
 
 Draws = dict[str, np.ndarray]
 """Named parameters of gestures, one entry each along the first axis."""
@@ -46,7 +51,7 @@ class GestureFrames(NamedTuple):
     slide: int
 
     @classmethod
-    def of(cls, settings: "GestureSettings") -> "GestureFrames":
+    def of(cls, settings: "TouchSettings") -> "GestureFrames":
         """Return ``round(seconds * rate)`` for every duration of the settings."""
         rate = settings.rate
 
@@ -65,7 +70,7 @@ class GestureFrames(NamedTuple):
             1 + max(1, ceil(settings.path * rate / settings.speed[1] - 1e-9)),
         )
 
-    def check(self, settings: "GestureSettings") -> None:
+    def check(self, settings: "TouchSettings") -> None:
         """Check that every duration has a frame, and taps and presses are on their sides of the threshold.
 
         Raises:
@@ -100,18 +105,17 @@ class GestureFrames(NamedTuple):
             )
 
 
-def _shown(settings: "GestureSettings", name: str) -> str:
+def _shown(settings: "TouchSettings", name: str) -> str:
     value = getattr(settings, name)
     return f"touch.{name}={list(value) if isinstance(value, tuple) else value} s"
 
 
-@checked("touch")
 @dataclass(frozen=True)
-class GestureSettings:
-    """Ranges of the gestures; ``conf/touch.yaml`` holds the same defaults and their units.
+class TouchSettings(ABC):
+    """Settings that all kinds of touches share: their times, their motion and their labels.
 
     Ranges are (least, most), drawn uniformly, both ends included. Durations are in s and speeds in m/s.
-    Gestures are drawn in frames of the model: a duration has ``round(seconds * rate)`` frames.
+    Touches are drawn in frames of the model: a duration has ``round(seconds * rate)`` frames.
 
     Attributes:
         over_sensors: a touch is dangerous if the mean pressure over the footprint of a sensor exceeds the
@@ -124,6 +128,63 @@ class GestureSettings:
 
     rate: PositiveFloat = 10.0
     window: PositiveFloat = 3.0
+    shapes: Annotated[tuple[str, ...], MinLen(1)] = ("disc",)
+    tap: _Above0 = (0.1, 0.3)
+    press: _Above0 = (0.4, 2.0)
+    speed: _From0 = (0.03, 0.20)
+    path: NonNegativeFloat = 0.010
+    spare: NonNegativeFloat = 0.010
+    ramp: Annotated[int, Ge(2)] = 3
+    shear: NonNegativeFloat = 0.0
+    redraws: PositiveInt = 30
+    over_sensors: bool = True
+    gap: _Above0 = (1.0, 6.0)
+    stride: _Above0 = (1.5, 4.5)
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    @cached_property
+    def frames(self) -> GestureFrames:
+        """The durations in frames of the model, and the speeds per frame."""
+        return GestureFrames.of(self)
+
+    def __post_init__(self) -> None:
+        self.frames.check(self)
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any] | Self | None) -> Self:
+        """Return the settings of a configuration; missing ones keep their default."""
+        if isinstance(settings, cls):
+            return settings
+        if settings is not None and not isinstance(settings, Mapping):
+            raise InputError(f"touch must be settings by name, got {settings!r}")
+        values = dict(settings or {})
+        limits = values.pop("thresholds", {})
+        if not isinstance(limits, Thresholds):
+            limits = configured(Thresholds, limits, "touch.thresholds")
+        values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        return configured(cls, values | {"thresholds": limits}, "touch")
+
+    @abstractmethod
+    def sampler(
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: "ContactModel",
+        padded: bool,
+        moments: np.ndarray | None,
+    ) -> "AbstractSampler":
+        """Return what draws such touches; the arguments are those of the sampler."""
+
+
+@checked("touch")
+@dataclass(frozen=True)
+class GestureSettings(TouchSettings):
+    """Ranges of the report's gestures; ``conf/touch/gestures.yaml`` holds the same defaults and their units.
+
+    Raises:
+        InputError: as :class:`TouchSettings`.
+    """
+
     shapes: Annotated[tuple[str, ...], MinLen(1)] = (
         "disc",
         "blurred_disc",
@@ -135,42 +196,11 @@ class GestureSettings:
     )
     small_area: _From0 = (0.01, 0.30)
     big_area: _From0 = (0.30, 0.70)
-    tap: _Above0 = (0.1, 0.3)
-    press: _Above0 = (0.4, 2.0)
     safe_peak: _Above0 = (10e3, 90.5e3)
     dangerous_peak: _Above0 = (90.5e3, 180e3)
-    speed: _From0 = (0.03, 0.20)
-    path: NonNegativeFloat = 0.010
-    spare: NonNegativeFloat = 0.010
-    ramp: Annotated[int, Ge(2)] = 3
-    shear: NonNegativeFloat = 0.0
-    redraws: PositiveInt = 30
     stretch: Annotated[float, Ge(1)] = 4.0
     leak: Annotated[float, Ge(0.5), Le(1)] = 0.6
     strict: bool = False
-    over_sensors: bool = True
-    gap: _Above0 = (1.0, 6.0)
-    stride: _Above0 = (1.5, 4.5)
-    thresholds: Thresholds = field(default_factory=Thresholds)
-
-    @classmethod
-    def of(cls, settings: "Mapping[str, Any] | GestureSettings | None") -> "GestureSettings":
-        """Return the settings of a configuration; missing ones keep their default."""
-        if isinstance(settings, GestureSettings):
-            return settings
-        if settings is not None and not isinstance(settings, Mapping):
-            raise InputError(f"touch must be settings by name, got {settings!r}")
-        values = dict(settings or {})
-        limits = values.pop("thresholds", {})
-        if not isinstance(limits, Thresholds):
-            limits = configured(Thresholds, limits, "touch.thresholds")
-        values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        return configured(cls, values | {"thresholds": limits}, "touch")
-
-    @cached_property
-    def frames(self) -> GestureFrames:
-        """The durations in frames of the model, and the speeds per frame."""
-        return GestureFrames.of(self)
 
     def __post_init__(self) -> None:
         lines = self.thresholds
@@ -187,21 +217,34 @@ class GestureSettings:
                     f"touch.{name}={list(limits)} must lie between {low:g} and {high:g}: "
                     "touch.thresholds decides"
                 )
-        self.frames.check(self)
+        super().__post_init__()
+
+    def sampler(
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: "ContactModel",
+        padded: bool,
+        moments: np.ndarray | None,
+    ) -> "AbstractSampler":
+        """Return what draws gestures."""
+        from skin.touch.sampler import TouchSampler
+
+        return TouchSampler(body, footprints, contact, self, padded, moments)
 
 
-def model_window(touch: Mapping[str, Any] | GestureSettings | None) -> tuple[int, float]:
+def model_window(touch: Mapping[str, Any] | TouchSettings | None) -> tuple[int, float]:
     """Return the frames of the model's window, and its rate, Hz.
 
     Only these settings are checked: a real skin draws no gestures.
 
     Args:
-        touch: as :meth:`GestureSettings.of` takes it.
+        touch: as :func:`skin.touch.fingertips.read_touch` takes it.
 
     Raises:
         InputError: a window or a rate that cannot be used.
     """
-    if isinstance(touch, GestureSettings):
+    if isinstance(touch, TouchSettings):
         return touch.frames.window, float(touch.rate)
     settings = {name: value for name, value in (touch or {}).items() if name in ("window", "rate")}
     check_settings(GestureSettings, settings, "touch")
@@ -239,15 +282,22 @@ def draw_gestures(
     Returns:
         The result of :func:`skin.touch.shapes.draw_bodies`, and duration and onset (frames).
     """
-    dynamic, press = labels[:, 1], labels[:, 2]
     drawn = draw_bodies(labels[:, 0], settings, shapes, generator, fit, kept)
+    return drawn | draw_times(labels, settings, padded, generator)
+
+
+def draw_times(
+    labels: np.ndarray, settings: TouchSettings, padded: bool, generator: np.random.Generator
+) -> Draws:
+    """Return duration and onset (frames) of touches with labels (B, 4), bool; see :func:`draw_gestures`."""
+    dynamic, press = labels[:, 1], labels[:, 2]
     frames = settings.frames
     least, most = np.where(press[:, None], frames.press, frames.tap).T
     least = np.where(dynamic, np.maximum(least, frames.slide), least)
     chance = generator.random((len(labels), 2))
     duration = least + (chance[:, 0] * (most - least + 1)).astype(int)
     free = frames.window - duration if padded else np.zeros_like(duration)
-    return drawn | {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
+    return {"duration": duration, "onset": (chance[:, 1] * (free + 1)).astype(int)}
 
 
 def draw_paths(
@@ -257,10 +307,7 @@ def draw_paths(
     size: tuple[float, float],
     chance: np.ndarray,
 ) -> Draws:
-    """Draw start, direction, speed and peak pressure of gestures.
-
-    A sliding touch moves along a straight line at constant speed and is reflected at the limits of its span,
-    so that neither its duration nor its speed depends on its size.
+    """Draw the path and the peak pressure of gestures.
 
     Args:
         labels: (B, 4), bool, the wanted combinations.
@@ -270,20 +317,44 @@ def draw_paths(
         chance: (B, 5), 0 to 1.
 
     Returns:
-        start (B, 2) within the span (m), span (B, 2) (m), direction (rad), speed (m per frame), peak (Pa).
+        The result of :func:`draw_motion`, and peak (Pa).
     """
-    dynamic, dangerous = labels[:, 1], labels[:, 3]
+    least, most = np.where(labels[:, 3:], settings.dangerous_peak, settings.safe_peak).T
+    motion = draw_motion(labels[:, 1], gestures, settings, size, chance[:, :4])
+    return motion | {"peak": least + (most - least) * chance[:, 4]}
+
+
+def draw_motion(
+    dynamic: np.ndarray,
+    gestures: Draws,
+    settings: TouchSettings,
+    size: tuple[float, float],
+    chance: np.ndarray,
+) -> Draws:
+    """Draw start, direction and speed of touches.
+
+    A sliding touch moves along a straight line at constant speed and is reflected at the limits of its span,
+    so that neither its duration nor its speed depends on its size.
+
+    Args:
+        dynamic: (B,), bool, those that slide.
+        gestures: low and high (B, 2), m, of what moves around its place, and duration (B,), frames.
+        settings: ranges of the touches.
+        size: extent (x, y) of the sheet, m.
+        chance: (B, 4), 0 to 1.
+
+    Returns:
+        start (B, 2) within the span (m), span (B, 2) (m), direction (rad), speed (m per frame).
+    """
     span = size - (gestures["high"] - gestures["low"])
     least_speed, most_speed = settings.frames.speed
     slowest = np.maximum(least_speed, settings.path / np.maximum(gestures["duration"] - 1, 1))
     speed = slowest + (most_speed - slowest) * chance[:, 3]
-    least, most = np.where(dangerous[:, None], settings.dangerous_peak, settings.safe_peak).T
     return {
         "start": chance[:, :2] * span,
         "span": span,
         "direction": np.where(dynamic, 2 * np.pi * chance[:, 2], 0.0),
         "speed": np.where(dynamic, speed, 0.0),
-        "peak": least + (most - least) * chance[:, 4],
     }
 
 
@@ -364,7 +435,7 @@ class SampledPaths(NamedTuple):
 
 
 def sample_paths(
-    gestures: Draws, wanted: np.ndarray, settings: GestureSettings, proportional: bool
+    gestures: Draws, wanted: np.ndarray, settings: TouchSettings, proportional: bool
 ) -> SampledPaths:
     """Return the distinct frames of gestures.
 

@@ -55,7 +55,10 @@ class Task:
         return tuple(name for name in self.binary if name != self.gate)
 
     def counts(self, labels: "Tensor") -> "Tensor":
-        """Return the mask of the labels (B, L) that are defined, bool, by gate and direction."""
+        """Return the mask of the labels (B, L) that are known and defined by gate and direction, bool.
+
+        Unknown labels are NaN.
+        """
         counts = labels.new_ones(labels.shape).bool()
         if self.gate is not None:
             gate = self.names.index(self.gate)
@@ -63,7 +66,7 @@ class Task:
             counts[:, gate] = True
         if self.direction:
             counts[:, -2:] &= (labels[:, -2:] != 0).any(dim=1, keepdim=True)
-        return counts
+        return counts & ~labels.isnan()
 
     def shares(self, labels: "Tensor") -> "Tensor":
         """Return labels (B, L) as what a probability should be on average, 0 to 1: cosines c as (1 + c) / 2.

@@ -53,6 +53,7 @@ def measure_gestures(
     footprints: Tensor,
     cell: tuple[float, float],
     contact: float = Thresholds.contact,
+    area: Tensor | None = None,
 ) -> Measures:
     """Measure gestures given as distinct frames, each processed once.
 
@@ -63,8 +64,8 @@ def measure_gestures(
         footprints: (S, H * W), area weights of each sensor that sum to 1.
         cell: extent (x, y) of a cell, m.
         contact: share of the gesture's peak cell above which a cell is in contact.
+        area: (U,), share of the sheet in contact in each frame; None: cells are counted.
     """
-    count, height, width = frames.shape
     flat = frames.flatten(1)
     highest = flat.amax(1)
     peak = (highest[index] * scale).amax(1)
@@ -73,20 +74,30 @@ def measure_gestures(
     sensors, centre = _means(frames, footprints, cell)
     pressure = (sensors.amax(1)[index] * scale).amax(1)
 
-    # The lowest pressure that counts as contact, where a frame is shown at its strongest.
-    level = torch.full((count,), torch.inf).to(frames)
-    lowest = contact * peak[:, None] / scale
-    level.scatter_reduce_(0, index.flatten(), lowest.flatten(), "amin")
-    # In parts that stay in the cache: the comparison of all cells at once would be as large as the movie.
-    parts = zip(flat.split(_PART), level[:, None].split(_PART), strict=True)
-    cells = torch.cat([(part > limit).sum(1) for part, limit in parts])
-    area = cells[index].where(touched, 0).amax(1) / (height * width)
+    shares = _areas(flat, index, contact * peak[:, None] / scale) if area is None else area
+    area = shares[index].where(touched, 0).amax(1)
 
     first = touched.int().argmax(1)
     places = centre[index]
     distance = torch.linalg.vector_norm(places - places[torch.arange(len(places)), first][:, None], dim=-1)
     travel = distance.where(touched, 0).amax(1)
     return Measures(area, travel, longest_run(touched), pressure)
+
+
+def _areas(flat: Tensor, index: Tensor, lowest: Tensor) -> Tensor:
+    """Return the share of cells of frames (U, H * W) in contact, (U,).
+
+    Args:
+        flat: Pa.
+        index: (B, T), the frame at each time.
+        lowest: (B, T), the lowest pressure of a frame that counts as contact, Pa.
+    """
+    # That where a frame is shown at its strongest.
+    level = torch.full((len(flat),), torch.inf).to(flat)
+    level.scatter_reduce_(0, index.flatten(), lowest.flatten(), "amin")
+    # In parts that stay in the cache: the comparison of all cells at once would be as large as the movie.
+    parts = zip(flat.split(_PART), level[:, None].split(_PART), strict=True)
+    return torch.cat([(part > limit).sum(1) for part, limit in parts]) / flat.shape[1]
 
 
 def _means(frames: Tensor, footprints: Tensor, cell: tuple[float, float]) -> tuple[Tensor, Tensor]:
@@ -153,7 +164,8 @@ class Movie:
     """Pressure movies of a batch of gestures; a static touch is one frame with a time profile.
 
     Attributes:
-        frames: (U, H, W), Pa, the distinct frames at full force.
+        frames: (U, H, W), Pa, the distinct frames at full force, as loads of the simulator: mean pressures of
+            cells, or moments of the pressure (:mod:`skin.touch.splines`).
         index: (B, T), the frame at each time.
         scale: (B, T), its share of full force; 0 without contact.
         labels: (B, 4), 0 or 1, float32, in the order of ``skin.touch.labels.TOUCH``.
@@ -166,6 +178,8 @@ class Movie:
             unconverged (frames of all its draws that were not found).
         shear: (U, 2), tangential traction along x and y of each frame divided by its pressure: the
             coefficient of friction times the direction of motion, 0 for static touches; None: no friction.
+        contacts: (B, T, K, 5), of fingertips: x, y, radius (m), force (N) and peak pressure (Pa) of each at
+            each time, NaN where there is none; None: unknown.
     """
 
     frames: Tensor
@@ -174,6 +188,7 @@ class Movie:
     labels: Tensor
     parameters: dict[str, Tensor]
     shear: Tensor | None = None
+    contacts: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -190,6 +205,7 @@ class Movie:
             self.labels[rows],
             {name: values[rows] for name, values in self.parameters.items()},
             None if self.shear is None else self.shear[used],
+            None if self.contacts is None else self.contacts[rows],
         )
 
     @property
@@ -213,6 +229,7 @@ def join_movies(movies: Sequence[Movie]) -> Movie:
     """Return one movie of all gestures of ``movies``, in order."""
     starts = np.cumsum([0, *(len(movie.frames) for movie in movies)])
     shears = [movie.shear for movie in movies if movie.shear is not None]
+    contacts = [movie.contacts for movie in movies if movie.contacts is not None]
     return Movie(
         torch.cat([movie.frames for movie in movies]),
         torch.cat([movie.index + int(start) for movie, start in zip(movies, starts, strict=False)]),
@@ -220,4 +237,5 @@ def join_movies(movies: Sequence[Movie]) -> Movie:
         torch.cat([movie.labels for movie in movies]),
         {name: torch.cat([movie.parameters[name] for movie in movies]) for name in movies[0].parameters},
         torch.cat(shears) if shears else None,
+        torch.cat(contacts) if contacts else None,
     )

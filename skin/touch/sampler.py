@@ -1,10 +1,11 @@
 """Random gestures with given labels: draws, their contact, and the movies of those that have the labels."""
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, final
 
 import numpy as np
 import torch
@@ -12,9 +13,12 @@ from torch import Tensor
 
 from skin.body.base import AbstractBody
 from skin.errors import InputError
+from skin.touch import splines
 from skin.touch.gesture import (
     Draws,
     GestureSettings,
+    SampledPaths,
+    TouchSettings,
     Trajectories,
     draw_gestures,
     draw_paths,
@@ -22,7 +26,7 @@ from skin.touch.gesture import (
     sample_paths,
 )
 from skin.touch.labels import TOUCH
-from skin.touch.movie import Movie, join_movies, measure_gestures
+from skin.touch.movie import Measures, Movie, join_movies, measure_gestures
 from skin.touch.shapes import Fit, Shapes
 
 _ATTEMPTS = 50
@@ -59,6 +63,8 @@ class ContactResult(NamedTuple):
             the contact did not converge.
         hopeless: (B,), bool, the refused gestures for which no other path can succeed.
         unconverged: (B,), number of frames that did not converge to the tolerance; None where all are exact.
+        area: (U,), share of the sheet in contact, where the frames are moments of the pressure
+            (:mod:`skin.touch.splines`); None: frames are mean pressures of cells.
     """
 
     frames: Tensor
@@ -67,6 +73,7 @@ class ContactResult(NamedTuple):
     refused: np.ndarray
     hopeless: np.ndarray
     unconverged: np.ndarray | None = None
+    area: np.ndarray | None = None
 
 
 class ContactModel(Protocol):
@@ -86,6 +93,29 @@ def balanced(count: int, generator: np.random.Generator) -> np.ndarray:
     """Return label combinations (count, 4), bool: all 16 equally often, to within one, in random order."""
     order = generator.permutation(16)[np.arange(count) % 16]
     return (generator.permutation(order)[:, None] >> np.arange(4) & 1).astype(bool)
+
+
+def describe_touches(
+    drawn: Draws, paths: SampledPaths, values: tuple[np.ndarray, np.ndarray, np.ndarray], measures: Measures
+) -> dict[str, Tensor]:
+    """Return the parameters of a movie, (B,) each.
+
+    Args:
+        drawn: of the touches, (B, ...).
+        paths: of the touches.
+        values: (B,) each, peak (Pa), force (N) and number of paths drawn.
+        measures: of the movie.
+    """
+    begin = paths.trajectories.place[paths.first]
+    named = dict(zip(_FOUND, (*values, *paths.net.T, *begin.T), strict=True))
+    parameters = {name: drawn[name] for name in _DRAWN} | named
+    floats = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
+    return floats | {name: value.float() for name, value in measures._asdict().items()}
+
+
+def steer(paths: SampledPaths, shear: float) -> Tensor | None:
+    """Return the tangential traction by pressure of each frame, (U, 2); None without friction."""
+    return torch.from_numpy(shear * heading(paths.place, paths.first)).float() if shear else None
 
 
 @dataclass(frozen=True)
@@ -119,47 +149,56 @@ class _Tally:
             )
 
 
-class TouchSampler:
-    """Draws gestures with wanted labels and renders their movies.
-
-    Labels are computed from the movie (docs/adr/0005 for rigid objects that slide). Where they differ from
-    the wanted ones, the path is drawn again (start, direction, speed, peak), up to ``redraws`` times, and
-    then the whole gesture.
+class AbstractSampler(ABC):
+    """Draws touches of a kind and renders their movies.
 
     Args:
         body: the sheet.
         footprints: (S, H * W), area weights of each sensor that sum to 1 (``AbstractBody.footprints``).
-        contact: computes the pressure of gestures.
-        settings: ranges of the gestures, as in ``conf/touch.yaml``.
-        padded: whether gestures begin at a random frame of the window instead of its first.
+        contact: computes the pressure of touches.
+        settings: of the touches.
+        padded: whether touches begin at a random frame of the window instead of its first.
+        moments: (S, H * W), weights of moments of the pressure in place of ``footprints``
+            (:func:`skin.touch.splines.footprints`). The frames of movies are then moments. None: they are
+            mean pressures of cells.
+
+    Attributes:
+        chosen: the labels that touches can be drawn for, names of ``TOUCH``; the others are what they are.
+        leak, strict: see :func:`skin.device.balance.check_label_leakage`.
 
     Raises:
         InputError: settings or pictures that cannot be used.
     """
+
+    chosen: tuple[str, ...] = TOUCH.names
+    leak: float = 1.0
+    strict: bool = False
 
     def __init__(
         self,
         body: AbstractBody,
         footprints: np.ndarray,
         contact: ContactModel,
-        settings: Mapping[str, Any] | GestureSettings | None = None,
+        settings: TouchSettings,
         padded: bool = True,
+        moments: np.ndarray | None = None,
     ) -> None:
-        self.body = body
-        self.settings = GestureSettings.of(settings)
-        self.padded = padded
+        self.body, self.contact, self.padded = body, contact, padded
+        self.settings = settings
         self.footprints = torch.as_tensor(footprints, dtype=torch.float32)
-        self.shapes = Shapes(self.settings.shapes, body, self.settings.thresholds.contact)
-        self.contact = contact
+        self.moments = None if moments is None else torch.as_tensor(moments, dtype=torch.float32)
+        self.shapes = Shapes(settings.shapes, body, settings.thresholds.contact, moments is not None)
 
-    @cached_property
-    def fit(self) -> Fit | None:
-        """The fit of shapes to the sheet; None where shapes are redrawn until they fit."""
-        return Fit.of(self.settings, self.shapes)
+    @abstractmethod
+    def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Return label combinations (count, 4), bool, for :meth:`sample`: those that can be drawn, balanced.
 
-    @torch.no_grad()
+        They are equally frequent, to within one, in random order.
+        """
+
+    @abstractmethod
     def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
-        """Return the movies of ``count`` gestures.
+        """Return the movies of ``count`` touches.
 
         Args:
             count: B.
@@ -169,6 +208,50 @@ class TouchSampler:
         Raises:
             InputError: a combination of labels that does not occur on this sheet with these settings.
         """
+
+
+@final
+class TouchSampler(AbstractSampler):
+    """Draws gestures with wanted labels and renders their movies.
+
+    Labels are computed from the movie (docs/adr/0005 for rigid objects that slide). Where they differ from
+    the wanted ones, the path is drawn again (start, direction, speed, peak), up to ``redraws`` times, and
+    then the whole gesture.
+
+    Args:
+        body, footprints, contact, padded: as of :class:`AbstractSampler`.
+        settings: ranges of the gestures, as in ``conf/touch/gestures.yaml``.
+
+    Raises:
+        InputError: settings or pictures that cannot be used.
+    """
+
+    settings: GestureSettings
+
+    def __init__(
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: ContactModel,
+        settings: Mapping[str, Any] | GestureSettings | None = None,
+        padded: bool = True,
+        moments: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(body, footprints, contact, GestureSettings.of(settings), padded, moments)
+        self.leak, self.strict = self.settings.leak, self.settings.strict
+
+    @cached_property
+    def fit(self) -> Fit | None:
+        """The fit of shapes to the sheet; None where shapes are redrawn until they fit."""
+        return Fit.of(self.settings, self.shapes)
+
+    def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Return label combinations (count, 4), bool: all 16 equally often."""
+        return balanced(count, generator)
+
+    @torch.no_grad()
+    def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
+        """Return the movies of ``count`` gestures; see :meth:`AbstractSampler.sample`."""
         targets = balanced(count, generator) if labels is None else labels
         redraws = self.settings.redraws
         pending = np.arange(count)
@@ -249,21 +332,23 @@ class TouchSampler:
             paths.trajectories, ContactProblem(self.shapes, self.footprints, settings)
         )
         index, shares = paths.trajectories.index, paths.trajectories.profile
+        area = None if pressed.area is None else torch.from_numpy(pressed.area).float()
+        weights = self.footprints if area is None or self.moments is None else self.moments
         measures = measure_gestures(
-            pressed.frames, index, shares, self.footprints, self.body.cell, settings.thresholds.contact
+            pressed.frames, index, shares, weights, self.body.cell, settings.thresholds.contact, area
         )
+        frames = pressed.frames
+        if self.moments is not None and area is None:
+            down, across = (torch.from_numpy(splines.of_cells(count)).float() for count in self.body.shape)
+            frames = down @ frames @ across.T
         if not self.contact.proportional:
             # The contact area grows with force, which moves the centre of pressure of a static touch.
             measures = measures._replace(travel=torch.from_numpy(paths.travel))
-        begin = paths.trajectories.place[paths.first]
-        values = pressed.peak, pressed.force, gestures["draws"], *paths.net.T, *begin.T
-        parameters = {name: gestures[name] for name in _DRAWN} | dict(zip(_FOUND, values, strict=True))
-        drawn = {name: torch.from_numpy(value).float() for name, value in parameters.items()}
-        drawn |= {name: value.float() for name, value in measures._asdict().items()}
-        pull = settings.shear * heading(paths.place, paths.first) if settings.shear else None
-        shear = None if pull is None else torch.from_numpy(pull).float()
+        values = pressed.peak, pressed.force, gestures["draws"]
+        drawn = describe_touches(gestures, paths, values, measures)
+        shear = steer(paths, settings.shear)
         labels = measures.labels(settings.thresholds, settings.rate)
-        return Movie(pressed.frames, index, shares, labels, drawn, shear), pressed
+        return Movie(frames, index, shares, labels, drawn, shear), pressed
 
     def _explain_impossible(self, labels: np.ndarray) -> InputError:
         names = (name if on else f"not {name}" for name, on in zip(TOUCH.names, labels, strict=True))

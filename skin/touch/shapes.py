@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from skin.body.base import AbstractBody, Sheet
 from skin.errors import InputError
+from skin.touch import splines
 from skin.touch.images import hulls, load_image, pyramid
 
 if TYPE_CHECKING:
@@ -25,6 +28,12 @@ _CELLS_AT_ONCE = 128 * 1024
 _POINTS = 4
 _LARGE = 2
 _CALIBRATION_SIZES, _CALIBRATION_POSES = 24, 6
+# A fine picture of a shape has as many samples along a cell, and at most so many along its box.
+_SAMPLES, _BOX = (2, 8), 48
+_FRAMES = 128  # whose moments are computed at once
+# The area of fine pictures is that of cells so many times as short.
+_FINER = 4
+_FINE_SIZES, _FINE_POSES = 12, 2
 _TRIES = 2000
 _PROBES = 500
 _RARE = 0.01
@@ -47,6 +56,38 @@ class Solids(NamedTuple):
     rim: Tensor
 
 
+class Pressed(NamedTuple):
+    """What shapes press.
+
+    Attributes:
+        moments: (F, H, W), float32, of the pressure with the splines of the cells, of sum 1.
+        peak: (F,), float32, highest pressure, as a share of the force by the area of a cell.
+        area: (F,), share of the sheet in contact.
+    """
+
+    moments: Tensor
+    peak: Tensor
+    area: np.ndarray
+
+
+class _Drawn(NamedTuple):
+    """Shapes as :meth:`Shapes.render` takes them."""
+
+    shape: np.ndarray
+    angle: np.ndarray
+    scale: np.ndarray
+    place: np.ndarray
+    stretch: np.ndarray | None
+
+    def rows(self, rows: np.ndarray) -> _Drawn:
+        """Return some of the shapes."""
+        stretch = None if self.stretch is None else self.stretch[rows]
+        return _Drawn(self.shape[rows], self.angle[rows], self.scale[rows], self.place[rows], stretch)
+
+
+_FINE_AREAS: dict[tuple[Any, ...], tuple[np.ndarray, np.ndarray]] = {}  # of the shapes used so far
+
+
 class Shapes:
     """Grey-scale images that can be pressed on a sheet at any place, angle and size.
 
@@ -57,6 +98,8 @@ class Shapes:
         names: stems in ``data/shapes`` or paths of pictures.
         body: the sheet.
         contact: share of a gesture's peak cell above which a cell is in contact.
+        fine: whether areas are those of a fine picture, which hardly depend on the cells, for shapes that
+            are on the sheet as a whole (:meth:`press`).
 
     Attributes:
         names: one per shape.
@@ -66,15 +109,17 @@ class Shapes:
         InputError: no shape, or a picture that cannot be used (:func:`skin.touch.images.load_image`).
     """
 
-    def __init__(self, names: Sequence[str], body: AbstractBody, contact: float = 0.02) -> None:
+    def __init__(
+        self, names: Sequence[str], body: AbstractBody, contact: float = 0.02, fine: bool = False
+    ) -> None:
         self.names = tuple(names)
         self.body: AbstractBody = body
-        self.contact = contact
+        self.contact, self.fine = contact, fine
         # Cells are sampled at _POINTS = 2 x 2 points, a spacing apart.
         self.spacing = float(np.sqrt(np.prod(body.cell))) / 2
-        finest = max(64, max(body.size) / self.spacing)
+        finest = max(64, max(body.size) / self.spacing) * (2 if fine else 1)
         self.levels = pyramid([load_image(name) for name in names], 2 ** int(np.ceil(np.log2(finest))))
-        self.hulls = hulls(self.levels[0][:, 0].numpy(), contact)
+        self.hulls, self._outlines = (hulls(self.levels[0][:, 0].numpy(), edge) for edge in (contact, 0.0))
 
     def extent(
         self, shape: np.ndarray, angle: np.ndarray, scale: np.ndarray, stretch: np.ndarray | None = None
@@ -103,6 +148,8 @@ class Shapes:
 
     def whole_scale(self, shape: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the scale (B,), m, at which whole shapes cover as much as a share of the sheet."""
+        if self.fine:
+            return self.scale(shape, area)
         large = self._large
         return large.scale(shape, area * (np.prod(self.body.cells) / np.prod(large.body.cells)))
 
@@ -125,10 +172,10 @@ class Shapes:
         Cells at the rim count as whole although the shape covers them in part. The area of a shape of a given
         size therefore depends on the mesh, and is computed once. Its root is nearly linear in the scale.
         """
+        if self.fine:
+            return self._fine_calibration()
         poses = np.random.default_rng(0).random((_CALIBRATION_POSES, 3))
-        width = np.ptp(self.hulls, axis=1).min(axis=1)
-        largest = 1.5 * max(self.body.size) / width
-        scales = largest[:, None] * np.geomspace(1 / 128, 1, _CALIBRATION_SIZES)
+        scales = self._sizes(_CALIBRATION_SIZES)
         angle = np.tile(2 * np.pi * poses[:, 0], _CALIBRATION_SIZES)
         places = np.array(self.body.size) / 2 + (poses[:, 1:] - 0.5) * self.body.cell
         places = np.tile(places, (_CALIBRATION_SIZES, 1))
@@ -140,6 +187,144 @@ class Shapes:
             means = share.view(_CALIBRATION_SIZES, _CALIBRATION_POSES).mean(1).numpy()
             roots.append(np.sqrt(np.maximum.accumulate(means)))
         return scales, np.stack(roots)
+
+    def _sizes(self, count: int) -> np.ndarray:
+        """Return scales (N, count), m, from a small part of the sheet to more than the whole."""
+        width = np.ptp(self.hulls, axis=1).min(axis=1)
+        largest = 1.5 * max(self.body.size) / width
+        return largest[:, None] * np.geomspace(1 / 128, 1, count)
+
+    def _fine_calibration(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same for fine pictures, of cells _FINER times as short, of whole shapes."""
+        images = hashlib.sha256(self.levels[0].numpy().tobytes()).hexdigest()
+        key = images, self.body.size, self.body.cells, self.contact
+        if key in _FINE_AREAS:
+            return _FINE_AREAS[key]
+        poses = np.random.default_rng(0).random((_FINE_POSES, 3))
+        scales, samples = self._sizes(_FINE_SIZES), 2 * _FINER
+        number = np.repeat(np.arange(len(scales)), _FINE_SIZES * _FINE_POSES)
+        angle, *offset = np.tile(poses, (scales.size, 1)).T
+        place = np.stack(offset, axis=1) * self.body.cell
+        drawn = _Drawn(number, 2 * np.pi * angle, np.repeat(scales.ravel(), _FINE_POSES), place, None)
+        share = np.empty(len(number))
+        for part, _, _, pictures in self._pictures(drawn, samples):
+            pixels = avg_pool2d(pictures, 2).flatten(1)
+            touched = (pixels > self.contact * pixels.amax(1, keepdim=True)).sum(1)
+            share[part] = touched.double().numpy() / (_FINER**2 * math.prod(self.body.cells))
+        means = share.reshape(len(scales), _FINE_SIZES, _FINE_POSES).mean(2)
+        _FINE_AREAS[key] = scales, np.sqrt(np.maximum.accumulate(means, axis=1))
+        return _FINE_AREAS[key]
+
+    def press(
+        self,
+        shape: np.ndarray,
+        angle: np.ndarray,
+        scale: np.ndarray,
+        place: np.ndarray,
+        stretch: np.ndarray | None = None,
+    ) -> Pressed:
+        """Return what shapes press, as :meth:`render` takes them, from pictures of the boxes they cover."""
+        drawn = _Drawn(shape, angle, scale, place, stretch)
+        # Adjacent frames that differ in their place alone, as those of a path, share a picture.
+        same = [np.diff(values) == 0 for values in drawn if values is not None and values.ndim == 1]
+        first = np.flatnonzero(np.append(True, ~np.logical_and.reduce(same)))
+        last = np.append(first[1:], len(shape))
+        moments, peak = torch.empty(len(shape), *self.body.shape), torch.empty(len(shape))
+        for part, corner, count, pictures in self._pictures(drawn.rows(first)):
+            frames = np.concatenate([np.arange(first[row], last[row]) for row in part])
+            number = np.repeat(np.arange(len(part)), (last - first)[part])
+            at = place[frames] / self.body.cell + corner[number]
+            highest = pictures.amax((1, 2))
+            for rows in np.split(np.arange(len(frames)), np.arange(_FRAMES, len(frames), _FRAMES)):
+                chosen = torch.from_numpy(number[rows])
+                pressed = self._moments(pictures[chosen], at[rows], count)
+                total = pressed.sum((1, 2))
+                moments[frames[rows]] = pressed.div_(total[:, None, None])
+                peak[frames[rows]] = highest[chosen] / total
+        return Pressed(moments, peak, self.area(shape, scale))
+
+    def _box(self, drawn: _Drawn) -> tuple[np.ndarray, np.ndarray]:
+        """Return the upper left corners of boxes from their places, and their extents, (F, 2), in cells."""
+        cos, sin = np.cos(drawn.angle)[:, None], np.sin(drawn.angle)[:, None]
+        x, y = self._outlines[drawn.shape].transpose(2, 0, 1)
+        corners = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        corners *= self._visible(drawn.scale, drawn.stretch)[:, None, None]
+        if drawn.stretch is not None:
+            wide = np.sqrt(drawn.stretch)
+            corners *= np.stack([wide, 1 / wide], axis=-1)[:, None]
+        low, high = (side / self.body.cell for side in (corners.min(axis=1), corners.max(axis=1)))
+        return low, np.maximum(np.ceil(high - low), 1).astype(int)
+
+    def _pictures(
+        self, drawn: _Drawn, samples: int | None = None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, int, Tensor]]:
+        """Yield pictures of shapes that are sampled alike: their rows, corners, samples and values.
+
+        Args:
+            drawn: the shapes.
+            samples: along each side of a cell; None: as many as the size of a shape asks for.
+
+        Yields:
+            rows (f,); upper left corner of each picture from its place, in cells, (f, 2); samples along a
+            cell; (f, y, x), float32.
+        """
+        corner, extent = self._box(drawn)
+        fitting = 2 ** np.floor(np.log2(_BOX / extent.max(axis=1))) if samples is None else samples
+        counts = np.broadcast_to(fitting, len(extent)).clip(*_SAMPLES).astype(int)
+        texel = 2 * self._visible(drawn.scale, drawn.stretch) / self.levels[0].shape[-1]
+        level = np.floor(np.log2(np.sqrt(np.prod(self.body.cell)) / counts / texel))
+        level = np.clip(level, 0, len(self.levels) - 1).astype(int)
+        order = np.lexsort((*extent.T, level, counts))
+        changes = np.flatnonzero(np.diff(level[order]) | np.diff(counts[order])) + 1
+        for run in np.split(order, changes):
+            count = int(counts[run[0]])
+            step = max(1, 2 * _CELLS_AT_ONCE // int(np.prod(extent[run].max(axis=0)) * count**2))
+            for rows in np.split(run, np.arange(step, len(run), step)):
+                texture = self.levels[level[run[0]]][torch.from_numpy(drawn.shape[rows])]
+                box = extent[rows].max(axis=0)
+                yield (
+                    rows,
+                    corner[rows],
+                    count,
+                    self._picture(texture, drawn.rows(rows), corner[rows], box, count),
+                )
+
+    def _picture(
+        self, texture: Tensor, drawn: _Drawn, corner: np.ndarray, box: np.ndarray, count: int
+    ) -> Tensor:
+        """Return samples (f, y, x) of textures (f, 1, p, p), ``count`` along each side of a box's cells."""
+        wide = np.sqrt(np.ones(len(drawn.shape)) if drawn.stretch is None else drawn.stretch)
+        turn = np.exp(-1j * drawn.angle) / self._visible(drawn.scale, drawn.stretch)
+        begin = (corner * self.body.cell).T
+        shift = turn * (begin[0] / wide + 1j * (begin[1] * wide))
+        x, y = (
+            torch.from_numpy((np.arange(cells * count) + 0.5) * (size / count))
+            for cells, size in zip(box, self.body.cell, strict=True)
+        )
+        turn_x, turn_y, shifts = (
+            torch.from_numpy(part)[:, None, None] for part in (turn / wide, 1j * turn * wide, shift)
+        )
+        across, down = (turn_x * x + shifts).to(torch.complex64), (turn_y * y[:, None]).to(torch.complex64)
+        grid = torch.view_as_real(across + down)
+        return grid_sample(texture, grid, padding_mode="zeros", align_corners=False)[:, 0]
+
+    def _moments(self, pictures: Tensor, corner: np.ndarray, count: int) -> Tensor:
+        """Return the moments (f, H, W) of pictures (f, y, x) whose corners are at places (f, 2), in cells."""
+        tables, cells = [], []
+        for axis, side in enumerate(self.body.cells):
+            size = pictures.shape[2 - axis] // count
+            first = np.clip(np.floor(corner[:, axis]), 0, max(side - size - 1, 0))
+            tables.append(splines.sampled(corner[:, axis] - first, size, count, -first, side - first))
+            cells.append(torch.from_numpy(first.astype(int)))
+        box = tables[1].mT @ pictures @ tables[0]
+        wide = [side + 2 * splines.REACH for side in self.body.shape]
+        height, width = (max(side, part) for side, part in zip(wide, box.shape[1:], strict=True))
+        row, column = (torch.arange(part) for part in box.shape[1:])
+        place = (cells[1][:, None, None] + row[:, None]) * width + cells[0][:, None, None] + column
+        sheet = torch.zeros(len(box), height * width)
+        sheet.scatter_(1, place.flatten(1), box.flatten(1))
+        sheet = splines.fold_back(sheet.view(-1, height, width)[:, : wide[0], : wide[1]])
+        return splines.fold_back(sheet.mT).mT
 
     def render(
         self,

@@ -28,6 +28,12 @@ def test_a_drawn_touch_and_a_recorded_one(run, tmp_path, configured):
     assert sorted(path.name for path in tmp_path.glob("*.gif")) == ["five.gif", "hand.gif"]
 
 
+def test_fingertips_are_shown_without_asking_for_labels(run, tmp_path):
+    done = run(tmp_path, *NAIVE, "touch=fingertips", "out=tips.png", store=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "tips.png: disc: dynamic, press, 30 frames at 10 Hz\n"
+
+
 @pytest.mark.slow
 def test_a_still_of_the_arm(run, tmp_path):
     arm = ["body=arm", "out=arm.png", "view=skin3d", "labels=[press]", "shape=disc"]
@@ -42,6 +48,7 @@ def test_a_still_of_the_arm(run, tmp_path):
     ("overrides", "words"),
     [
         ([], "add out=touch.gif"),
+        (["out=x.gif", "touch=fingertips", "labels=[big]"], "fingertips cannot be drawn to be big"),
         (["out=x.mp4"], "a still a .png file, got out=x.mp4"),
         (["vieww=flat"], "vieww"),
     ],

@@ -74,3 +74,14 @@ def test_bad_input_ends_with_a_sentence(run, tmp_path, overrides, message):
     assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.glob("x.*"))
+
+
+def test_fingertips_are_written_with_their_contacts(run, tmp_path):
+    words = ["simulator=naive", "touch=fingertips", "n=16", "out=tips.parquet"]
+    done = run(tmp_path, "generate", *words, store=False)
+    assert done.returncode == 0, done.stderr
+    contacts = read_recording(tmp_path / "tips.parquet").touches.contacts
+    assert contacts.shape == (16, 30, 3, 5)
+    refused = run(tmp_path, "generate", *words, "touch.force=50", store=False)
+    assert refused.returncode == 2
+    assert "touch.force=50 N is more than" in refused.stderr

@@ -43,14 +43,15 @@ def touches(count, seed, force=1.0):
 )
 def test_derivatives_are_those_of_differences(make):
     body = sheet(LAYERS)
-    simulator, fingertip = make(body, Grid(4, 4).sensors(body)), Fingertip(body, 0.0015)
+    simulator = make(body, Grid(4, 4).sensors(body))
+    fingertip = Fingertip(body, 0.0015, simulator.smooth)
     given = touches(20, 0, force=2.0)
     found = sensitivity(simulator, fingertip, given)
-    assert found.readings.numpy() == pytest.approx(simulator(fingertip(given)).readings.numpy())
+    assert found.readings.numpy() == pytest.approx(simulator.press(fingertip(given)).readings.numpy())
     for axis, step in enumerate((1e-6, 1e-6, 1e-6, 1e-3)):
         move = torch.zeros(4, dtype=torch.float64)
         move[axis] = step
-        above, below = (simulator(fingertip(given + sign * move)).readings for sign in (1, -1))
+        above, below = (simulator.press(fingertip(given + sign * move)).readings for sign in (1, -1))
         slopes = ((above - below) / (2 * step)).numpy()
         scale = np.abs(slopes).max()
         assert scale > 0
@@ -96,7 +97,7 @@ def estimate(simulator, fingertip, readings, start, noise, centre, priors):
     scale = priors
 
     def cost(place):
-        missed = (simulator(fingertip(place)).readings - readings) / deviation
+        missed = (simulator.press(fingertip(place)).readings - readings) / deviation
         return missed.square().sum(1) + ((place - centre) / scale).square().sum(1)
 
     deviation = noise.frame / noise.frames**0.5
@@ -125,7 +126,8 @@ def test_the_most_probable_place_has_the_local_precision():
     """200 touches that raise three sensors above five standard deviations, four noises each."""
     body, force, draws = sheet(THICK), 20.0, 4
     sensors = Grid(5, 5, depth=0.0195).sensors(body)
-    simulator, fingertip, noise = Solid(body, sensors, divisions=3), Fingertip(body, 0.0015), Noise(0.05, 10)
+    simulator, noise = Solid(body, sensors, divisions=3), Noise(0.05, 10)
+    fingertip = Fingertip(body, 0.0015, simulator.smooth)
     given = touches(2000, 2, force)
     felt = sensitivity(simulator, fingertip, given)
     clear = (felt.readings > 5 * noise.frame).sum(1) >= 3

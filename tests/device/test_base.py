@@ -7,7 +7,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from skin.device.balance import report_balance
-from skin.device.base import AbstractDevice
+from skin.device.base import AbstractDevice, split_groups
 from skin.device.files import write_recording
 from skin.device.simulated import Simulated
 from skin.errors import InputError
@@ -88,7 +88,7 @@ def test_a_blank_has_labelled_touches_of_the_same_shape(device):
 
 def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
     settings = Evaluation(devices=2, layouts=2, false_alarm_rate=0.02)
-    assert list(touch_sets(made_up_device, settings)) == ["same", "holdout"]
+    assert list(touch_sets(made_up_device, settings)) == ["holdout"]
     assert torch.equal(
         threshold_gestures(made_up_device, settings).readings, made_up_device.touches("validation").readings
     )
@@ -117,3 +117,19 @@ def test_a_device_of_ones_own_needs_touches_alone(made_up_device, capsys):
 def test_what_it_does_not_know_is_refused_in_a_sentence(made_up_device, ask, said):
     with pytest.raises(InputError, match=said):
         ask(made_up_device)
+
+
+@pytest.mark.parametrize(("count", "validation"), [(2, 0), (6, 1), (40, 4)])
+def test_no_group_is_in_two_splits(count, validation):
+    """With few groups, the validation is a part of the touches of those to train on."""
+    groups = torch.arange(20 * count) % count
+    rows = split_groups(groups, seed=0)
+    assert sorted(torch.cat(list(rows.values())).tolist()) == list(range(20 * count))
+    parts = {name: set(groups[part].tolist()) for name, part in rows.items()}
+    assert not parts["holdout"] & (parts["train"] | parts["validation"])
+    assert len(parts["holdout"]) == max(1, count // 10)
+    if validation:
+        assert not parts["train"] & parts["validation"]
+        assert len(parts["validation"]) == validation
+    assert set(groups[split_groups(groups, 0, [1])["holdout"]].tolist()) == {1}
+    assert any(not torch.equal(part, split_groups(groups, seed=1)[name]) for name, part in rows.items())

@@ -142,3 +142,14 @@ def test_a_folder_that_is_no_data_set_is_refused(tmp_path):
     for path in (tmp_path, tmp_path / "none"):
         with pytest.raises(InputError, match=r"is no data set, because it has no manifest.json"):
             Recorded(BODY, LAYOUT, str(path))
+
+
+def test_a_converted_recording_brings_its_sensors(simulated, tmp_path):
+    """Body and layout have no effect on it, nor on the device that restores a run."""
+    foreign = replace(simulated, metadata={"positions": "unknown", "groups": {}})
+    stored = str(write_recording(foreign, tmp_path / "x.parquet"))
+    device = Recorded(BODY, Grid(4, 4), stored)
+    assert len(device.sensors) == 25
+    assert not device.configured
+    assert not device.blank().configured
+    assert device.split == "by gesture"

@@ -190,3 +190,25 @@ def test_a_tie_is_a_wrong_answer_and_no_alarm():
     codes = np.stack([encode(one, labels, TOUCH, POINT) for one in (right, wrong)])
     assert decode(vote(codes), "overall/accuracy", TOUCH).tolist() == [0, 1]
     assert decode(vote(codes), "dangerous/alarm_recall", TOUCH).tolist() == [0, 1]
+
+
+def test_unknown_labels_do_not_count(scored):
+    """Each label is scored on the touches for which it is known, and none where it is never known."""
+    chances, labels = scored
+    part = labels.clone()
+    part[100:, 0] = torch.nan
+    values = compute_metrics(chances, part, TOUCH, POINT)
+    first = compute_metrics(chances[:100], labels[:100], TOUCH)
+    for name in ("accuracy", "balanced_accuracy", "ece"):
+        assert values[f"{TOUCH.names[0]}/{name}"] == pytest.approx(first[f"{TOUCH.names[0]}/{name}"])
+    assert encode(chances, part, TOUCH, POINT) is None
+    part[:, 0] = torch.nan
+    values = compute_metrics(chances, part, TOUCH)
+    assert math.isnan(values[f"{TOUCH.names[0]}/accuracy"])
+    others = [values[f"{name}/accuracy"] for name in TOUCH.names[1:]]
+    assert values["overall/accuracy"] == pytest.approx(sum(others) / 3)
+    task = Task(("a", "b", "c", "d"), "exclusive")
+    truth = torch.eye(4)[torch.arange(400) % 4]
+    truth[50:] = torch.nan
+    known = compute_metrics(chances[:50], truth[:50], task)
+    assert compute_metrics(chances, truth, task) == pytest.approx(known)

@@ -236,9 +236,9 @@ def test_a_cache_is_built_anew_where_it_holds_objects(run, tmp_path, marker, mon
 def test_a_stored_influence_is_built_anew_where_it_holds_objects(tmp_path, marker):
     sheet = Sheet((0.02, 0.02), (4, 4), [{"material": "EcoFlex 00-30", "thickness": 0.01}])
     elastic, path = Elastic(build_mesh(sheet, 1, {})), tmp_path / "influence.npy"
-    wanted = np.array(elastic.influence(2, path))
+    wanted = np.array(elastic.influence(2, 1, path))
     np.save(path, np.array([Payload(marker)], dtype=object))
-    np.testing.assert_array_equal(elastic.influence(2, path), wanted)
+    np.testing.assert_array_equal(elastic.influence(2, 1, path), wanted)
     np.save(path, wanted[:3])
-    np.testing.assert_array_equal(elastic.influence(2, path), wanted)
+    np.testing.assert_array_equal(elastic.influence(2, 1, path), wanted)
     assert not marker.exists()

@@ -323,7 +323,7 @@ def test_the_table_is_a_study_with_the_reports_numbers_and_its_figures(run, trai
         "study.jobs=2",
         "trainer.max_epochs=1",
     ]
-    done = run(trained, "study", *words, *SMALL, "out=table")
+    done = run(trained, "study", *words, *SMALL, "out=table", apart=True)
     assert done.returncode == 0, done.stderr
     found = {line["variant"]: line for line in lines(trained / "table" / "study_table.csv")}
     assert list(found) == ["rules", "temporal_graph", "gru", "best_fresh"]

@@ -25,9 +25,23 @@ def rows(**changes) -> pa.Table:
 
 
 def test_a_pause_or_another_place_begins_a_press():
-    assert bench.gauge_from_table(rows(), "x", "disc", 0.01).press.tolist() == [0, 0, 0, 0, 1, 1]
+    assert bench.gauge_from_table(rows(), "x", "disc", 0.01).press.tolist() == [
+        0,
+        0,
+        0,
+        0,
+        1,
+        1,
+    ]
     moved = rows(x_m=[0.05, 0.05, 0.06, 0.06, 0.06, 0.06])
-    assert bench.gauge_from_table(moved, "x", "disc", 0.01).press.tolist() == [0, 0, 1, 1, 2, 2]
+    assert bench.gauge_from_table(moved, "x", "disc", 0.01).press.tolist() == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    ]
     named = rows(indenter=["disc"] * 3 + ["square"] * 3)
     assert len(bench.gauge_from_table(named, "x", "disc", 0.01)) == 3
 

@@ -12,7 +12,8 @@ from skin.body.layout import Grid
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.bench import Protocol, emulate_session, write_bench_session
+from skin.hardware.bench import write_bench_session
+from skin.hardware.bench_protocol import Protocol, emulate_session
 from skin.hardware.comparison import (
     Agreement,
     compare_gestures,

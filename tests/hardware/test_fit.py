@@ -10,7 +10,8 @@ from skin.device.calibration import Calibration, write_calibration
 from skin.device.imperfection import Imperfection
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.bench import BenchData, Gauge, Protocol, build_bench_data, emulate_session, per_newton
+from skin.hardware.bench import BenchData, Gauge, build_bench_data, per_newton
+from skin.hardware.bench_protocol import Protocol, emulate_session
 from skin.hardware.calibration import (
     estimate_force,
     evaluate_held_out,

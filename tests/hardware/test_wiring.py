@@ -11,7 +11,8 @@ from skin.body.layout import File, Grid
 from skin.device.calibration import Calibration
 from skin.device.simulated import Simulated
 from skin.errors import InputError
-from skin.hardware.bench import BenchData, BenchSession, Gauge, Protocol, emulate_session
+from skin.hardware.bench import BenchData, BenchSession, Gauge
+from skin.hardware.bench_protocol import Protocol, emulate_session
 from skin.hardware.calibration import fit_calibration
 from skin.hardware.wiring import (
     TURNS,

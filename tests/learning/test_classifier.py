@@ -9,9 +9,9 @@ from hydra.utils import instantiate
 from skin.body.layout import Scattered
 from skin.device.base import AbstractDevice
 from skin.device.touches import Touches
-from skin.learning.classifier import TouchClassifier, probabilities
 from skin.learning.data import TouchData
 from skin.learning.fusion import AbstractFusion
+from skin.learning.network import TouchClassifier, probabilities
 from skin.learning.representation import Frames
 from skin.touch.labels import TOUCH, TOUCH_OR_NOT, TOUCH_SLIDING, Task
 
@@ -205,3 +205,24 @@ def test_a_batch_of_one_touch_can_be_learnt_from():
     logits = network(Frames(torch.randn(1, 3, 2), None, torch.randn(1, 3)))
     network.loss(logits, torch.ones(1, 4)).backward()
     assert torch.isfinite(logits).all()
+
+
+@pytest.mark.parametrize("task", [TOUCH, TOUCH_OR_NOT, GESTURES])
+def test_unknown_labels_have_no_loss_and_no_gradient(task):
+    """The loss is that of the touches whose labels are known; without any, it is 0."""
+    network = classifier(task)
+    frames = Frames(torch.randn(6, 3, 2, generator=torch.Generator().manual_seed(1)), None)
+    labels = torch.nn.functional.one_hot(torch.arange(6) % len(task), len(task)).float()
+    if task.gate:
+        labels[:, task.names.index(task.gate)] = 1.0
+    unknown = labels.clone()
+    unknown[4:] = torch.nan
+    known = Frames(frames.x[:4], None)
+    expected = network.loss(network(known), labels[:4])
+    torch.testing.assert_close(network.loss(network(frames), unknown), expected)
+    nothing = network.loss(network(frames), torch.full_like(labels, torch.nan))
+    nothing.backward()
+    assert nothing.item() == 0
+    assert all(not parameter.grad.any() for parameter in network.parameters())
+    shares = (network._accuracy(network(known), labels[:4]), network._accuracy(network(frames), unknown))
+    torch.testing.assert_close(shares[1], shares[0])

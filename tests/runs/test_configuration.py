@@ -73,7 +73,7 @@ def test_a_simulator_has_data(name):
     assert OmegaConf.load(CONF / "data" / f"{name}.yaml").name == name, "step 2 of CONTRIBUTING.md"
 
 
-@pytest.mark.parametrize("group", ["data", "experiment", "sweep"])
+@pytest.mark.parametrize("group", ["data", "experiment", "sweep", "touch"])
 def test_groups_of_values_build_nothing(group):
     for path in (CONF / group).glob("*.yaml"):
         assert "_target_" not in keys(OmegaConf.to_container(OmegaConf.load(path), resolve=False)), path
@@ -83,6 +83,17 @@ def test_groups_of_values_build_nothing(group):
 def test_every_option_composes(configured, group, option):
     config = settings_of(configured(f"{group}={option}"))
     assert config[group]["_target_"] == target(group, option)
+
+
+@pytest.mark.parametrize("skin", ["naive", "fem", "solid", "solid body=arm"])
+@pytest.mark.parametrize("kind", [path.stem for path in sorted((CONF / "touch").glob("*.yaml"))])
+def test_every_kind_of_touches_is_simulated(configured, kind, skin):
+    skin = [f"simulator={skin.split()[0]}", *skin.split()[1:]]
+    device = build_device(configured(f"touch={kind}", *skin, "data.gestures=32"))
+    touches = device.recording(complete=False).touches
+    assert touches.readings.isfinite().all()
+    assert touches.readings.max() > 1.0
+    assert (touches.contacts is None) == (kind == "gestures")
 
 
 @pytest.mark.parametrize("simulator", ["naive", "fem"])
@@ -279,6 +290,7 @@ def built(word):
         "evaluation=null",
         "trainer=null",
         "contact._partial_=../x",
+        "optimizer._partial_=2",
         "device.contact=''",
         "representation=2147483648",
         "layout=[[1]]",

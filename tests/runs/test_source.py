@@ -76,7 +76,7 @@ def test_one_warning_counts_reused_results_of_other_code(run, tmp_path):
     store = Store.open(Tracking(f"sqlite:///{tmp_path}/m.db", f"{tmp_path}/a", "skin", True, None))
     for one in store.find("FINISHED", row="rules"):
         store.client.set_tag(one.info.run_id, "source_commit", "0" * 40)
-    again = run(tmp_path, "train", *words)
+    again = run(tmp_path, "train", *words, apart=True)  # it warns as it ends
     assert again.returncode == 0
     assert again.stderr.count("\n") == 1
     assert "reused 2 finished runs, such as rules naive" in again.stderr

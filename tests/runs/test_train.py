@@ -96,7 +96,7 @@ def test_two_processes_make_one_run(run, tmp_path):
     """The second one, which Lightning starts as the command again, neither logs nor prints."""
     given = [*SMALL, "data.gestures=80", "trainer.max_epochs=2"]  # 64 to train on: two equal parts
     two = ["trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu"]
-    done = run(tmp_path, "train", *given, *two)
+    done = run(tmp_path, "train", *given, *two, apart=True)
     assert done.returncode == 0, done.stderr
     ((name, status, losses),) = logged(tmp_path)
     assert status == "FINISHED"
@@ -115,7 +115,7 @@ def test_two_processes_make_one_run(run, tmp_path):
 @pytest.mark.slow
 def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     two = ["trainer.devices=2", "trainer.strategy=ddp_spawn", f"hydra.sweep.dir={tmp_path}/out"]
-    done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two)
+    done = run(tmp_path, "train", "-m", *SMALL, "seed=0", *two, apart=True)
     assert done.returncode == 0, done.stderr
     ((_, status, losses),) = logged(tmp_path)
     assert (status, len(losses)) == ("FINISHED", 1)
@@ -130,7 +130,9 @@ def test_a_sweep_trains_each_job_in_two_processes(run, tmp_path):
     ],
 )
 def test_processes_that_cannot_train_together_are_refused(run, tmp_path, given, said):
-    done = run(tmp_path, "train", *given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out")
+    done = run(
+        tmp_path, "train", *given, *SMALL, "trainer.devices=2", f"hydra.sweep.dir={tmp_path}/out", apart=True
+    )
     assert done.returncode in (1, 2)
     assert said in done.stderr
     assert "Traceback" not in done.stderr

@@ -1,5 +1,6 @@
 """What gestures are drawn from."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +9,25 @@ from omegaconf import OmegaConf
 
 from skin.body.base import Sheet
 from skin.errors import InputError
+from skin.touch.fingertips import FingertipSettings, read_touch
 from skin.touch.gesture import GestureSettings, draw_gestures, draw_paths, fold, heading, model_window
 from skin.touch.labels import Thresholds
 from skin.touch.shapes import Shapes
 
-CONF = Path(__file__).parents[2] / "conf" / "touch.yaml"
+CONF = Path(__file__).parents[2] / "conf" / "touch"
 BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
 
 
-def test_the_shipped_configuration_is_the_default_difficulty():
-    assert GestureSettings.of(OmegaConf.to_container(OmegaConf.load(CONF))["touch"]) == GestureSettings()
+@pytest.mark.parametrize("kind", [GestureSettings, FingertipSettings])
+def test_the_shipped_configuration_is_the_default_difficulty(kind):
+    name = {GestureSettings: "gestures", FingertipSettings: "fingertips"}[kind]
+    settings = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"))
+    assert read_touch(settings) == kind()
+    assert set(settings) == {entry.name for entry in fields(kind)}
+
+
+def test_every_kind_of_touches_is_tested_above():
+    assert {path.stem for path in CONF.glob("*.yaml")} == {"gestures", "fingertips"}
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,7 @@ def _frames(
     time = np.arange(0.0, corners[-1], 1 / _RATE)
     load = np.interp(time, corners, [0, 1, 1, 0])
     with np.errstate(all="ignore"):  # any scale is tried
-        values = np.nan_to_num(load[:, None] * press / conversion.scale + conversion.zero)
+        values = np.nan_to_num(conversion.raw(load[:, None] * press))
         values = np.round(values) if device.whole else values
         if (device.least, device.most) != (None, None):
             values = np.clip(values, device.least, device.most)

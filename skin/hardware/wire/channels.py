@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from skin.device.calibration import Calibration
+from skin.device.curves import Curves
 from skin.device.resampling import Frame, StreamClock, Window
 from skin.errors import InputError
 from skin.hardware.wire.protocol import Header
@@ -130,6 +131,7 @@ class UnitConversion:
         noise: (S,), N, standard deviation of a frame of the untouched skin; None: unknown.
         changing: (S,), share of the frames of the untouched skin that differed from the one before; None:
             unknown.
+        curves: of the sensors, for gain 1; None: all are linear.
     """
 
     scale: np.ndarray
@@ -137,6 +139,7 @@ class UnitConversion:
     broken: np.ndarray
     noise: np.ndarray | None = None
     changing: np.ndarray | None = None
+    curves: Curves | None = None
 
     def __call__(self, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings (..., S), N, 0 where invalid, and a mask of the valid ones, (..., S), bool.
@@ -144,9 +147,19 @@ class UnitConversion:
         A reading that no skin can have is invalid.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            newtons = (values - self.zero) * self.scale
+            newtons = self.newtons(values)
             valid = valid & ~self.broken & (np.abs(newtons) <= _LARGEST)
         return np.where(valid, newtons, 0.0).astype(np.float32), valid
+
+    def newtons(self, values: np.ndarray) -> np.ndarray:
+        """Return values (..., S) in N, whatever they are."""
+        linear = (values - self.zero) * self.scale
+        return linear if self.curves is None else self.curves.straighten(linear)
+
+    def raw(self, newtons: np.ndarray) -> np.ndarray:
+        """Return the values (..., S) that the device sends at readings in N."""
+        bent = newtons if self.curves is None else self.curves.bend(newtons)
+        return bent / self.scale + self.zero
 
 
 def unit_conversion(
@@ -176,7 +189,14 @@ def unit_conversion(
         quantities, signs = calibration.values(), calibration.signs
         per_unit = (calibration.scale if scale is None else scale) * signs / quantities["gain"]
         offset = calibration.zero + signs * quantities["offset"] / calibration.scale
-        return UnitConversion(per_unit, offset if baseline is None else baseline, quantities["dead"])
+        curves = calibration.curves
+        return UnitConversion(
+            per_unit,
+            offset if baseline is None else baseline,
+            quantities["dead"],
+            # Values are divided by the gain, which stands before the curve.
+            curves=None if curves is None else curves.scaled(1 / quantities["gain"]),
+        )
     if scale is None:
         if header is None or header.unit != "N":
             raise InputError(
@@ -419,7 +439,7 @@ class Tare:
             return
         frames = np.stack([frame.values for frame in self._quiet])
         steps = np.diff(frames, axis=0)
-        noise = steps.std(axis=0) / np.sqrt(2) * np.abs(fresh.scale)
+        noise = np.diff(fresh.newtons(frames), axis=0).std(axis=0) / np.sqrt(2)
         changing = (steps != 0).mean(axis=0)
         self.conversion = replace(fresh, noise=noise, changing=changing)
         lacks = (

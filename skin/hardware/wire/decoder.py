@@ -3,25 +3,24 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import log10
 from typing import NamedTuple
 
 import numpy as np
 
 from skin.device.resampling import After, Frame, FrameError
 from skin.errors import InputError
-from skin.hardware.wire.protocol import (
-    Format,
-    FrameFormat,
-    Header,
-    RawFrame,
-    detect_format,
-    detection_error,
-    frames_ahead,
-    parse_header,
-)
+from skin.hardware.wire.adapter import Adapter
+from skin.hardware.wire.formats import FrameFormat
+from skin.hardware.wire.protocol import Format, Header, RawFrame, frames_ahead, parse_header
 
-_WRAP = 2**32  # microseconds: 71.6 minutes
-_WRAP_GAP = 60_000_000  # microseconds that may be missing where the clock wraps
+# Ticks after which a clock wraps, by its unit: micros() and millis(), and what is computed from micros().
+_CLOCK_WRAPS = {1e-6: (2**32,), 1e-3: (2**16, 2**32 / 1e3, 2**32), 1.0: (2**32 / 1e6, 2**32 / 1e3, 86_400.0)}
+_WRAP_GAP = 60.0  # s that may be missing where the clock wraps
+_WRAP_SHARE = 1 / 16  # of the range of the clock: less than 60 s where it is short
+_NEAR = 16  # frames that may be missing where a counter wraps at a number that no firmware counts in
+_UNEVEN = 0.25  # deviation of the time between two frames
+_ROUND = frozenset([*(2**bits for bits in range(4, 33)), *(10**digits for digits in range(1, 10))])
 
 
 class FramePosition(NamedTuple):
@@ -34,52 +33,171 @@ class FramePosition(NamedTuple):
 
 
 class SequenceTracker:
-    """Tracks seq and the device's clock from frame to frame."""
+    """Tracks seq and the device's clock from frame to frame.
 
-    def __init__(self) -> None:
-        self.segment = 0
+    A counter that begins again while the time goes on as before has wrapped: the number at which it does is
+    learned. A restarted device begins its clock again, too, or pauses.
+
+    Args:
+        unit: s per tick of the clock.
+        modulus: of the counter; None: learned.
+
+    Attributes:
+        segment: number of restarts and reconnections so far.
+        unit: as given.
+        modulus: of the counter; None: not known.
+    """
+
+    def __init__(self, unit: float = 1e-6, modulus: int | None = None) -> None:
+        self.segment, self.unit, self.modulus = 0, unit, modulus
+        self._fixed = modulus is not None
         self._after: After = ""
-        self._last: tuple[int, float] | None = None
-        self._wrapped = 0
+        self._last: tuple[int | None, float] | None = None
+        self._wrapped = self._period = 0.0
+        self._fell: int | None = None  # modulus of an earlier fall that was taken for a restart
 
     def cut(self, after: After) -> None:
         """Start a new segment with the next frame; ``after`` is the reason."""
         self._after = after
 
-    def place(self, seq: int | None, t_us: float, missing: int) -> FramePosition:
+    def place(self, seq: int | None, ticks: float, missing: int, clocked: bool = True) -> FramePosition:
         """Return the time, segment and losses of a frame.
 
         Args:
             seq: its number; None if the device sends none.
-            t_us: the device's clock, microseconds.
+            ticks: the device's clock.
             missing: number of bad frames since the last good one, used without seq.
+            clocked: whether the device sends the time; if not, it follows from the arrival.
 
         Raises:
             FrameError: ``repeat``: the same number at the same time once more.
         """
-        if seq is None:
-            return self._begin(t_us) if self._after else self._follow(t_us, missing)
-        last, self._last = self._last, (seq, t_us)
+        last, self._last = self._last, (seq, ticks)
         if self._after or last is None:
-            return self._begin(t_us)
-        if last == (seq, t_us):
+            return self._begin(ticks)
+        if seq is not None and last == (seq, ticks):
             raise FrameError("repeat")
-        ahead, elapsed = frames_ahead(last[0], seq), t_us - last[1]
-        if elapsed < 0 and last[1] < _WRAP and elapsed + _WRAP <= _WRAP_GAP:
-            elapsed += _WRAP
-            self._wrapped += _WRAP
+        elapsed = ticks - last[1]
+        if elapsed < 0:
+            wrap = next((wrap for wrap in _CLOCK_WRAPS[self.unit] if self._wraps(last[1], ticks, wrap)), 0)
+            elapsed += wrap
+            self._wrapped += wrap
+        ahead = 1 + missing if seq is None or last[0] is None else self._ahead(last[0], seq, elapsed, clocked)
         if not ahead or elapsed < 0:
             self._after = "reset"
-            return self._begin(t_us)
-        return self._follow(t_us + self._wrapped, ahead - 1)
+            return self._begin(ticks)
+        self._period = 0.9 * self._period + 0.1 * elapsed / ahead if self._period else elapsed / ahead
+        return self._follow(ticks + self._wrapped, ahead - 1)
 
-    def _follow(self, t_us: float, lost: int) -> FramePosition:
-        return FramePosition(t_us * 1e-6, self.segment, lost, "gap" if lost else "")
+    def ahead(self, seq: int | None, missing: int) -> int:
+        """Return the frames since the last one, at least 1: what is known before the time is."""
+        before = None if self._last is None else self._last[0]
+        if seq is None or before is None:
+            return 1 + missing
+        return max(1, frames_ahead(before, seq, self.modulus))
 
-    def _begin(self, t_us: float) -> FramePosition:
-        after, self._after, self._wrapped = self._after, "", 0
+    def _ahead(self, before: int, seq: int, elapsed: float, clocked: bool) -> int:
+        """Return by how many frames ``seq`` is ahead; 0 if the counter began again."""
+        ahead = frames_ahead(before, seq, self.modulus)
+        if ahead or self._fixed or elapsed < 0 or seq == before or not self._period:
+            return ahead
+        frames = round(elapsed / self._period) if clocked else 1
+        uneven = abs(elapsed - frames * self._period) > _UNEVEN * self._period and clocked
+        modulus = before - seq + frames
+        if not 0 < frames <= _NEAR or uneven or not 2 <= modulus <= before + frames or seq > frames:
+            return 0
+        if not clocked and modulus not in (*_ROUND, self._fell) and modulus + 1 not in _ROUND:
+            self._fell = modulus
+            return 0
+        self.modulus = modulus
+        return frames
+
+    def _wraps(self, before: float, ticks: float, wrap: float) -> bool:
+        gap = min(_WRAP_GAP / self.unit, _WRAP_SHARE * wrap)
+        return wrap - gap <= before < wrap and ticks - before + wrap <= gap
+
+    def _follow(self, ticks: float, lost: int) -> FramePosition:
+        return FramePosition(ticks * self.unit, self.segment, lost, "gap" if lost else "")
+
+    def _begin(self, ticks: float) -> FramePosition:
+        after, self._after, self._wrapped = self._after, "", 0.0
         self.segment += bool(after)
-        return FramePosition(t_us * 1e-6, self.segment, 0, after)
+        return FramePosition(ticks * self.unit, self.segment, 0, after)
+
+
+_UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us"}
+_JUDGED = 1.0, 10  # s and frames after which a clock is compared with the host's
+_CLOSE = 0.7  # decades: a factor of 5, which bursts and a backlog explain; the units are three decades apart
+_COUNTED = 8  # frames after which the rate of the header is compared
+
+
+class ClockUnit:
+    """Tells whether a device's clock counts s, ms or us, by the header's rate and the host's clock.
+
+    Args:
+        unit: s per tick, as far as it is known.
+        fixed: the user set it: a contradiction is an error.
+
+    Attributes:
+        unit: s per tick.
+        summary: what the clock counts, and how that is known; empty as long as it is not.
+        error: contradiction of the clocks; None if there is none.
+    """
+
+    def __init__(self, unit: float, fixed: bool) -> None:
+        self.unit, self._fixed = unit, fixed
+        self.summary = ""
+        self.error: InputError | None = None
+        self._first: tuple[float, float] | None = None
+        self._frames, self._rated, self._done = 0, False, False
+
+    def restart(self) -> None:
+        """Compare again: the device was restarted."""
+        self._first, self._frames = None, 0
+
+    def add(self, ticks: float, now: float, frames: int, rate: float | None) -> bool:
+        """Return whether the unit changes with this frame.
+
+        Args:
+            ticks: the device's clock.
+            now: s, arrival by the host's clock.
+            frames: since the frame before.
+            rate: of the header, Hz; None: unknown.
+        """
+        if self._done:
+            return False
+        if self._first is None or ticks < self._first[0]:
+            self._first, self._frames = (ticks, now), 0
+            return False
+        self._frames += frames
+        passed, received = ticks - self._first[0], now - self._first[1]
+        if passed <= 0:
+            return False
+        if rate and not self._rated and self._frames >= _COUNTED:
+            self._rated = True
+            return self._judge(self._frames / rate / passed, f"the header's rate={rate:g}")
+        if received >= _JUDGED[0] and self._frames >= _JUDGED[1]:
+            self._done = True
+            return self._judge(received / passed, "the host's clock")
+        return False
+
+    def _judge(self, measured: float, witness: str) -> bool:
+        unit = min(_UNITS, key=lambda unit: abs(log10(measured / unit)))
+        if abs(log10(measured / unit)) > _CLOSE:
+            return False
+        if unit == self.unit:
+            self.summary = f"the device's clock counts {_UNITS[unit]}, by {witness}"
+            return False
+        if self._fixed:
+            self.error = InputError(
+                f"the device's clock counts {_UNITS[unit]} by {witness}, not {_UNITS[self.unit]}: correct "
+                "time_unit of the adapter, or the rate that the firmware sends"
+            )
+            self._done = True
+            return False
+        self.unit, self._fixed = unit, True
+        self.summary = f"the device's clock counts {_UNITS[unit]}, by {witness}"
+        return True
 
 
 class FrameClock:
@@ -196,6 +314,7 @@ class Stats:
         rate_hz: frames per second by the device's clock, Hz; 0 if unknown.
         format: ``text`` or ``binary``; empty if not known yet, or if the source sends no bytes.
         check: ``crc16``, ``xor`` or ``none``; empty likewise.
+        clock: what the device's clock and its counter were found to count; empty: as they should, or unknown.
         trouble: a message about the current problem; empty if there is none.
     """
 
@@ -214,6 +333,7 @@ class Stats:
     rate_hz: float = 0.0
     format: str = ""
     check: str = ""
+    clock: str = ""
     trouble: str = ""
 
     @property
@@ -230,6 +350,7 @@ class Stats:
 _LONGEST = 65536  # bytes of a line
 _ENOUGH = 4096  # bytes in which the format must show
 _PATIENCE = 2.0  # s of receiving in which it must
+_MANY, _LONG = 65536, 4.0  # the same of an adapter, which may need a dozen frames of many lines
 _PAUSE = 0.2  # s that a silence counts for at most, because a board may take seconds to start
 _PER_FIELD = 12  # bytes
 _SPAN = 2.0  # s over which good frames are compared with bad ones
@@ -239,14 +360,16 @@ _FEW = 3  # bad frames, too few for a conclusion
 class Decoder:
     """Decodes bytes into frames; resynchronises at the next delimiter and never raises for its input.
 
-    The format is detected (two binary frames with a correct CRC, or three lines with equal numbers of fields)
-    and then kept. Without a CRC, the bytes before the first delimiter are skipped: they may be half a frame.
+    The format is detected, as the adapter describes it (of our protocol: two binary frames with a correct
+    CRC, or three lines with equal numbers of fields), and then kept. Without a CRC, the bytes before the
+    first delimiter are skipped: they may be half a frame.
 
     Args:
         sensors: S; None: taken from the header or from eight lines.
         format: ``auto``, ``text`` or ``binary``.
         channels: the device's channel, from 0, of every sensor; empty: frames keep the device's order.
         polarity: 1 or -1 per sensor, -1 where values fall with force; empty: 1 for all.
+        adapter: describes the frames; None: our protocol.
 
     Attributes:
         stats: numbers of frames and errors; kept by :meth:`restart`.
@@ -260,14 +383,20 @@ class Decoder:
         format: Format = "auto",
         channels: Sequence[int] = (),
         polarity: Sequence[int] = (),
+        adapter: Adapter | None = None,
     ) -> None:
-        self.sensors, self.format = sensors, format
+        self.sensors, self.adapter = sensors, adapter or Adapter(format=format)
         self.stats = Stats()
         self._compared_at: float | None = None
         self._good = self._bad = 0
         self._latest_bad = FrameError("")
         self.header: Header | None = None
-        self._order, self._clock, self._counted = SequenceTracker(), HostClock(), FrameClock()
+        self._order, self._clock, self._counted = (
+            SequenceTracker(modulus=self.adapter.modulus),
+            HostClock(),
+            FrameClock(),
+        )
+        self._unit = ClockUnit(self._order.unit, False)
         self._latest = np.zeros(sensors or 0)
         self._channels = np.array(channels) if len(channels) else None
         self._polarity = np.array(polarity, dtype=float) if min(polarity, default=1) < 0 else None
@@ -287,6 +416,7 @@ class Decoder:
         self._begin()
         self._order.cut(after)
         self._counted.restart()
+        self._unit.restart()
 
     def feed(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """Return the frames that end in ``data``.
@@ -303,7 +433,7 @@ class Decoder:
         if self.frame_format is None and not self._recognise(data, now):
             return []
         assert self.frame_format is not None
-        *pieces, self._buffer = self._buffer.split(self.frame_format.delimiter)
+        pieces, self._buffer = self.frame_format.split(self._buffer)
         good, bad = self.stats.frames, self.stats.bad_frames
         frames = [frame for piece in pieces if (frame := self._frame(piece, now))]
         if len(self._buffer) > _LONGEST:
@@ -312,14 +442,26 @@ class Decoder:
         return frames
 
     def error(self) -> InputError | None:
-        """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None."""
-        if self.frame_format or (self._receiving < _PATIENCE and len(self._buffer) < self._enough):
+        """Return an error once 2 s of receiving or 4 kB (or four frames) show no format; else None.
+
+        Also if the device's clock contradicts what is said of it.
+        """
+        if self.frame_format is not None and self._unit.error is not None:
+            return self._unit.error
+        patience = _PATIENCE if self.adapter.kind == "protocol" else _LONG
+        if self.frame_format or (self._receiving < patience and len(self._buffer) < self._enough):
             return None
-        return detection_error(self._buffer, self._count_seen, self.sensors)
+        return self.explain()
+
+    def explain(self) -> InputError:
+        """Return why no format was detected so far."""
+        return self.adapter.explain(self._buffer, self._count_seen, self.sensors)
 
     @property
     def _enough(self) -> int:
         """Bytes in which the format must show: 4 kB, or four frames."""
+        if self.adapter.kind != "protocol":
+            return _MANY
         return max(_ENOUGH, 4 * _PER_FIELD * (2 + (self.sensors or 0)))
 
     def _recognise(self, data: bytes, now: float) -> bool:
@@ -327,14 +469,18 @@ class Decoder:
         passed = now - self._fed_at
         self._receiving += min(passed, _PAUSE) if passed > 0 else 0.0
         self._fed_at = now
-        if b"\n" not in data and b"\0" not in data:
+        if not self.adapter.may_end(data):
             return False
-        self.frame_format, self._count_seen, header = detect_format(self._buffer, self.sensors, self.format)
+        detected = self.adapter.detect(self._buffer, self.sensors)
+        self.frame_format, self._count_seen = detected.frame_format, detected.count_seen
         if self.frame_format is None:
             return False
-        self.header = header or self.header
+        self.header = detected.header or self.header
         self.sensors = self.frame_format.sensors
         self.stats.format, self.stats.check = self.frame_format.name, self.frame_format.check
+        if detected.unit is not None and self._unit.unit == self._order.unit and not self._unit.summary:
+            self._order.unit = detected.unit
+            self._unit = ClockUnit(detected.unit, detected.settled)
         self._all_valid = np.ones(self.sensors, dtype=bool)
         self._all_valid.flags.writeable = False
         if len(self._latest) != self.sensors:
@@ -365,11 +511,17 @@ class Decoder:
             return None
 
     def _place_frame(self, raw: RawFrame, now: float) -> Frame:
-        t_us = raw.t_us
-        if t_us is None:
-            rate = None if self.header is None else self.header.rate
-            t_us = 1e6 * self._counted(now, 1 + self._missing, rate)
-        t, segment, lost, after = self._order.place(raw.seq, t_us, self._missing)
+        ticks, rate = raw.ticks, None if self.header is None else self.header.rate
+        frames = self._order.ahead(raw.seq, self._missing)
+        if ticks is None:
+            ticks = self._counted(now, frames, rate) / self._order.unit
+        elif self._unit.add(ticks, now, frames, rate):
+            self._order.unit = self._unit.unit
+            self._order.cut("reset")
+        t, segment, lost, after = self._order.place(raw.seq, ticks, self._missing, raw.ticks is not None)
+        if self._unit.summary:
+            modulus = f", its counter wraps at {self._order.modulus}" if self._order.modulus else ""
+            self.stats.clock = self._unit.summary + modulus
         stats = self.stats
         stats.frames += 1
         stats.resyncs += self._missing > 0

@@ -8,24 +8,22 @@ u16 seq, u32 t_us, u16 n, n values, u16 CRC-16/CCITT-FALSE of all before it. A c
 u8 0xA5, u8 type 35 (``#``), a comment line of the text protocol without its checksum, u16 CRC. COBS: Cheshire
 and Baker, "Consistent overhead byte stuffing", IEEE/ACM ToN 7 (1999).
 
-Announcements: comments of the text protocol in which an emulated skin describes its next gesture.
+Announcements: comments of the text protocol in which an emulated skin describes its next gesture; for its
+contacts see :mod:`skin.hardware.wire.contact_lines`.
 """
 
 import binascii
 import struct
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import reduce
-from itertools import pairwise
 from math import isfinite, nan
 from operator import xor
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from skin.device.resampling import Check, FrameError
-from skin.errors import InputError
 
 
 def crc16(data: bytes) -> int:
@@ -109,17 +107,31 @@ def parse_line(line: bytes) -> Line:
     Raises:
         FrameError: ``checksum`` is wrong or unknown, or a field is no ``number`` and not one of ``INVALID``.
     """
-    body, check = _verified(line)
-    if b"_" in body:  # valid in Python's grammar only
-        raise FrameError("number")
-    words = _split(body.lstrip().rstrip(b" \r"))
+    body, check = verify_line(line)
+    return parse_words(_split(body.lstrip().rstrip(b" \r")), check)
+
+
+def parse_words(words: Sequence[bytes], check: Check = "none", invalid: Collection[bytes] = INVALID) -> Line:
+    """Return the numbers of fields.
+
+    Args:
+        words: the fields.
+        check: kind of checksum of their line.
+        invalid: fields, in lower case, that firmware sends instead of a value.
+
+    Raises:
+        FrameError: a field is no ``number`` and not one of ``invalid``.
+    """
     try:
         fields = [float(word) for word in words]
     except ValueError:
         fields = [nan]
-    if all(map(isfinite, fields)):
-        return Line(fields, check)
-    return Line([_field(word) for word in words], check, False)
+    finite = all(map(isfinite, fields))
+    if not finite:
+        fields = [_field(word, invalid) for word in words]
+    if any(b"_" in word for word in words):  # valid in Python's grammar only
+        raise FrameError("number")
+    return Line(fields, check, finite)
 
 
 def ends_with_separator(line: bytes) -> bool:
@@ -127,22 +139,22 @@ def ends_with_separator(line: bytes) -> bool:
     return line.rpartition(b"*")[0 if b"*" in line else 2].rstrip(b" \r")[-1:] in _SEPARATORS
 
 
-def _field(word: bytes) -> float:
+def _field(word: bytes, invalid: Collection[bytes]) -> float:
     """Return the number of a field; NaN where it says that there is none."""
     word = word.strip()
-    if word.lower() in INVALID:
+    if word.lower() in invalid:
         return nan
     try:
         value = float(word)
     except ValueError:
-        raise FrameError("number") from None
+        raise FrameError("number", word=word.decode("ascii", "replace")) from None
     return value if isfinite(value) else nan
 
 
 def parse_header(line: bytes) -> Header | None:
     """Return the header if this comment is one whose checksum, where it has one, is right; else None."""
     try:
-        body, _ = _verified(line)
+        body, _ = verify_line(line)
     except FrameError:
         return None
     words = body.decode("ascii", "replace").lstrip("#").split()
@@ -159,7 +171,12 @@ def parse_header(line: bytes) -> Header | None:
     )
 
 
-def _verified(line: bytes) -> tuple[bytes, Check]:
+def verify_line(line: bytes) -> tuple[bytes, Check]:
+    """Return a line without its checksum, and the kind of it.
+
+    Raises:
+        FrameError: ``checksum`` is wrong or unknown.
+    """
     body, star, tail = line.rpartition(b"*")
     if not star:
         return line, "none"
@@ -215,13 +232,13 @@ class RawFrame(NamedTuple):
 
     Attributes:
         seq: number of the frame, or None.
-        t_us: the device's clock, microseconds, or None.
+        ticks: the device's clock, in its unit, or None.
         values: (S,); NaN or infinite where the device sent no number.
         finite: whether all values are numbers.
     """
 
     seq: int | None
-    t_us: float | None
+    ticks: float | None
     values: np.ndarray
     finite: bool = True
 
@@ -352,202 +369,18 @@ def parse_announcement(line: bytes) -> Announcement | None:
 
 Format = Literal["auto", "text", "binary"]
 
-_LINES, _FRAMES = 3, 2
-_LINES_UNKNOWN = 8  # three lines of noise may count upwards by chance, eight hardly
-_STEP = 1000  # frames that may be missing between two consecutive lines
-
-
 _WRAPS = (2**16, 2**32)  # of seq: what firmware counts in
 _ACROSS = 4096  # frames that may be missing where seq wraps
 
 
-def frames_ahead(before: int, seq: int) -> int:
-    """Return by how many frames ``seq`` is ahead of ``before``, u16 or u32 wrapped; 0 if it is not."""
+def frames_ahead(before: int, seq: int, modulus: int | None = None) -> int:
+    """Return by how many frames ``seq`` is ahead, wrapped at u16, u32 or ``modulus``; 0 if it is not."""
     if seq > before:
         return seq - before
+    if modulus is not None:
+        ahead = seq - before + modulus
+        return ahead if 0 < ahead <= max(1, modulus // 2) else 0
     for wrap in _WRAPS:
         if wrap - _ACROSS <= before < wrap and seq - before + wrap <= _ACROSS:
             return seq - before + wrap
     return 0
-
-
-@dataclass(frozen=True)
-class TextFormat:
-    """Lines.
-
-    Attributes:
-        counted: seq and t_us stand before the values.
-        trailing: every line ends with a separator, so no line means an empty field by it.
-    """
-
-    sensors: int
-    counted: bool
-    check: Check
-    trailing: bool = False
-    name: ClassVar[str] = "text"
-    delimiter: ClassVar[bytes] = b"\n"
-
-    def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame in a line, or the line where it is empty or a comment; else raise FrameError."""
-        line = piece.removesuffix(b"\r")
-        if not line or line.startswith(b"#"):
-            return line
-        fields, check, finite = parse_line(line)
-        if check != self.check:
-            raise FrameError("checksum")
-        if (missing := self.sensors + 2 * self.counted - len(fields)) != 0:
-            if missing != 1 or self.trailing or not ends_with_separator(line):
-                raise FrameError("fields", len(fields) - 2 * self.counted)
-            fields, finite = [*fields, nan], False
-        if not self.counted:
-            return RawFrame(None, None, np.array(fields), finite)
-        seq, t_us = fields[:2]
-        if not (seq >= 0 and t_us >= 0) or seq % 1:
-            raise FrameError("number")
-        return RawFrame(int(seq), t_us, np.array(fields[2:]), finite)
-
-
-@dataclass(frozen=True)
-class BinaryFormat:
-    """COBS frames."""
-
-    sensors: int
-    name: ClassVar[str] = "binary"
-    delimiter: ClassVar[bytes] = b"\0"
-    check: ClassVar[Check] = "crc16"
-
-    def read(self, piece: bytes) -> RawFrame | bytes:
-        """Return the frame between two zeros, or the text of a comment; else raise FrameError."""
-        comment = decode_comment(piece) if piece else b""
-        if comment is not None:
-            return comment
-        frame = decode_frame(piece)
-        if len(frame.values) != self.sensors:
-            raise FrameError("fields", len(frame.values))
-        return frame
-
-
-FrameFormat = TextFormat | BinaryFormat
-"""A detected format: S ``sensors``, the ``delimiter`` at the end of a frame and the kind of its ``check``."""
-
-
-def detect_format(
-    data: bytes, sensors: int | None, format: Format
-) -> tuple[FrameFormat | None, int | None, Header | None]:
-    """Return the format of the first bytes of a connection; None if it is not known yet.
-
-    Second, the number of values in readable frames that do not match the layout; or None. Third, the last
-    header received.
-
-    Args:
-        data: from the first byte on; an incomplete piece at the end is ignored.
-        sensors: S, or None to detect it.
-        format: only this format, or ``auto``.
-    """
-    count_seen = None
-    if format != "text":
-        counts = list[int]()
-        for piece in data.split(b"\0")[:-1]:
-            with suppress(FrameError):
-                counts.append(len(decode_frame(piece).values))
-        for count in counts:
-            if counts.count(count) >= _FRAMES and sensors in (None, count):
-                return BinaryFormat(count), None, None
-            count_seen = count
-    if format == "binary":
-        return None, count_seen, None
-    return _detect_text(data, sensors, count_seen)
-
-
-def detection_error(data: bytes, count_seen: int | None, sensors: int | None) -> InputError:
-    """Return the error for data in which no format was detected."""
-    # The first piece may be half a line.
-    run = [line for piece in data.split(b"\n")[1:-1] if (line := _parse_numbers(piece))]
-    if _has_constant_time(run := [line for line in run if len(line.fields) > 2]):
-        return stopped_clock_error(len(run), run[0].fields[1])
-    if count_seen is not None and sensors is not None:
-        return InputError(
-            f"the device sends {count_seen} values per frame, the layout has {sensors} sensors: give its "
-            "own layout, as in layout=file layout.path=FILE.csv"
-        )
-    return InputError(
-        f"no frame in {len(data)} bytes, which begin with {data[:64].hex(' ')}: is the baud rate right, "
-        "as in device.baudrate=115200? Or give the format, as in device.format=text or device.format=binary"
-    )
-
-
-def stopped_clock_error(frames: int, t_us: float) -> InputError:
-    """Return the error for frames whose clock does not move: no window would ever fill."""
-    return InputError(
-        f"the device's clock stands still: t_us was {t_us:.0f} in all of {frames} frames; let the firmware "
-        "send micros(), or lines of values alone"
-    )
-
-
-def _parse_numbers(line: bytes) -> Line | None:
-    """Return a line if more than half of its fields are numbers; only such lines show a format."""
-    try:
-        read = parse_line(line.removesuffix(b"\r"))
-    except FrameError:
-        return None
-    return read if 2 * sum(map(isfinite, read.fields)) > len(read.fields) else None
-
-
-def _has_constant_time(run: Sequence[Line]) -> bool:
-    """Return whether the first column counts while the next one, the time, is constant."""
-    run = [line for line in run if len(line.fields) > 2]
-    times = {line.fields[1] for line in run}
-    if len(run) < _LINES_UNKNOWN or len(times) > 1 or not all(map(isfinite, times)):
-        return False
-    return _all_count([Line([line.fields[0], place, 0], line.check) for place, line in enumerate(run)])
-
-
-def _detect_text(
-    data: bytes, sensors: int | None, count_seen: int | None
-) -> tuple[FrameFormat | None, int | None, Header | None]:
-    header, run = None, list[Line]()
-    for piece in data.split(b"\n")[:-1]:
-        line = piece.removesuffix(b"\r")
-        if line.startswith(b"#"):
-            header = parse_header(line) or header
-            continue
-        if (read := _parse_numbers(line)) is None:
-            run = []
-            continue
-        if run and (len(run[-1].fields), run[-1].check) != (len(read.fields), read.check):
-            run = []
-        run = [*run[1 - _LINES_UNKNOWN :], read]
-        expected = sensors or (header.n if header else None)
-        if frame_format := _judge(run, expected, learn=sensors is None):
-            return replace(frame_format, trailing=ends_with_separator(line)), None, header
-        if len(run) >= _LINES:
-            count_seen = len(read.fields) - 2 * _all_count(run[-_LINES:])
-    return None, count_seen, header
-
-
-def _judge(run: Sequence[Line], sensors: int | None, learn: bool) -> TextFormat | None:
-    """Return the format of similar lines, or None if they do not determine it."""
-    if len(run) < _LINES:
-        return None
-    count, check = len(run[-1].fields), run[-1].check
-    counting = _all_count(run[-_LINES:])
-    if count == sensors:
-        return TextFormat(count, False, check)
-    if sensors is not None and count == sensors + 2 and counting:
-        return TextFormat(sensors, True, check)
-    if not learn or len(run) < _LINES_UNKNOWN or _has_constant_time(run):
-        return None
-    counting = _all_count(run)
-    return TextFormat(count - 2 * counting, counting, check)
-
-
-def _all_count(run: Sequence[Line]) -> bool:
-    """Return whether the two columns before the values are a frame number and a time."""
-    return len(run) > 1 and all(_counts(before.fields, line.fields) for before, line in pairwise(run))
-
-
-def _counts(before: Sequence[float], line: Sequence[float]) -> bool:
-    if len(line) < 3 or any(field < 0 or field % 1 for field in (before[0], line[0])):
-        return False
-    later = line[1] > before[1] or line[1] < 2**31 < before[1]
-    return later and 0 < frames_ahead(int(before[0]), int(line[0])) <= _STEP

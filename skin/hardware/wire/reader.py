@@ -6,7 +6,8 @@ import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from itertools import count
 from math import inf
 from time import monotonic, sleep
@@ -18,9 +19,11 @@ from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat, PositiveIn
 from skin.core.settings import RISING, check_settings
 from skin.device.resampling import After, Frame
 from skin.errors import InputError
+from skin.hardware.wire.adapter import Adapter, read_adapter
 from skin.hardware.wire.channels import ChannelHealth, ChannelState, Limits
 from skin.hardware.wire.decoder import Decoder
-from skin.hardware.wire.protocol import Format, stopped_clock_error
+from skin.hardware.wire.formats import stopped_clock_error
+from skin.hardware.wire.protocol import Format
 
 _log = logging.getLogger("skin.hardware.wire")
 
@@ -39,7 +42,8 @@ class PortSettings:
     Args:
         port: ``/dev/ttyACM0``, ``COM3`` or ``socket://host:number``.
         baudrate: bits per second, for serial ports.
-        format: ``auto``, ``text`` or ``binary``.
+        adapter: describes what the board sends: an option of ``conf/adapter/``, a YAML file, or the settings
+            of :class:`skin.hardware.wire.adapter.Adapter`.
         limits: smallest and largest value of a channel, as in
             :class:`skin.hardware.wire.channels.ChannelHealth`; None: the largest count, if the header gives
             the bits.
@@ -59,6 +63,7 @@ class PortSettings:
     port: str | None = None
     baudrate: PositiveInt = 115200
     format: Format = "auto"
+    adapter: str | Mapping[str, Any] = "protocol"
     limits: Annotated[Limits, AfterValidator(_check_order)] | None = None
     timeout: PositiveFloat = 5.0
     backoff: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (1.0, 10.0)
@@ -74,6 +79,9 @@ class PortSettings:
         check_settings(PortSettings, changed, "device")
         if self.tare < 0:
             raise InputError(f"device.tare is s without touch and must be 0 or more, got {self.tare}")
+        self.frames = read_adapter(self.adapter)
+        if self.frames.kind == "protocol" and self.frames.format == "auto":
+            self.frames = replace(self.frames, format=self.format)
 
     @classmethod
     def select(cls, device: Mapping[str, Any]) -> "PortSettings":
@@ -124,6 +132,9 @@ class ByteStream(Protocol):
     def read(self) -> bytes:
         """Return the received bytes, possibly none, within 0.1 s; OSError once the stream is closed."""
 
+    def write(self, data: bytes) -> None:
+        """Send bytes; needed only for an adapter with a start, poll or stop string."""
+
     def close(self) -> None:
         """Close the port."""
 
@@ -164,13 +175,19 @@ class _Serial:
 
         try:
             # Exclusive, or two readers would get half the bytes each.
-            self._port = serial.Serial(port, baudrate, timeout=_WAIT, exclusive=True)
+            self._port = serial.Serial(port, baudrate, timeout=_WAIT, write_timeout=_CONNECT, exclusive=True)
         except (OSError, _Gone, ValueError, OverflowError) as error:
             raise _refused(port, baudrate, error) from error
 
     def read(self) -> bytes:
         try:
             return self._port.read(max(1, min(self._port.in_waiting, _MOST)))
+        except (OSError, _Gone) as error:
+            raise OSError(str(error)) from error
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
         except (OSError, _Gone) as error:
             raise OSError(str(error)) from error
 
@@ -201,6 +218,9 @@ class _Socket:
         if not data:
             raise ConnectionResetError("the other side closed the connection")
         return data
+
+    def write(self, data: bytes) -> None:
+        self._socket.sendall(data)
 
     def close(self) -> None:
         self._socket.close()
@@ -252,6 +272,57 @@ _WEAK = {
 }
 
 
+_AGAIN = 1.0  # s between two attempts to start a board, which may take seconds to boot
+_UNPOLLED = 0.25  # s without an answer after which a board is polled again
+
+
+class Prompter:
+    """Sends a board what it waits for: a start string, a string for each frame, and a stop string.
+
+    Args:
+        adapter: with the strings.
+        stream: to the board.
+    """
+
+    def __init__(self, adapter: Adapter, stream: ByteStream) -> None:
+        self._stream = stream
+        self._start, self._poll, self._stop = (
+            (text or "").encode() for text in (adapter.start, adapter.poll, adapter.stop)
+        )
+        self._asked_at = self._polled_at = -inf
+        self._attempts, self._started, self._answered = 0, False, True
+
+    def ask(self, now: float) -> None:
+        """Send what is due at ``now``, s."""
+        if self._start and not self._started and now - self._asked_at >= _AGAIN:
+            self._stream.write(self._start)
+            self._asked_at = now
+            self._attempts += 1
+        if self._poll and (self._answered or now - self._polled_at >= _UNPOLLED):
+            self._stream.write(self._poll)
+            self._polled_at, self._answered = now, False
+            self._attempts += not self._start
+
+    def answer(self, received: bool, frames: bool) -> None:
+        """Note whether bytes and frames arrived; before the first frame any bytes answer a poll."""
+        self._started |= frames
+        self._answered |= frames or (received and not self._started)
+
+    @property
+    def unanswered(self) -> str:
+        """What was sent without any frame in return, in words; empty if nothing."""
+        if self._started or not self._attempts:
+            return ""
+        name, text = ("start", self._start) if self._start else ("poll", self._poll)
+        sent = f"the {name} string {text.decode()!r} of the adapter"
+        return f"{sent} was sent {self._attempts} times without an answer"
+
+    def stop(self) -> None:
+        """Send the stop string."""
+        if self._stop:
+            self._stream.write(self._stop)
+
+
 class WireFeed:
     """Frames decoded from bytes, with checked channels; logs bad frames once a second.
 
@@ -287,9 +358,11 @@ class WireFeed:
 
     def _begin(self) -> None:
         self._warned = False
+        self._prompter = Prompter(self._decoder.adapter, self._stream)
         self._reported = Counter(self._decoder.stats.bad)
         self._reported_at = self._heard_at = monotonic()
         self._clock, self._clock_since, self._clock_frames = -inf, 0.0, 0
+        self._clock_told = ""
 
     def poll(self) -> list[Frame]:
         """Return the frames received since the last call.
@@ -298,12 +371,16 @@ class WireFeed:
             InputError: no format is detected, or the device's clock stands still.
             OSError: the stream is closed, or silent for too long.
         """
+        self._prompter.ask(monotonic())
         data, now = self._stream.read(), monotonic()
         if data:
             self._heard_at = now
         elif now - self._heard_at >= self._silence:
             raise TimeoutError(f"nothing received for {self._silence:g} s")
         frames = self._decoder.feed(data, now) if data else []
+        self._prompter.answer(bool(data), bool(frames))
+        if data and (error := self._decoder.error()):
+            raise error
         if frames:
             self._prepare()
             if frames[-1].t != self._clock:
@@ -312,8 +389,6 @@ class WireFeed:
             least, few = _STILL
             if now - self._clock_since >= least and self._clock_frames >= few:
                 raise stopped_clock_error(self._clock_frames, self._clock * 1e6)
-        elif data and (error := self._decoder.error()):
-            raise error
         stats = self._decoder.stats
         if now - self._reported_at >= 1:
             fresh, self._reported, self._reported_at = stats.bad - self._reported, Counter(stats.bad), now
@@ -327,13 +402,23 @@ class WireFeed:
         """Return the state of each channel."""
         return self._health.states()
 
+    @property
+    def unanswered(self) -> str:
+        """What the board was told without an answer, in words; empty if it answered or was told nothing."""
+        return self._prompter.unanswered
+
     def close(self) -> None:
-        """Close the port."""
+        """Tell the board to stop, and close the port."""
+        with suppress(OSError):
+            self._prompter.stop()
         self._stream.close()
 
     def _prepare(self) -> None:
         """Warn once of a weak checksum; set limits from the header as soon as it arrives."""
-        check, header = self._decoder.stats.check, self._decoder.header
+        check, header, clock = self._decoder.stats.check, self._decoder.header, self._decoder.stats.clock
+        if clock != self._clock_told:
+            _log.info("%s", clock)
+            self._clock_told = clock
         if not self._warned and check in _WEAK:
             _log.warning("frames carry %s; let the firmware send *HHHH", _WEAK[check])
         self._warned = True

@@ -14,6 +14,7 @@ import numpy as np
 from skin.core.rng import Stream, generator
 from skin.device.resampling import Frame, Resampled, Window
 from skin.errors import InputError
+from skin.hardware.wire.contact_lines import ContactLine, join_contact_lines, parse_contact_line
 from skin.hardware.wire.protocol import Announcement, parse_announcement
 from skin.hardware.wire.reader import ByteStream
 from skin.touch.labels import OPPOSITE, Task
@@ -40,6 +41,7 @@ class RecordedGesture:
         lost: number of frames known to be missing.
         broken: the device restarted within the window, so it cannot be used.
         resampled: the window at the model's rate, in the device's unit; None until it is complete.
+        contacts: (T, K, 5) at the model's rate, as of :class:`skin.device.touches.Touches`; None if unknown.
     """
 
     number: int
@@ -50,6 +52,7 @@ class RecordedGesture:
     lost: int = 0
     broken: bool = False
     resampled: Resampled | None = None
+    contacts: np.ndarray | None = None
 
 
 def label_plan(names: Sequence[str], repetitions: int, seed: int) -> Iterator[Labels]:
@@ -82,16 +85,19 @@ class AnnouncementListener:
 
     Attributes:
         announcements: announcements that have not been read yet.
+        contacts: lines of contacts that have not been read yet.
     """
 
     def __init__(self, opener: Callable[[], ByteStream]) -> None:
         self._opener = opener
         self.announcements: deque[Announcement] = deque(maxlen=_KEPT)
+        self.contacts: deque[ContactLine] = deque(maxlen=_KEPT * _LONGEST)
 
     def __call__(self) -> ByteStream:
         """Open the stream; called again after each disconnection."""
         self._stream, self._rest = self._opener(), b""
         self.announcements.clear()
+        self.contacts.clear()
         return self
 
     def read(self) -> bytes:
@@ -100,7 +106,12 @@ class AnnouncementListener:
         *lines, self._rest = (self._rest + data).split(b"\n")
         self._rest = self._rest[-_LONGEST:]
         self.announcements.extend(filter(None, map(parse_announcement, lines)))
+        self.contacts.extend(filter(None, map(parse_contact_line, lines)))
         return data
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._stream.write(data)
 
     def close(self) -> None:
         """Close the stream."""
@@ -167,7 +178,7 @@ class AnnouncedSegmenter(AbstractSegmenter):
 
     def __init__(self, window: Window, listener: AnnouncementListener, task: Task) -> None:
         super().__init__(window)
-        self._announcements, self._task = listener.announcements, task
+        self._announcements, self._task, self._contacts = listener.announcements, task, listener.contacts
 
     def _begin(self, frame: Frame) -> RecordedGesture | None:
         if frame.seq is None:
@@ -185,8 +196,17 @@ class AnnouncedSegmenter(AbstractSegmenter):
                 if missing := [name for name in self._task.names if name not in labels]:
                     raise InputError(f"the skin announces no {missing[0]}: give device.labels=prompted")
                 task_labels = {name: labels[name] for name in self._task.names}
-                return RecordedGesture(announced.number, task_labels, begin, frame.segment, lost=late)
+                contacts = self._take_contacts(announced.number)
+                return RecordedGesture(
+                    announced.number, task_labels, begin, frame.segment, lost=late, contacts=contacts
+                )
         return None
+
+    def _take_contacts(self, number: int) -> np.ndarray | None:
+        """Return the contacts of a gesture, and forget those of the gestures before it."""
+        lines = [line for line in self._contacts if line.number == number]
+        self._contacts.clear()
+        return join_contact_lines(lines, self.window.frames, self.window.rate)
 
 
 class PromptedSegmenter(AbstractSegmenter):

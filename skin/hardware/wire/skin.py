@@ -201,8 +201,12 @@ class Skin:
         message = f"{len(frames)} of {count} frames arrived within {timeout:g} s"
         if self.away:
             raise SkinTimeout(f"{message}: the skin is unplugged; trying again", frames)
+        if isinstance(self._feed, WireFeed) and (unanswered := self._feed.unanswered):
+            raise SkinTimeout(f"{message}: {unanswered}", frames)
         if not stats.bytes and not stats.frames:
             raise SkinTimeout(f"{message}: port open, nothing received; is the device sending?", frames)
+        if not stats.frames and self._decoder is not None and self._decoder.adapter.kind != "protocol":
+            raise SkinTimeout(f"{message}: {self._decoder.explain()}", frames)
         if not stats.frames:
             reason = stats.trouble or "no format shows yet; wrong baud rate?"
             raise SkinTimeout(f"{message}: {stats.bytes} bytes but no frame: {reason}", frames)
@@ -307,7 +311,7 @@ def open_skin(
         queue: number of frames that are buffered.
         reconnect: wait for an unplugged skin; its next frame has ``after="reconnect"``.
         realtime: False plays a recording or the simulator as fast as frames are read.
-        settings: baudrate, format, limits, timeout, backoff and silence, as in :class:`PortSettings`.
+        settings: baudrate, adapter, limits, timeout, backoff and silence, as in :class:`PortSettings`.
 
     Raises:
         InputError: there is nothing at ``port``, it may not be opened or is in use, or a setting is wrong.
@@ -324,7 +328,9 @@ def open_skin(
         return play(device.strips(), baseline, queue, realtime, about)
     if opener is None and address.endswith((".parquet", ".csv")):
         return play([_read_touches(address, sensors)], baseline, queue, realtime, about)
-    decoder = Decoder(sensors, about.format, channels, polarity)
+    if about.frames.kind == "auto":
+        raise InputError("skin listen adapter=auto proposes an adapter: give device.adapter=FILE.yaml of it")
+    decoder = Decoder(sensors, channels=channels, polarity=polarity, adapter=about.frames)
     watched = reconnect and address.startswith("socket://")
     opener = opener or partial(open_stream, address, about.baudrate)
     try:
@@ -395,6 +401,7 @@ class PortMonitor:
         frames = ", ".join([f"{stats.frames} frames", *counts]) + (f" ({reasons})" if reasons else "")
         checksum = f"checksum {stats.check}" if stats.check != "none" else "NO CHECKSUM"
         trouble = f"; {stats.trouble}" if stats.trouble else ""
+        trouble = f"; {stats.clock}{trouble}" if stats.clock else trouble
         return f"{stats.format}, {checksum}, {sensors} sensors, {stats.rate_hz:.4g} Hz, {frames}{trouble}"
 
     def summary(self) -> str:

@@ -30,12 +30,21 @@ class Prescribed(AbstractContact):
 
     def press(self, trajectories: Trajectories, problem: ContactProblem) -> ContactResult:
         """Return the images at the force at which the peak cell of the gesture has the wanted pressure."""
-        frames = problem.shapes.render(*trajectories.poses)
-        # Equation 2: the drawn peak is that of the whole movie.
-        peak = (frames.flatten(1).amax(1)[trajectories.index] * trajectories.profile).amax(1).double().numpy()
-        width, height = problem.shapes.body.cell
+        shapes = problem.shapes
+        width, height = shapes.body.cell
+        if shapes.fine:
+            frames, highest, area = shapes.press(*trajectories.poses)
+            peak = _peak(highest, trajectories)
+        else:
+            frames, area = shapes.render(*trajectories.poses), None
+            peak = _peak(frames.flatten(1).amax(1), trajectories)
         force = trajectories.peak * (width * height) / peak
         owner = torch.from_numpy(trajectories.owner)
         frames *= torch.from_numpy(force / (width * height)).float()[owner, None, None]
         none = np.zeros(len(force), bool)
-        return ContactResult(frames, force, trajectories.peak, none, none)
+        return ContactResult(frames, force, trajectories.peak, none, none, area=area)
+
+
+def _peak(highest: torch.Tensor, trajectories: Trajectories) -> np.ndarray:
+    """Return the peak of each whole movie, (B,), from those of its frames, (U,): equation 2."""
+    return (highest[trajectories.index] * trajectories.profile).amax(1).double().numpy()

@@ -136,29 +136,55 @@ class Hexahedra:
     ) -> sp.csr_matrix:
         """Return rows (P, 3 N) that read n . sigma . m at points, Pa.
 
-        An element knows its stress best half-way down (its vertical strain does not change with depth), so
-        a point takes the line between the middles of the two elements nearest in depth.
+        An element knows its stress best in its middle, so a point takes what :meth:`between` makes of them.
 
         Args:
             points: (P, 3), chart, m.
             normals: n, (P, 3), in the chart's frame.
             others: m; None: n.
         """
-        frame = self.frame(points)
+        return self.mean_stress(self.between(points), normals, others)
+
+    def between(self, points: np.ndarray) -> sp.csr_matrix:
+        """Return weights (P, E) that interpolate what is known in the middles of elements.
+
+        Along x and y a point takes the cubic through the four nearest middles, in depth the line between the
+        nearest two; in depth it does not extrapolate.
+        """
+        stencils = []
+        for axis, (line, most) in enumerate(zip(self.lines, (4, 4, 2), strict=True)):
+            middles = (line[1:] + line[:-1]) / 2
+            at = points[:, axis] if axis < 2 else np.clip(points[:, axis], middles[0], middles[-1])
+            stencils.append(_lagrange(middles, at, min(most, len(middles))))
+        (x, u), (y, v), (z, w) = stencils
+        columns, rows, _ = self.counts
+        element = (z[:, :, None, None] * rows + y[:, None, :, None]) * columns + x[:, None, None]
+        weight = w[:, :, None, None] * v[:, None, :, None] * u[:, None, None]
+        point = np.broadcast_to(np.arange(len(points))[:, None, None, None], element.shape)
+        shape = (len(points), len(self.corners))
+        return sp.csr_matrix((weight.ravel(), (point.ravel(), element.ravel())), shape=shape)
+
+    def mean_stress(
+        self, weights: sp.csr_matrix, normals: np.ndarray, others: np.ndarray | None = None
+    ) -> sp.csr_matrix:
+        """Return rows (R, 3 N) that read sums of n . sigma . m in the middles of elements, Pa.
+
+        Args:
+            weights: (R, E), of each element.
+            normals: n, (R, 3), in the chart's frame.
+            others: m; None: n.
+        """
+        sums = weights.tocoo()
+        middles = [(line[1:] + line[:-1]) / 2 for line in self.lines]
+        depth, row, column = np.unravel_index(sums.col, self.counts[::-1])
+        frame = self.frame(np.column_stack([middles[0][column], middles[1][row], middles[2][depth]]))
         n, m = (
-            np.einsum("pi,pij->pj", sides, frame)
+            np.einsum("pi,pij->pj", sides[sums.row], frame)
             for sides in (normals, normals if others is None else others)
         )
-        middles = (self.lines[2][1:] + self.lines[2][:-1]) / 2
-        last = len(middles) - 1
-        below = np.clip(np.searchsorted(middles, points[:, 2]), 1, max(last, 1))
-        upper, lower = middles[below - 1], middles[np.minimum(below, last)]
-        share = np.clip((points[:, 2] - upper) / np.where(lower > upper, lower - upper, 1), 0, 1)
-        rows = sp.csr_matrix((len(points), 3 * len(self.nodes)))
-        for depth, weight in ((upper, 1 - share), (lower, share)):
-            element, local = self._locate(np.column_stack([points[:, :2], depth]))
-            rows = rows + sp.diags_array(weight) @ self._traction(element, local, n, m)
-        return rows.tocsr()
+        tractions = self._traction(sums.col, np.full((sums.nnz, 3), 0.5), n, m)
+        total = sp.csr_matrix((sums.data, (sums.row, np.arange(sums.nnz))), shape=(sums.shape[0], sums.nnz))
+        return (total @ tractions).tocsr()
 
     def strain(self, points: np.ndarray) -> list[sp.csr_matrix]:
         """Return rows (P, 3 N) for each of the strains xx, yy, zz, yz, xz, xy at points, along axes of space.
@@ -210,6 +236,17 @@ class Hexahedra:
         row = np.broadcast_to(np.arange(len(element))[:, None, None], unknown.shape)
         shape = (len(element), 3 * len(self.nodes))
         return sp.csr_matrix((values.ravel(), (row.ravel(), unknown.ravel())), shape=shape)
+
+
+def _lagrange(knots: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ``count`` knots nearest to places (P,), (P, count), and their weights in a polynomial."""
+    first = np.clip(np.searchsorted(knots, places) - count // 2, 0, len(knots) - count)
+    near = first[:, None] + np.arange(count)
+    weights = np.ones(near.shape)
+    for number, other in np.argwhere(~np.eye(count, dtype=bool)):
+        apart = knots[near[:, number]] - knots[near[:, other]]
+        weights[:, number] *= (places - knots[near[:, other]]) / apart
+    return near, weights
 
 
 def _shapes(local: np.ndarray) -> np.ndarray:

@@ -27,20 +27,26 @@ def squeeze(structure: Structure) -> np.ndarray:
 
 
 def solid_rows(
-    mesh: Hexahedra, deep: int, read: Callable[[sp.csr_matrix], np.ndarray]
+    mesh: Hexahedra, deep: int, refinement: int, read: Callable[[sp.csr_matrix], np.ndarray]
 ) -> Iterator[np.ndarray]:
-    """Yield the strain of the upper ``deep`` rows of elements at their middles, (6, elements, cells), 1/Pa.
+    """Yield the mean strain of each cell in the upper ``deep`` rows of elements, (6, cells, cells), 1/Pa.
 
     Args:
         mesh: of the body.
         deep: rows of elements.
+        refinement: elements along each side of a cell.
         read: gives rows (R, 3 N) over the cells, (R, cells).
     """
     x, y, z = ((line[1:] + line[:-1]) / 2 for line in mesh.lines)
+    along = [
+        sp.kron(sp.eye_array(len(line) // refinement), np.full((1, refinement), 1 / refinement))
+        for line in (x, y)
+    ]
+    mean = sp.kron(along[1], along[0]).tocsr()
     for depth in z[:deep]:
         places = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
         rows = mesh.strain(np.column_stack([places, np.full(len(places), depth)]))
-        yield np.stack([read(part) for part in rows])
+        yield np.stack([read((mean @ part).tocsr()) for part in rows])
 
 
 def largest(cells: Tensor, rows: Tensor) -> Tensor:

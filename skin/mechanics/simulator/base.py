@@ -50,10 +50,13 @@ class AbstractSimulator(nn.Module, ABC):
     Attributes:
         feels_shear: whether readings depend on tangential forces too.
         mechanical: whether readings depend on the thickness and stiffness of the layers.
+        smooth: whether the loads of movies are moments of the pressure (:mod:`skin.touch.splines`) instead of
+            mean pressures of cells.
     """
 
     feels_shear: ClassVar[bool] = False
     mechanical: ClassVar[bool] = True
+    smooth: ClassVar[bool] = False
 
     @abstractmethod
     def forward(self, pressure: Tensor, shear: Tensor | None = None) -> Response:
@@ -68,8 +71,16 @@ class AbstractSimulator(nn.Module, ABC):
             InputError: shear, if the simulator does not support it.
         """
 
-    def linear(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
-        """Return the quantities (..., R) that are linear in the pressure, the input of :meth:`read`.
+    def loads(self, pressure: Tensor) -> Tensor:
+        """Return mean pressures of cells (..., H, W), Pa, as loads, Pa."""
+        return pressure
+
+    def press(self, loads: Tensor, shear: Tensor | None = None) -> Response:
+        """Return the response to loads (..., H, W), Pa; ``shear`` (..., 2) is that of :meth:`forward`."""
+        return self(loads, shear)
+
+    def linear(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
+        """Return the quantities (..., R) that are linear in the loads, the input of :meth:`read`.
 
         Raises:
             InputError: the simulator has no mechanics.
@@ -94,13 +105,13 @@ class AbstractSimulator(nn.Module, ABC):
         """Return the response to movies, (B, T, ...); each distinct frame is solved once.
 
         Args:
-            frames: (U, H, W), Pa.
+            frames: (U, H, W), loads, Pa.
             index: (B, T), the frame at each time.
             scale: (B, T), factor of the frame.
             shear: (U, 2), as in :meth:`forward`.
             displacement: whether to compute the displacement.
         """
-        readings, moves = self(frames, shear)
+        readings, moves = self.press(frames, shear)
         scaled = readings[index] * scale[..., None]
         if moves is None or not displacement:
             return Response(scaled, None)
@@ -156,15 +167,22 @@ class AbstractSimulator(nn.Module, ABC):
             f"simulator={self._name}: set simulator=solid, or contact=prescribed"
         )
 
+    def surface(self, loads: Tensor) -> Tensor | None:
+        """Return how far the corners of the cells move into the skin, (F, H + 1, W + 1), m, under loads.
+
+        None if this simulator does not compute it.
+        """
+        return None
+
     def pressure_rows(self, sensors: Sensors) -> np.ndarray | None:
-        """Return the readings of other sensors under 1 Pa on each cell, (S, cells), N/Pa.
+        """Return the readings of other sensors under a load of 1 Pa of each cell, (S, cells), N/Pa.
 
         None if that is not faster than a simulator of these sensors, or if readings are not linear.
         """
         return None
 
-    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor | None:
-        """Return the largest principal strain of the top layer under pressures (U, H, W), (U,), 1.
+    def strain(self, loads: Tensor, shear: Tensor | None = None) -> Tensor | None:
+        """Return the largest principal strain of the top layer under loads (U, H, W), (U,), 1.
 
         From the linear solution, which is valid up to about 0.3. None if the simulator has no mechanics.
         """

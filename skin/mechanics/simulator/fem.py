@@ -185,11 +185,11 @@ class PlatesAndBeams(AbstractSimulator):
         """
         return self.read(self.linear(pressure, shear))
 
-    def linear(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
+    def linear(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return D_s, D_t and the force that the reading is made of, (..., 3 S)."""
         if shear is not None:
             self.refuse_shear()
-        return flatten(pressure, self.shape, self.transfer.dtype) @ self.transfer
+        return flatten(loads, self.shape, self.transfer.dtype) @ self.transfer
 
     def read(self, linear: Tensor) -> Response:
         """Return the response that has these linear parts (..., 3 S)."""
@@ -203,9 +203,9 @@ class PlatesAndBeams(AbstractSimulator):
         share = torch.where(moves, sensor / torch.where(moves, surface, 1), 0)
         return Response(share * force, displacement)
 
-    def strain(self, pressure: Tensor, shear: Tensor | None = None) -> Tensor:
+    def strain(self, loads: Tensor, shear: Tensor | None = None) -> Tensor:
         """Return the largest compressive strain of the top layer, (U,)."""
-        cells = flatten(pressure, self.shape, self.transfer.dtype)
+        cells = flatten(loads, self.shape, self.transfer.dtype)
         return largest(cells, self._squeeze.to(cells.device))
 
     @cached_property

@@ -77,3 +77,24 @@ def test_trees_of_an_earlier_version_are_refused(made_up_device, tmp_path):
     np.savez(tmp_path / "features.npz", train=np.zeros(3))
     with pytest.raises(InputError, match=r"features.npz holds the training data .*: train the run again"):
         BoostedTrees().load(TouchData(made_up_device, Readings), tmp_path / "features.npz")
+
+
+def test_trees_do_not_learn_from_unknown_labels(made_up_device):
+    """Trees with labels that are unknown are those that were trained without these touches."""
+    touches = made_up_device.touches
+
+    def fitted(change) -> torch.Tensor:
+        made_up_device.touches = lambda split, epoch=0: change(touches(split))
+        trees = BoostedTrees(rounds=5)
+        trees.fit(TouchData(made_up_device, Readings))
+        return trees.probabilities(touches("test"))
+
+    def hidden(whole: Touches) -> Touches:
+        labels = whole.labels.clone()
+        labels[::3] = torch.nan
+        return Touches(whole.readings, whole.valid, whole.positions, labels, whole.rate)
+
+    def shortened(whole: Touches) -> Touches:
+        return whole[torch.arange(len(whole)) % 3 > 0]
+
+    assert torch.equal(fitted(hidden), fitted(shortened))

@@ -1,0 +1,41 @@
+"""Convert recordings of others, such as CSV files and spreadsheets, to a recording of this program.
+
+    skin convert from=map.yaml out=x.parquet
+    skin convert from=sdu path=2D_6060_learning_data.xlsx out=sdu.parquet
+
+A mapping file says what the columns are (docs/recordings.md). device=recording device.path=x.parquet trains
+on the result. The skin of the configuration matters only for a mapping with positions: layout.
+"""
+
+from pathlib import Path
+
+from skin.commands._command import command
+from skin.core.files import tabular
+from skin.errors import InputError
+from skin.runs.configuration import Config
+
+
+@command("convert")
+def main(config: Config) -> None:
+    """Read the files of a mapping and write one recording."""
+    if config.from_ is None or config.out is None:
+        raise InputError("skin convert needs from= and out=, as in from=map.yaml out=x.parquet")
+    out = tabular(config.out, "a recording")
+
+    from skin.device.conversion import convert_files, summarise_conversion
+    from skin.device.files import write_recording
+    from skin.device.formats import read_format
+    from skin.runs.build import build_skin
+
+    mapping = read_format(config.from_)
+    written = config.from_.endswith((".yaml", ".yml"))
+    if config.path is None and not written:
+        raise InputError(f"from={config.from_} needs path=FOLDER, where the recordings are")
+    folder = Path(config.path if config.path is not None else Path(config.from_).parent).expanduser()
+    if mapping.positions == "layout":
+        skin = build_skin(config)
+        recording = convert_files(mapping, folder, skin.sensors, skin.body.size)
+    else:
+        recording = convert_files(mapping, folder)
+    write_recording(recording, out)
+    print(f"{out}: {summarise_conversion(recording)}")

@@ -1,0 +1,351 @@
+"""Calibrate without a gauge: by a weight on a round base on every sensor, or a loaded board over the skin.
+
+The gain of a channel is its reading over the simulated one. A wide base hardly cares where the sensor lies
+below it, and a board not at all.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+
+from skin.core.settings import configured
+from skin.device.base import AbstractSimulated
+from skin.device.calibration import Calibration
+from skin.errors import InputError
+from skin.hardware.bench import BenchSession, Gauge, per_newton
+from skin.hardware.bench_protocol import Protocol
+from skin.hardware.emulator import Converter
+from skin.hardware.placements import Placements, find_placements
+from skin.hardware.wiring import find_quantum, list_numbers, measure_idle
+
+GRAVITY = 9.80665  # m/s2
+_HEAVIEST = 50.0  # kg: nobody puts more on a skin by hand
+_GREATEST = 5000.0  # N on a board: five people
+_SPREAD = 0.35  # of gains and model together, in assigning placements to sensors
+_FLOOR = 0.03  # of the largest reading: what a model leaves beside a base
+_TILT = 0.25  # standard deviation of the tilt of a board's pressure, share from the middle to an edge
+_UNEVEN = 0.1  # of the pressure of foam, share
+_RELIEVED = 0.5  # weight of the inverse of a reading, over that of its median, in its error
+_MISSED = 0.25  # share of the sensors that may have no gain
+
+
+@dataclass(frozen=True)
+class KnownLoad:
+    """What is put on the skin.
+
+    Attributes:
+        weight: kg; None: a board.
+        base: radius of the weight's round base, m.
+        board: force on a board over the whole skin, N.
+    """
+
+    weight: float | None
+    base: float | None
+    board: float | None
+
+    def check(self, size: tuple[float, float]) -> None:
+        """Raise InputError unless this is one load that a skin of this size, m, can carry."""
+        if (self.weight is None) == (self.board is None):
+            raise InputError("give weight=2.0 base=0.02 (kg, m), or board=500 (N), not both")
+        if self.weight is None:
+            if self.base is not None:
+                raise InputError("board= covers the whole skin: leave out base=")
+            if not 0 < float(self.board or 0) <= _GREATEST:
+                raise InputError(f"board={self.board:g} is a force in N above 0 and up to {_GREATEST:g}")
+            return
+        if self.base is None:
+            raise InputError(f"weight={self.weight:g} needs the radius of its base in m, as in base=0.02")
+        if not 0 < self.weight <= _HEAVIEST:
+            in_grams = f"; for {self.weight:g} g give weight={self.weight / 1000:g}" * (self.weight >= 100)
+            raise InputError(
+                f"weight={self.weight:g} is a mass in kg above 0 and up to {_HEAVIEST:g}{in_grams}"
+            )
+        widest = min(size) / 2
+        if not 0 < self.base <= widest:
+            in_mm = f"; for {self.base:g} mm give base={self.base / 1000:g}" * (self.base >= 1)
+            raise InputError(
+                f"base={self.base:g} is a radius in m above 0 that fits on the skin of {size[0]:g} x "
+                f"{size[1]:g} m, so at most {widest:g}{in_mm}"
+            )
+
+    @property
+    def force(self) -> float:
+        """N."""
+        return GRAVITY * self.weight if self.weight is not None else float(self.board or 0)
+
+
+@dataclass(frozen=True)
+class LoadResult:
+    """A calibration by known loads, and how well it is determined.
+
+    Attributes:
+        calibration: of the skin.
+        placements: number of placements of every sensor, (S,); of a board, of all.
+        differ: median difference between placements of the same sensor, or of a board left by the fit, share;
+            NaN where every sensor has one.
+        never: sensors that were never loaded: their gain is the median.
+    """
+
+    calibration: Calibration
+    placements: np.ndarray
+    differ: float
+    never: list[int]
+
+
+def fit_known_load(device: AbstractSimulated, session: BenchSession, load: KnownLoad) -> LoadResult:
+    """Fit offsets and noise to idle frames, and gains to placements of a load.
+
+    Args:
+        device: with the skin as designed.
+        session: idle, and placements in any order, with the skin untouched between them.
+        load: what was put on it.
+
+    Raises:
+        InputError: another number of channels, an impossible load, no placement, or sensors without one.
+    """
+    load.check(device.size)
+    channels, sensors = session.raw.shape[1], len(device.sensors)
+    if channels != sensors:
+        raise InputError(
+            f"the session has {channels} channels, the layout {sensors} sensors: give the layout it was "
+            "recorded with, as in layout=file layout.path=FILE.csv"
+        )
+    placements = find_placements(session)
+    fit = _fit_weight if load.weight is not None else _fit_board
+    gains, counts, differ = fit(device, placements, load)
+    return _build(session, placements, load, gains, counts, differ)
+
+
+def base_readings(device: AbstractSimulated, base: float) -> np.ndarray:
+    """Return the readings (S, S), N, under 1 N on a round base over each sensor.
+
+    Near the rim the base is as far inside as it needs to be to lie on the skin.
+    """
+    places = np.clip(device.sensors.positions[:, :2], base, np.array(device.size) - base)
+    count = len(places)
+    zeros, names = np.zeros(count), np.full(count, "disc")
+    presses = np.arange(count)
+    rows = Gauge(presses.astype(float), zeros + 1, places, zeros + base, zeros, names, presses)
+    return per_newton(device.model, device.body, rows)
+
+
+def _fit_weight(
+    device: AbstractSimulated, placements: Placements, load: KnownLoad
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return gains (S,), in the session's unit per N, NaN if unknown; placements (S,); their difference."""
+    assert load.base is not None
+    expected = load.force * base_readings(device, load.base)
+    sensor = _assign(expected, placements)
+    gains, counts = np.full(len(expected), np.nan), np.bincount(sensor, minlength=len(expected))
+    differences = []
+    for number in np.flatnonzero((counts > 0) & placements.reached):
+        ratios = placements.change[sensor == number, number] / expected[number, number]
+        gains[number] = np.median(ratios) if len(ratios) > 2 else ratios.mean()
+        if len(ratios) > 1:
+            differences.append(np.abs(ratios / gains[number] - 1).mean() * 2)
+    return gains, counts, float(np.median(differences)) if differences else math.nan
+
+
+def _assign(expected: np.ndarray, placements: Placements) -> np.ndarray:
+    """Return the sensor (P,) below each placement: that whose pattern of readings is the most likely.
+
+    Gains are unknown, so a reading is its expectation within a third. A dead sensor is found by the readings
+    of its neighbours.
+    """
+    size = np.abs(placements.change)
+    typical = float(np.median(size.max(axis=1)) / np.median(np.diagonal(expected)))
+    measured = placements.change[:, None, :] * np.sign(_sign(placements)) / typical
+    noise = placements.noise / typical
+    variance = (_SPREAD * expected) ** 2 + noise**2 + (_FLOOR * expected.max()) ** 2
+    cost = (measured - expected) ** 2 / variance + np.log(variance)
+    return np.asarray(cost[..., placements.reached].sum(axis=-1).argmin(axis=1))
+
+
+def _sign(placements: Placements) -> np.ndarray:
+    """Return 1 or -1 per channel, (S,): whether it rises under load; as most others, if it is silent."""
+    strongest = np.abs(placements.change).argmax(axis=0)
+    signs = np.sign(placements.change[strongest, np.arange(placements.change.shape[1])])
+    most = -1.0 if signs[placements.reached].sum() < 0 else 1.0
+    return np.where(placements.reached & (signs != 0), signs, most)
+
+
+@torch.no_grad()
+def board_readings(device: AbstractSimulated) -> np.ndarray:
+    """Return the readings (3, S), N, under 1 N on a board: even, and their change with a tilt in x and in y.
+
+    The pressure of a tilt of 1 is 0 at one edge, and twice the mean at the other.
+    """
+    rows, columns = device.body.shape
+    centres = [torch.linspace(-1, 1, 2 * number + 1)[1::2] for number in (rows, columns)]
+    y, x = torch.meshgrid(*centres, indexing="ij")
+    even = torch.full((rows, columns), 1 / (device.size[0] * device.size[1]))
+    slight = 0.1  # the report's reading is not linear in the pressure, but nearly so
+    maps = torch.stack([even, even * (1 + slight * x), even * (1 + slight * y)])
+    readings = device.model(maps).readings.double().numpy()
+    return np.stack([readings[0], *((tilted - readings[0]) / slight for tilted in readings[1:])])
+
+
+def _fit_board(
+    device: AbstractSimulated, placements: Placements, load: KnownLoad
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return gains, placements and their difference as :func:`_fit_weight`; tilts are estimated jointly."""
+    maps = load.force * board_readings(device)
+    alive = placements.reached
+    if not alive.any():
+        raise InputError("no channel responds to the board: check the wiring")
+    readings = placements.change * _sign(placements)
+    shown = np.log(np.maximum(readings[:, alive], 3 * placements.noise[alive]))
+    count, sensors = shown.shape
+    # Below the edge that a tilt relieves, the foam may have lost contact.
+    relief = np.median(shown, axis=0) - shown
+    uneven = _UNEVEN * np.hypot(1.0, _RELIEVED * np.exp(relief))
+    start = np.r_[(shown - np.log(maps[0, alive])).mean(axis=0), np.zeros(2 * count)]
+
+    def misfit(values: np.ndarray) -> np.ndarray:
+        tilts = values[sensors:].reshape(count, 2)
+        pressed = np.log(np.maximum(maps[0, alive] + tilts @ maps[1:, alive], 0.05 * maps[0, alive]))
+        return np.r_[((shown - values[:sensors] - pressed) / uneven).ravel(), values[sensors:] / _TILT]
+
+    fit = least_squares(misfit, start, loss="soft_l1")
+    gains = np.full(len(alive), np.nan)
+    gains[alive] = np.exp(fit.x[:sensors]) * _sign(placements)[alive]
+    left = _UNEVEN * np.abs(fit.fun[: shown.size]).mean()
+    return gains, np.full(len(alive), count), float(left) if count > 1 else math.nan
+
+
+def _build(
+    session: BenchSession,
+    placements: Placements,
+    load: KnownLoad,
+    gains: np.ndarray,
+    counts: np.ndarray,
+    differ: float,
+) -> LoadResult:
+    """Return the calibration of gains (S,), in the session's unit per N, NaN if unknown."""
+    signs = _sign(placements)
+    dead = [int(n) for n in np.flatnonzero(~placements.reached)]
+    never = [int(n) for n in np.flatnonzero(placements.reached & ~(gains * signs > 0))]
+    if len(dead) + len(never) > _MISSED * len(gains):
+        raise InputError(
+            f"sensors {list_numbers(sorted(dead + never))} were never loaded, or do not respond: put the "
+            "load on every sensor and record again, or check the wiring"
+        )
+    idle = placements.idle
+    rests = []
+    for channel in session.raw.T:
+        quiet = idle & np.isfinite(channel)
+        rest = channel[np.isfinite(channel)]
+        step = find_quantum(rest) if len(rest) else 0.0
+        # Slow drift is left to the tare: placements move the rest a little, too.
+        rests.append((*_rest(session.time[quiet], channel[quiet], step), step))
+    offset, noise, step_sizes = np.array(rests).T
+    absolute = np.where(np.isfinite(gains), gains * signs, np.nan)
+    typical = float(np.nanmedian(absolute))
+    in_newton = session.unit == "N"
+    scale = 1.0 if in_newton else 1 / typical
+    zero = 0.0 if in_newton else float(np.median(offset[placements.reached]))
+    sensors: dict[str, list[float | None]] = {
+        "offset": _rounded(signs * (offset - zero) * scale),
+        "noise": _rounded(noise * scale),
+        "quantum": _rounded(step_sizes * scale),
+        "gain": _rounded(absolute * scale),
+    }
+    ranges: dict[str, list[float]] = {"dead": [0, len(dead)]}
+    for name, values in sensors.items():
+        working = [value for n, value in enumerate(values) if value is not None and n not in dead]
+        ranges[name] = [min(working), max(working)]
+    about: dict[str, Any] = {"unit": session.unit, "placements": len(placements.change)}
+    about |= {"weight": load.weight, "base": load.base} if load.board is None else {"board": load.board}
+    polarity = tuple(int(sign) for sign in signs) if signs.min() < 0 else ()
+    calibration = Calibration(sensors, {"dead": dead}, ranges, scale, zero, about, polarity)
+    return LoadResult(calibration, counts, differ, never)
+
+
+def _rest(time: np.ndarray, values: np.ndarray, step: float) -> tuple[float, float]:
+    """Return the level at rest and the noise of a channel, in the session's unit; 0 without frames."""
+    if len(values) < 2 * 10 or np.ptp(values) == 0:
+        return (float(np.median(values)) if len(values) else 0.0), 0.0
+    idle = measure_idle(time - time.mean(), values, step)
+    return idle.offset, idle.noise
+
+
+def _rounded(values: np.ndarray) -> list[float | None]:
+    return [float(f"{value:.6g}") + 0.0 if np.isfinite(value) else None for value in values]
+
+
+def print_known_load(result: LoadResult) -> None:
+    """Print gains, placements, and the sensors without a gain."""
+    calibration = result.calibration
+    gains = [gain for gain in calibration.sensors["gain"] if gain is not None]
+    print(
+        f"{calibration.about['placements']} placements, {len(gains)} of {len(calibration)} sensors have a "
+        f"gain: median {np.median(gains):.4g}, {min(gains):.4g} to {max(gains):.4g}"
+    )
+    if math.isfinite(result.differ):
+        print(f"placements of the same sensor differ by {result.differ:.1%} (median)")
+    if dead := calibration.broken["dead"]:
+        print(f"dead, or never loaded: sensors {list_numbers(dead)} (from 0) never left their noise")
+    if result.never:
+        print(f"never loaded, so of median gain: sensors {list_numbers(result.never)}")
+    if inverse := np.flatnonzero(calibration.signs < 0).tolist():
+        print(f"inverse, values fall with force: sensors {list_numbers(inverse)}")
+
+
+# A session of an emulated skin under the load.
+
+
+def emulate_placements(
+    device: AbstractSimulated,
+    readings: np.ndarray,
+    protocol: Protocol,
+    generator: np.random.Generator,
+    bits: int | None = None,
+) -> BenchSession:
+    """Simulate placements of a load one after the other, 2 s each, with pauses of ``protocol.rest``.
+
+    Args:
+        device: the skin.
+        readings: true readings of each placement, (P, S), N.
+        protocol: its ``idle``, ``rest``, ``ramp`` and ``rate``.
+        generator: of the noise.
+        bits: of the converter; None: N are sent.
+    """
+    period = 2 * protocol.ramp + 2.0 + protocol.rest
+    time = np.arange(round((protocol.idle + len(readings) * period) * protocol.rate)) / protocol.rate
+    number = np.floor((time - protocol.idle) / period).astype(int)
+    inside = (time - protocol.idle) % period
+    corners = [0.0, protocol.ramp, protocol.ramp + 2.0, 2 * protocol.ramp + 2.0]
+    share = np.where(number >= 0, np.interp(inside, corners, [0.0, 1.0, 1.0, 0.0]), 0.0)
+    true = share[:, None] * readings[np.maximum(number, 0)]
+    measured = device.imperfection.raw(
+        torch.from_numpy(true)[None].float(), device.constants, generator, torch.from_numpy(time).float()
+    )[0].numpy() * device.imperfection.signs(true.shape[1])
+    values = Converter(bits, device.imperfection.clip)(measured)
+    return BenchSession(time, values, "N" if bits is None else "adc", None, bits)
+
+
+def emulate_known_load(
+    device: AbstractSimulated, load: KnownLoad, settings: Mapping[str, Any]
+) -> BenchSession:
+    """Simulate a session of a load on an emulated skin: on every sensor twice, in any order, or eight boards.
+
+    Args:
+        device: the skin.
+        load: what is put on it.
+        settings: ``conf/calibrate.yaml`` under ``calibrate``.
+    """
+    load.check(device.size)
+    protocol = configured(Protocol, settings["protocol"], "calibrate.protocol")
+    randomness = np.random.default_rng(device.seed)
+    if load.base is not None:
+        order = np.concatenate([randomness.permutation(len(device.sensors)) for _ in range(2)])
+        readings = load.force * base_readings(device, load.base)[order]
+    else:
+        tilts = np.c_[np.ones(8), _TILT * randomness.standard_normal((8, 2))]
+        readings = load.force * tilts @ board_readings(device)
+    return emulate_placements(device, readings, protocol, randomness, settings["bits"])

@@ -1,0 +1,385 @@
+"""Fingertips: one to three discs that press a skin at known places, still or sliding together."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Annotated, Any, NamedTuple, final
+
+import numpy as np
+import torch
+from annotated_types import MinLen
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from skin.body.base import AbstractBody
+from skin.core.settings import RISING, checked
+from skin.errors import InputError
+from skin.touch.gesture import (
+    Draws,
+    GestureSettings,
+    SampledPaths,
+    TouchSettings,
+    draw_motion,
+    draw_times,
+    sample_paths,
+)
+from skin.touch.images import load_image
+from skin.touch.labels import TOUCH
+from skin.touch.movie import Movie, join_movies, measure_gestures
+from skin.touch.sampler import AbstractSampler, ContactModel, describe_touches, steer
+from skin.touch.shapes import Shapes
+
+CONTACT = ("x", "y", "radius", "force", "peak")
+"""Columns of contacts: centre and radius (m), force (N) and highest pressure (Pa)."""
+
+_DYNAMIC, _PRESS = TOUCH.names.index("dynamic"), TOUCH.names.index("press")
+_TRIES = 1000
+
+
+@checked("touch")
+@dataclass(frozen=True)
+class FingertipSettings(TouchSettings):
+    """Ranges of fingertips; ``conf/touch/fingertips.yaml`` holds the same defaults and their units.
+
+    Attributes:
+        shapes: pictures of the pressure of a fingertip; each has any of them.
+        contacts: fingertips at a time.
+        radius: half the larger extent of the shape, m.
+        force: the least of a fingertip, N; the logarithm of the force is uniform up to that at ``pressure``.
+        pressure: the largest force of a fingertip by the area of a circle of its radius, Pa.
+        apart: smallest distance between the outlines of two fingertips, m.
+
+    Raises:
+        InputError: as :class:`TouchSettings`, or the least force gives more than the largest pressure.
+    """
+
+    shapes: Annotated[tuple[str, ...], MinLen(1)] = ("disc",)
+    contacts: Annotated[tuple[PositiveInt, PositiveInt], RISING] = (1, 3)
+    radius: Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = (0.004, 0.012)
+    force: PositiveFloat = 0.5
+    pressure: PositiveFloat = 130e3
+    apart: NonNegativeFloat = 0.005
+
+    def __post_init__(self) -> None:
+        most = self.pressure * np.pi * self.radius[0] ** 2
+        if self.force > most:
+            raise InputError(
+                f"touch.force={self.force:g} N is more than the {most:.3g} N that touch.pressure="
+                f"{self.pressure:g} Pa gives a fingertip of the least touch.radius={self.radius[0]:g} m: "
+                "lower touch.force, or raise touch.radius"
+            )
+        super().__post_init__()
+
+    def sampler(
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: ContactModel,
+        padded: bool,
+        moments: np.ndarray | None,
+    ) -> "FingertipSampler":
+        """Return what draws fingertips."""
+        return FingertipSampler(body, footprints, contact, self, padded, moments)
+
+
+_SPECIAL = {entry.name for entry in fields(FingertipSettings)} - {
+    entry.name for entry in fields(GestureSettings)
+}
+
+
+def read_touch(settings: Mapping[str, Any] | TouchSettings | None) -> TouchSettings:
+    """Return the settings of touches: fingertips where they have settings of fingertips, else gestures.
+
+    Args:
+        settings: the group ``touch`` of a configuration, which may lack settings, or the settings
+            themselves; None: the gestures of the report.
+
+    Raises:
+        InputError: an invalid setting.
+    """
+    if isinstance(settings, TouchSettings):
+        return settings
+    fingertips = isinstance(settings, Mapping) and not _SPECIAL.isdisjoint(settings)
+    return FingertipSettings.of(settings) if fingertips else GestureSettings.of(settings)
+
+
+class Group(NamedTuple):
+    """Fingertips of touches, which move as one; K is the most at a time.
+
+    Attributes:
+        number: (B,), fingertips of each touch.
+        shape: (B, K), index of the shape.
+        radius: (B, K), m.
+        force: (B, K), full force, N.
+        offset: (B, K, 2), m, from the centre of the first fingertip to each centre.
+        low, high: (B, 2), m, bounding box of all around the centre of the first.
+        misfits: (B,), groups drawn before that had no room.
+    """
+
+    number: np.ndarray
+    shape: np.ndarray
+    radius: np.ndarray
+    force: np.ndarray
+    offset: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    misfits: np.ndarray
+
+
+def draw_groups(
+    count: int,
+    settings: FingertipSettings,
+    shapes: int,
+    size: tuple[float, float],
+    generator: np.random.Generator,
+) -> Group:
+    """Draw fingertips that leave ``spare`` along both axes of the sheet, and ``apart`` between them.
+
+    Args:
+        count: B.
+        settings: ranges of the fingertips.
+        shapes: number of shapes.
+        size: extent (x, y) of the sheet, m.
+        generator: source of randomness; it draws for all touches in every round.
+
+    Raises:
+        InputError: the sheet has no room for them.
+    """
+    least, most = settings.contacts
+    number = generator.integers(least, most, count, endpoint=True)
+    shape = generator.integers(0, shapes, (count, most))
+    small, large = settings.radius
+    radius = small + (large - small) * generator.random((count, most))
+    highest = settings.pressure * np.pi * radius**2
+    force = settings.force * (highest / settings.force) ** generator.random((count, most))
+    absent = np.arange(most) >= number[:, None]
+
+    offset, (lows, highs) = np.empty((count, most, 2)), np.empty((2, count, 2))
+    misfits, todo = np.zeros(count), np.arange(count)
+    for _ in range(_TRIES):
+        chance = generator.random((count, most, 2))[todo]
+        reach = radius[todo][..., None]
+        centre = reach + chance * (np.array(size) - 2 * reach)
+        hidden = absent[todo][..., None]
+        first = centre[:, 0]
+        low = np.where(hidden, np.inf, centre - reach).min(axis=1) - first
+        high = np.where(hidden, -np.inf, centre + reach).max(axis=1) - first
+        offset[todo], lows[todo], highs[todo] = centre - first[:, None], low, high
+        fits = (high - low + settings.spare <= size).all(axis=1)
+        fits &= _separate(centre, radius[todo], absent[todo], settings.apart)
+        misfits[todo[~fits]] += 1
+        todo = todo[~fits]
+        if not len(todo):
+            return Group(number, shape, radius, force, offset, lows, highs, misfits)
+    raise InputError(
+        f"a sheet of {size[0]:g} x {size[1]:g} m has no room for {number[todo].max()} fingertips of "
+        f"touch.radius={list(settings.radius)} m with touch.spare={settings.spare:g} m: lower "
+        "touch.contacts, touch.radius, touch.apart or touch.spare"
+    )
+
+
+def _separate(centre: np.ndarray, radius: np.ndarray, absent: np.ndarray, apart: float) -> np.ndarray:
+    """Return whether all fingertips (B, K, 2) of a touch are apart, (B,), bool."""
+    first, second = np.triu_indices(centre.shape[1], 1)
+    distance = np.linalg.norm(centre[:, first] - centre[:, second], axis=2)
+    free = distance >= radius[:, first] + radius[:, second] + apart
+    return (free | absent[:, first] | absent[:, second]).all(axis=1)
+
+
+def half_extents(shapes: Shapes) -> np.ndarray:
+    """Return half the larger extent of each shape, (N,), in scales: a picture has a black border."""
+    return np.array([np.ptp(hull, axis=0).max() / 2 for hull in shapes.hulls])
+
+
+def peak_per_newton(shapes: Shapes, shape: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return the highest pressure of shapes under 1 N, Pa; of the whole pictures, whatever the cells.
+
+    Args:
+        shapes: the pictures.
+        shape: indices.
+        radius: half the larger extent of each, m.
+    """
+    covers = np.array([_cover(name, shapes.contact) for name in shapes.names])
+    return 1 / (covers[shape] * radius**2)
+
+
+@cache
+def _cover(name: str, contact: float) -> float:
+    """Return the force of a picture of 1 Pa by the square of its radius: pi for a disc."""
+    picture = load_image(name)
+    extents = [np.ptp(places) + 1 for places in np.nonzero(picture > contact)]
+    return picture.sum() / (max(extents) / 2) ** 2
+
+
+@final
+class FingertipSampler(AbstractSampler):
+    """Draws fingertips with wanted labels ``dynamic`` and ``press``, and renders their movies.
+
+    All fingertips of a touch rise and fall together and slide along the same path, each with its own force.
+    The other labels are what the movie gives: a touch is hardly ever big or dangerous.
+
+    Args:
+        body, footprints, contact, padded, moments: as of :class:`skin.touch.sampler.AbstractSampler`.
+        settings: ranges of the fingertips.
+
+    Raises:
+        InputError: settings or pictures that cannot be used, or a contact that solves for the pressure.
+    """
+
+    chosen = ("dynamic", "press")
+    settings: FingertipSettings
+
+    def __init__(
+        self,
+        body: AbstractBody,
+        footprints: np.ndarray,
+        contact: ContactModel,
+        settings: FingertipSettings,
+        padded: bool = True,
+        moments: np.ndarray | None = None,
+    ) -> None:
+        if not contact.proportional:
+            raise InputError(
+                "fingertips are softer than the skin and press as their picture: set contact=prescribed, or "
+                "touch=gestures for rigid objects"
+            )
+        super().__init__(body, footprints, contact, settings, padded, moments)
+
+    def balanced(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Return label combinations (count, 4), bool: all four of dynamic and press equally often."""
+        codes = generator.permutation(generator.permutation(4)[np.arange(count) % 4])
+        labels = np.zeros((count, len(TOUCH)), bool)
+        labels[:, _DYNAMIC], labels[:, _PRESS] = codes & 1, codes >> 1
+        return labels
+
+    @torch.no_grad()
+    def sample(self, count: int, generator: np.random.Generator, labels: np.ndarray | None = None) -> Movie:
+        """Return the movies of ``count`` touches.
+
+        Args:
+            count: B.
+            generator: source of randomness; it draws for all touches in every round.
+            labels: (B, 4), bool, the wanted combinations of ``dynamic`` and ``press``; None: balanced.
+
+        Raises:
+            InputError: other labels are wanted, or the sheet has no room.
+        """
+        wanted = self.balanced(count, generator) if labels is None else np.asarray(labels, bool)
+        self._check(wanted)
+        pending, movies, finished = np.arange(count), list[Movie](), list[np.ndarray]()
+        for attempt in range(1, self.settings.redraws + 1):
+            movie = self._draw(wanted, generator, pending, attempt)
+            columns = [_DYNAMIC, _PRESS]
+            right = (movie.labels.numpy()[:, columns] == wanted[pending][:, columns]).all(axis=1)
+            movies.append(movie[torch.from_numpy(np.flatnonzero(right))])
+            finished.append(pending[right])
+            pending = pending[~right]
+            if not len(pending):
+                order = np.concatenate(finished).argsort()
+                return join_movies(movies)[torch.from_numpy(order)]
+        raise InputError(
+            f"no touch of fingertips in {self.settings.redraws} draws was "
+            + ", ".join(f"{'' if wanted[pending[0], n] else 'not '}{TOUCH.names[n]}" for n in columns)
+            + ": touch.thresholds and the ranges under touch rule it out"
+        )
+
+    def _check(self, wanted: np.ndarray) -> None:
+        others = [n for n, name in enumerate(TOUCH.names) if name not in self.chosen]
+        if refused := [TOUCH.names[n] for n in others if wanted[:, n].any()]:
+            raise InputError(
+                f"fingertips cannot be drawn to be {' or '.join(refused)}, only dynamic, press or neither: "
+                "set touch=gestures"
+            )
+
+    def _draw(
+        self, wanted: np.ndarray, generator: np.random.Generator, rows: np.ndarray, attempt: int
+    ) -> Movie:
+        """Draw all touches and return the movie of some rows, (b,)."""
+        settings, size, count = self.settings, self.body.size, len(wanted)
+        group = draw_groups(count, settings, len(self.shapes.names), size, generator)
+        drawn: Draws = {
+            "low": group.low,
+            "high": group.high,
+            "shape": group.shape[:, 0],
+            "angle": np.zeros(count),
+            "stretch": np.ones(count),
+            "scale": group.radius[:, 0],
+            "misfits": group.misfits,
+            "peak": np.zeros(count),  # of sample_paths, which only passes it on
+        } | draw_times(wanted, settings, self.padded, generator)
+        chance = generator.random((count, 4))
+        drawn |= draw_motion(wanted[:, _DYNAMIC], drawn, settings, size, chance)
+        drawn["draws"] = np.full(count, float(attempt))
+        mine = {name: values[rows] for name, values in drawn.items()}
+        return self._render(mine, Group(*(values[rows] for values in group)), wanted[rows])
+
+    def _render(self, drawn: Draws, group: Group, wanted: np.ndarray) -> Movie:
+        """Return the movie of drawn touches (B,) with its labels."""
+        settings = self.settings
+        paths = sample_paths(drawn, wanted, settings, proportional=True)
+        index, profile = paths.trajectories.index, paths.trajectories.profile
+        scale = group.radius / half_extents(self.shapes)[group.shape]
+        frames, highest, area = self._pressure(paths, group, scale)
+        weights = self.footprints if self.moments is None else self.moments
+        contact = settings.thresholds.contact
+        measures = measure_gestures(frames, index, profile, weights, self.body.cell, contact, area)
+        present = np.arange(group.radius.shape[1]) < group.number[:, None]
+        peak = (highest[index] * profile).amax(1).double().numpy()
+        values = peak, (group.force * present).sum(axis=1), drawn["draws"]
+        parameters = describe_touches(drawn, paths, values, measures)
+        parameters["contacts"] = torch.from_numpy(group.number).float()
+        pressures = group.force * peak_per_newton(self.shapes, group.shape, group.radius)
+        contacts = _contacts(paths, group, pressures, present)
+        labels = measures.labels(settings.thresholds, settings.rate)
+        return Movie(frames, index, profile, labels, parameters, steer(paths, settings.shear), contacts)
+
+    def _pressure(
+        self, paths: SampledPaths, group: Group, scale: np.ndarray
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return what all fingertips press at full force.
+
+        Returns:
+            The sum of their pressures, (U, H, W), Pa, the highest one, (U,), Pa, and the share of the sheet
+            in contact, (U,), or None where cells are counted.
+        """
+        owner, place = paths.trajectories.owner, paths.trajectories.place
+        frames = torch.zeros(len(owner), *self.body.shape)
+        highest, areas = torch.zeros(2, len(owner))
+        cell = float(np.prod(self.body.cell))
+        for k in range(scale.shape[1]):
+            rows = np.flatnonzero(group.number[owner] > k)
+            # Sorted by scale, because frames of one texture level are rendered together.
+            rows = rows[np.argsort(scale[owner[rows], k], kind="stable")]
+            mine, todo = owner[rows], torch.from_numpy(rows)
+            centres = place[rows] + group.offset[mine, k]
+            pose = group.shape[mine, k], np.zeros(len(rows)), scale[mine, k], centres
+            full = torch.from_numpy(group.force[mine, k] / cell).float()
+            if self.shapes.fine:
+                shares, peak, area = self.shapes.press(*pose)
+                areas[todo] += torch.from_numpy(area).float()
+                highest[todo] = torch.maximum(highest[todo], full * peak)
+            else:
+                shares = self.shapes.render(*pose)
+            frames[todo] += shares * full[:, None, None]
+        if self.shapes.fine:
+            return frames, highest, areas
+        return frames, frames.flatten(1).amax(1), None
+
+
+def _contacts(paths: SampledPaths, group: Group, highest: np.ndarray, present: np.ndarray) -> Tensor:
+    """Return the contacts at each time, (B, T, K, 5), float32, columns :data:`CONTACT`; NaN without contact.
+
+    Args:
+        paths: of the touches.
+        group: their fingertips.
+        highest: (B, K), highest pressure at full force, Pa.
+        present: (B, K), bool.
+    """
+    profile = paths.trajectories.profile.double().numpy()[..., None]
+    places = paths.trajectories.place[paths.trajectories.index.numpy()]
+    centre = places[:, :, None] + group.offset[:, None]
+    values = np.empty((*centre.shape[:3], len(CONTACT)))
+    values[..., :2], values[..., 2] = centre, group.radius[:, None]
+    values[..., 3], values[..., 4] = group.force[:, None] * profile, highest[:, None] * profile
+    values[~present[:, None] | (profile == 0)] = np.nan
+    return torch.from_numpy(values).float()

@@ -1,0 +1,105 @@
+"""Contacts of fingertips travel with the touches, and what does not know them says so."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from skin.body.base import Sheet
+from skin.body.layout import Grid
+from skin.core.rng import Stream
+from skin.device.files import describe_recording, read_description, read_recording, write_recording
+from skin.device.simulated import Simulated
+from skin.device.touches import Touches, concatenate, join_contacts
+from skin.learning.data import Augmentation
+from skin.mechanics.simulator.naive import Naive
+
+BODY = Sheet([0.16, 0.16], [32, 32], [{"material": "EcoFlex 00-30", "thickness": 0.005}])
+TIPS = {"radius": [0.004, 0.012]}
+
+
+def device(**changes) -> Simulated:
+    settings = {"simulator": Naive, "layout": Grid(3, 3), "touch": TIPS, "gestures": 40, "test_gestures": 16}
+    return Simulated(body=BODY, **(settings | changes))
+
+
+def same(one, other) -> bool:
+    return torch.equal(one.nan_to_num(-1), other.nan_to_num(-1))
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return device().recording()
+
+
+@pytest.mark.parametrize("name", ["x.parquet", "x.csv"])
+def test_a_file_gives_them_back_to_the_last_bit(recording, tmp_path, name):
+    path = write_recording(recording, tmp_path / name)
+    for complete in (True, False):
+        assert same(read_recording(path, complete).touches.contacts, recording.touches.contacts)
+
+
+def test_a_file_of_gestures_has_no_trace_of_them(tmp_path):
+    """So that versions without contacts and this one read each other's files."""
+    gestures = device(touch=None).recording()
+    assert gestures.touches.contacts is None
+    assert "contacts" not in describe_recording(gestures)
+    path = write_recording(gestures, tmp_path / "x.parquet")
+    assert "contacts" not in read_description(path)
+    assert read_recording(path).touches.contacts is None
+
+
+def test_splits_and_drawn_touches_have_them():
+    source = device()
+    for touches in (source.touches("train"), source.touches("test"), source.draw(Stream.ALARM, 5, 0)):
+        assert touches.contacts.shape == (len(touches), 30, 3, 5)
+    assert same(source.touches("train").contacts[3], source.touches("train")[3:4].contacts[0])
+
+
+def test_contacts_press_sensors_that_are_near():
+    """The naive skin reads pressure under a sensor, so a sensor that reads has a contact over it."""
+    perfect = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
+    touches = device(**perfect).touches("test")
+    places = touches.contacts[:, :, None, :, :2] - touches.positions[None, None, :, None, :2]
+    gap = (places.norm(dim=-1) - touches.contacts[:, :, None, :, 2]).nan_to_num(1.0).amin(3)
+    cell = 0.16 / 32
+    assert (touches.readings > 1e-3).any()
+    assert gap[touches.readings > 1e-3].max() < 2 * cell
+    assert (touches.readings[gap < -2 * cell] > 0).all()
+
+
+def test_windows_of_streams_have_those_that_they_show():
+    touches = device(stream=True).touches("test")
+    shown = ~touches.contacts[..., 0].isnan().all(2)
+    assert not shown[touches.labels[:, -1] == 0].any()
+    assert shown[touches.labels[:, -1] == 1].any(1).all()
+    source = device(stream=True, gain_spread=0.0, offset=0.0, noise=0.0, clip=1e9)
+    whole = source.simulate_stream(600).whole
+    assert torch.equal(~whole.touches.contacts[..., 0].isnan().all(2), whole.force > 0)
+
+
+def test_joined_recordings_have_them_where_all_do(recording):
+    other = device(touch=TIPS | {"contacts": [1, 1]}, data_seed=1).recording()
+    contacts = concatenate([recording, other]).touches.contacts
+    assert contacts.shape == (80, 30, 3, 5)
+    assert contacts[40:, :, 1:].isnan().all()
+    assert same(contacts[40:, :, :1], other.touches.contacts)
+    assert join_contacts([contacts, None]) is None
+
+
+def test_a_shifted_touch_has_shifted_contacts():
+    perfect = {"gain_spread": 0.0, "offset": 0.0, "noise": 0.0, "clip": 1e9}
+    touches = device(**perfect, touch=TIPS | {"over_sensors": False}).touches("train")
+    moved = Augmentation(shift=True, reverse=True)(touches, torch.Generator().manual_seed(0))
+    assert not same(moved.contacts, touches.contacts)
+    pressed = moved.readings.sum(2) > 1e-3
+    assert not moved.contacts[..., 0].isnan().all(2)[pressed].any()
+    assert same(*(each.contacts[..., 3].flatten(1).nan_to_num(0).sort(1).values for each in (moved, touches)))
+
+
+@pytest.mark.parametrize("shape", [(2, 4, 3, 4), (2, 5, 3, 5), (1, 4, 3, 5)])
+def test_contacts_of_other_shapes_are_refused(shape):
+    readings = torch.zeros(2, 4, 3)
+    touches = Touches(readings, readings == 0, torch.zeros(3, 3), None, 10.0)
+    with pytest.raises(ValueError, match="contacts must be"):
+        replace(touches, contacts=torch.zeros(shape))

@@ -1,0 +1,336 @@
+"""Foreign files become recordings: each mapping on a sample of a few lines, and what can be wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from skin.body.base import Sensors
+from skin.core.files import CONF, ROOT
+from skin.device.conversion import convert_files
+from skin.device.files import read_recording, write_recording
+from skin.device.formats import read_format
+from skin.errors import InputError
+
+REAL = ROOT.parent / "shared" / "real"
+SHIPPED = sorted(path.stem for path in (CONF / "mapping").glob("*.yaml"))
+PLAIN = {
+    "files": "*.csv",
+    "time": {"column": "t", "unit": "ms"},
+    "channels": {"columns": "s*", "unit": "g"},
+    "segments": {"by": "file", "frames": 4},
+}
+TABLE = "t,s0,s1,label,person\n" + "".join(
+    f"{100 * n},{n},{10 * n},{'press' if n else 'none'},anna\n" for n in range(4)
+)
+
+
+def convert(folder: Path, settings: dict, **files: str):
+    """Write a mapping and files, and return their recording."""
+    for name, text in (files or {"a.csv": TABLE}).items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (folder / "map.yaml").write_text(yaml.safe_dump(settings))
+    return convert_files(read_format(str(folder / "map.yaml")), folder)
+
+
+def plain(**changes) -> dict:
+    """Return the plain mapping with other settings."""
+    return PLAIN | changes
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_mapping_is_valid(name):
+    assert read_format(name).about or name == "folder"
+
+
+def test_units_become_si(tmp_path):
+    recording = convert(tmp_path, PLAIN)
+    gram = 9.80665e-3
+    expected = gram * np.array([[n, 10 * n] for n in range(4)])
+    assert np.allclose(recording.touches.readings[0], expected)
+    assert recording.touches.rate == pytest.approx(10)
+    assert recording.touches.labels is None
+    assert recording.metadata["positions"] == "unknown"
+
+
+def eflesh(folder: Path) -> None:
+    """Write three sessions of ten rows as eFlesh has them: two files without a header, joined by row."""
+    for number in range(3):
+        place = folder / f"2025040{number}_probe"
+        place.mkdir(parents=True)
+        fields = [[1e9 + row, *(10 * row + np.arange(15))] for row in range(10)]
+        states = [[1e9 + row, 315, -100, 288, -1 if row % 2 else 300.0 * row] for row in range(10)]
+        for name, rows in (("sensor_post_baselines", fields), ("states", states)):
+            (place / f"{name}.csv").write_text("\n".join(",".join(map(str, row)) for row in rows))
+
+
+def test_eflesh_has_forces_in_every_other_row(tmp_path):
+    eflesh(tmp_path)
+    recording = convert_files(read_format("eflesh_force"), tmp_path)
+    assert recording.touches.readings.shape == (30, 5, 15)
+    assert torch.allclose(recording.touches.readings[3, 2], 0.1 * (30 + torch.arange(15.0)))
+    assert not recording.touches.readings[:, [0, 1, 3, 4]].any()
+    assert torch.equal(recording.touches.positions[0], recording.touches.positions[2])
+    label = recording.touches.labels[:10, 0]
+    assert label[1::2].isnan().all()
+    assert label[::2].tolist() == [0, 0, 1, 1, 1]  # 10 N are 1020 g
+    force = recording.parameters["force"][:10]
+    assert force[4] == pytest.approx(1.2 * 9.80665)
+    assert force.isnan().tolist() == label.isnan().tolist()
+    assert recording.metadata["groups"] == {"session": [f"2025040{number}_probe" for number in range(3)]}
+    assert recording.parameters["group_session"].tolist() == [0] * 10 + [1] * 10 + [2] * 10
+
+
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
+def test_unknown_labels_and_targets_are_stored(tmp_path, ending):
+    eflesh(tmp_path)
+    recording = convert_files(read_format("eflesh_force"), tmp_path)
+    stored = read_recording(write_recording(recording, tmp_path / f"x.{ending}"))
+    assert torch.equal(stored.touches.labels.isnan(), recording.touches.labels.isnan())
+    for name, values in recording.parameters.items():
+        assert torch.equal(stored.parameters[name].nan_to_num(-1), values.nan_to_num(-1)), name
+    assert stored.metadata["groups"] == recording.metadata["groups"]
+
+
+def test_eflesh_places_begin_at_zero(tmp_path):
+    place = tmp_path / "a"
+    place.mkdir()
+    rows = [(274 + 10 * n, -115 + 20 * n) for n in range(3)]
+    text = "\n".join(f"{n},{x},{y},142" for n, (x, y) in enumerate(rows))
+    (place / "states.csv").write_text(text)
+    fields = "\n".join(",".join(map(str, [n, *range(15)])) for n in range(3))
+    (place / "sensor_post_baselines.csv").write_text(fields)
+    recording = convert_files(read_format("eflesh_place"), tmp_path)
+    assert recording.parameters["x"].tolist() == pytest.approx([0, 0.01, 0.02])
+    assert recording.parameters["y"].tolist() == pytest.approx([0, 0.02, 0.04])
+    assert recording.size == (0.03, 0.03)
+
+
+def test_sdu_is_a_spreadsheet_whose_places_are_groups(tmp_path):
+    pytest.importorskip("openpyxl")
+    import pandas as pd
+
+    rows = [(2 * (n % 3), 0, 0.7, 4.0, 1 + n, 2 + n, 0.9 * n, None) for n in range(9)]
+    table = pd.DataFrame(rows, columns=["X", "Y", "Tl", "Tr", "Pl", "Pr", "F", "Depth"])
+    path = tmp_path / "2D_6060_learning_data.xlsx"
+    table.to_excel(path, index=False)
+    recording = convert_files(read_format("sdu"), path)
+    assert recording.touches.readings[4, 2].tolist() == pytest.approx([5, 6, 0.07, 0.4])
+    assert recording.touches.labels[:, 0].tolist() == [0] * 5 + [1] * 4
+    assert recording.metadata["groups"] == {"place": ["0 0", "2 0", "4 0"]}
+    assert recording.parameters["x"][:3].tolist() == pytest.approx([0, 0.002, 0.004])
+
+
+def test_epi_has_a_touch_in_each_row(tmp_path):
+    values = np.arange(11 * 1200).reshape(11, 12, 100)
+    lines = "\n".join(",".join(map(str, row.ravel())) for row in values)
+    (tmp_path / "training_data_x.csv").write_text(lines)
+    (tmp_path / "training_data_y.csv").write_text("\n".join(map(str, range(10, -1, -1))))
+    recording = convert_files(read_format("epi"), tmp_path)
+    assert torch.allclose(recording.touches.readings[3], torch.tensor(0.1 * values[3].T).float())
+    assert recording.task.kind == "exclusive"
+    assert recording.task.names[:2] == ("hold", "rub")
+    assert recording.touches.labels.argmax(1).tolist() == list(range(10, -1, -1))
+
+
+def test_a_folder_has_contacts_and_persons(tmp_path):
+    for person in ("anna", "ben"):
+        (tmp_path / person).mkdir()
+        for number, gesture in enumerate(("press", "tap", "pat")):
+            rows = ["time,s0,s1,label"]
+            for frame in range(120):
+                force = 100 if 40 <= frame < 60 else 0
+                rows.append(f"{frame / 20:.2f},{500 + force},{400 + number},{gesture}")
+            (tmp_path / person / f"{number}.csv").write_text("\n".join(rows))
+    recording = convert_files(read_format("folder"), tmp_path)
+    assert recording.touches.readings.shape == (6, 30, 2)
+    assert recording.touches.rate == 10
+    peak = recording.touches.readings[0, :, 0]
+    assert peak.nonzero().flatten().tolist() == list(range(5, 15))  # 20 rows at 20 Hz, 10 at 10 Hz
+    assert peak.max() == pytest.approx(2.0)
+    assert recording.touches.labels[:, 0].nan_to_num(-1).tolist() == [1, 0, -1] * 2
+    assert recording.metadata["groups"] == {"person": ["anna", "ben"]}
+
+
+def test_a_second_file_is_joined_by_time(tmp_path):
+    """As a velostat sensor at 143 Hz and a gauge at 333 Hz, both separated by blanks."""
+    sensor = "\n".join(f"{n}   {1.7e9 + 0.007 * n:.6f}" for n in range(10))
+    gauge = "\n".join(f"{100 * n} {1.7e9 + 0.003 * n:.6f}" for n in range(12))
+    blanks = {"header": False, "delimiter": "whitespace"}
+    settings = {
+        "files": "velostat.csv",
+        "table": blanks,
+        "join": {
+            "file": "gauge.csv",
+            "by": "time",
+            "clock": "clock",
+            "tolerance": 0.002,
+            "table": blanks | {"names": ["gauge", "clock"]},
+        },
+        "time": {"column": 2, "unit": "s"},
+        "channels": {"columns": [1], "unit": "adc", "scale": 0.5},
+        "segments": {"by": "row", "frames": 1, "before": 0},
+        "targets": {"force": {"column": "gauge", "unit": "mN"}},
+    }
+    recording = convert(tmp_path, settings, **{"velostat.csv": sensor, "gauge.csv": gauge})
+    assert recording.touches.readings.flatten().tolist() == [0.5 * n for n in range(10)]
+    near = [round(7 * n / 3) for n in range(5)]  # the gauge ends at 33 ms, within 2 ms of row 5
+    assert recording.parameters["force"][:5].tolist() == pytest.approx([0.1 * n for n in near])
+    assert recording.parameters["force"][6:].isnan().all()
+
+
+def test_rows_of_a_mat_are_one_frame(tmp_path):
+    frames = np.arange(3 * 4 * 5).reshape(3, 4, 5)
+    text = "\n".join(";".join(f"{value:03d},5" for value in row) for frame in frames for row in frame)
+    settings = {
+        "files": "mat.txt",
+        "table": {"header": False, "delimiter": ";", "decimal": ",", "lines": 4},
+        "rate": 25.0,
+        "channels": {"columns": "*", "unit": "counts", "scale": 1.0},
+        "segments": {"by": "windows", "frames": 2, "step": 1},
+    }
+    recording = convert(tmp_path, settings, **{"mat.txt": text})
+    assert recording.touches.readings.shape == (2, 2, 20)
+    assert torch.equal(recording.touches.readings[1, 0], torch.tensor(frames[1].ravel() + 0.5).float())
+    assert recording.touches.rate == 25
+
+
+@pytest.mark.parametrize(
+    ("baseline", "first"),
+    [
+        ({"kind": "none"}, [7, 7, 9, 7]),
+        ({"kind": "first", "rows": 2}, [0, 0, 2, 0]),
+        ({"kind": "idle"}, [0, 0, 2, 0]),
+        ({"kind": "segment", "rows": 3}, [-2 / 3, -2 / 3, 4 / 3, -2 / 3]),
+    ],
+)
+def test_a_baseline_is_subtracted(tmp_path, baseline, first):
+    text = "t,s0\n" + "".join(f"{100 * n},{value}\n" for n, value in enumerate([7, 7, 9, 7]))
+    channels = {"columns": ["s0"], "unit": "N"}
+    recording = convert(tmp_path, plain(baseline=baseline, channels=channels), **{"a.csv": text})
+    assert recording.touches.readings.flatten().tolist() == pytest.approx(first)
+
+
+@pytest.mark.parametrize(("combine", "value"), [("normal", [12, 3]), ("magnitude", [13, 5])])
+def test_three_axes_become_one_reading(tmp_path, combine, value):
+    text = "t,a,b,c,d,e,f\n0,3,4,12,0,4,3\n100,3,4,12,0,4,3\n"
+    channels = {"columns": list("abcdef"), "unit": "N", "per_sensor": 3, "combine": combine}
+    recording = convert(tmp_path, plain(channels=channels), **{"a.csv": text})
+    assert recording.touches.readings[0, 0].tolist() == value
+    assert recording.touches.positions.shape == (2, 3)
+
+
+def test_a_missing_value_is_invalid(tmp_path):
+    text = "t,s0,s1\n0,1,2\n100,,3\n200,-999,4\n"
+    recording = convert(tmp_path, plain(table={"missing": [-999]}), **{"a.csv": text})
+    assert recording.touches.valid[0, :3, 0].tolist() == [True, False, False]
+    assert recording.touches.readings[0, 1:3, 0].tolist() == [0, 0]
+
+
+def test_positions_are_of_the_mapping_or_of_the_layout(tmp_path):
+    stated = plain(positions=[[0.01, 0.02], [0.03, 0.02]], size=[0.05, 0.04])
+    recording = convert(tmp_path, stated)
+    assert np.allclose(recording.touches.positions, [[0.01, 0.02, 0], [0.03, 0.02, 0]])
+    assert recording.size == (0.05, 0.04)
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(plain(positions="layout")))
+    sensors = Sensors(np.array([[0.1, 0.1, 0.01], [0.2, 0.1, 0.01]]), (0.02, 0.02))
+    recording = convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path, sensors, (0.3, 0.2))
+    assert np.allclose(recording.touches.positions, sensors.positions)
+    assert (recording.size, recording.footprint) == ((0.3, 0.2), (0.02, 0.02))
+    with pytest.raises(InputError, match="needs a skin: give layout=file"):
+        convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path)
+
+
+PRESS = {"press": {"column": "label", "values": {"press": 1, "none": 0}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"files": "*.txt"}, r"has no file \*\.txt: give the folder of the recordings, path=FOLDER"),
+        ({"channels": {"columns": ["s0", "s7"], "unit": "N"}}, r"has no column s7, which channels.columns"),
+        ({"channels": {"columns": "q*", "unit": "N"}}, r"has no column q\*"),
+        ({"channels": {"columns": ["s0"]}}, "channels needs unit, got columns"),
+        ({"channels": {"columns": ["s0"], "unit": "V"}}, "unit=V is no force .*: add channels.scale"),
+        ({"channels": {"columns": ["label"], "unit": "N"}}, "column label has 'none' in row 1, no number"),
+        ({"channels": {"columns": ["s0"], "unit": "N", "per_sensor": 3}}, "1 columns of channels are not"),
+        ({"time": {"column": "clock", "unit": "s"}}, "has no column clock, which time names: it has t, s0"),
+        ({"time": {"column": "t", "unit": "hours"}}, "time.unit=hours must be 's', 'ms', 'us' or 'min'"),
+        ({"time": None}, "add time, as in time: .* or rate, Hz"),
+        (
+            {"targets": {"force": {"column": "s0", "unit": "mm"}}},
+            "targets.force with unit mm: its units are N",
+        ),
+        ({"targets": {"weight": {"column": "s0", "unit": "N"}}}, "targets.weight .* there are x, y, force"),
+        ({"labels": PRESS}, "label press contradicts itself in rows 1 to 4, with none and press"),
+        ({"labels": {"press": {"column": "label", "values": {"tap": 1}}}}, "press is unknown in all touches"),
+        ({"labels": {"press": {"column": "label"}}}, "labels.press needs column and values"),
+        ({"labels": {"press": {"column": "label", "values": {"press": 2}}}}, "values must be 0 or 1"),
+        ({"labels": PRESS, "classes": {"column": "label"}}, "give labels or classes, not both"),
+        ({"classes": {"column": "person"}}, "fewer than two of the classes anna"),
+        ({"groups": ["session"]}, "has no column session, which groups names"),
+        ({"groups": ["label"]}, "each touch needs one group, got none and press"),
+        ({"fields": "(?P<a"}, "fields is no regular expression"),
+        ({"fields": "(?P<person>[0-9]+)"}, "a.csv does not fit the regular expression"),
+        ({"join": {"file": "none.csv"}}, "cannot read .*none.csv: .*No such file"),
+        ({"join": {"file": "a.csv"}}, "both have a column t: give join.table.names"),
+        ({"segments": {"by": "contact", "threshold": 100.0}}, "has no touch: lower segments.threshold"),
+        ({"segments": {"by": "press"}}, "segments.by=press must be 'row', 'file'"),
+        ({"positions": [[0, 0]], "size": [0.1, 0.1]}, "2 readings of 1 per sensor, positions are 1"),
+        ({"colour": "red"}, "map.yaml has no setting colour"),
+    ],
+)
+def test_a_wrong_mapping_is_one_sentence(tmp_path, changes, message):
+    settings = {name: value for name, value in plain(**changes).items() if value is not None}
+    with pytest.raises(InputError, match=message) as refused:
+        convert(tmp_path, settings)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,s0,s1\n0,1,1\n200,1,1\n100,1,1\n", "time goes backwards at row 3, from 0.200000 to 0.100000 s"),
+        ("t,s0,s1\n0,1,1\n0,1,1\n", "its times do not differ"),
+        ("t,s0,s1\n", "has no rows"),
+        ("", "cannot read .*No columns"),
+        ("t,s0,s1\n0,1\n0,1,2,3,4\n", "cannot read .*line 3"),
+        ("t,s0,s0 \n0,1,1\n", "several columns are called s0"),
+    ],
+)
+def test_a_wrong_file_is_one_sentence(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as refused:
+        convert(tmp_path, PLAIN, **{"a.csv": text})
+    assert "\n" not in str(refused.value)
+
+
+def test_an_encoding_that_does_not_fit_is_named(tmp_path):
+    (tmp_path / "a.csv").write_bytes("t,s0,s1,Kraft \xe4\n0,1,1,1\n100,2,2,2\n".encode("latin-1"))
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(PLAIN))
+    with pytest.raises(InputError, match=r"cannot read .*utf-8"):
+        convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path)
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(plain(table={"encoding": "latin-1"})))
+    assert len(convert_files(read_format(str(tmp_path / "map.yaml")), tmp_path)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real recordings")
+@pytest.mark.parametrize(
+    ("name", "folder", "shape", "known"),
+    [
+        ("eflesh_force", "eflesh/normal_force", (10800, 5, 15), 5580),
+        ("eflesh_place", "eflesh/spatial_resolution", (9610, 5, 15), 9610),
+        ("sdu", "sdu_fsi", (15376, 5, 4), 15376),
+    ],
+)
+def test_real_recordings_are_converted(name, folder, shape, known):
+    if name == "sdu":
+        pytest.importorskip("openpyxl")
+    recording = convert_files(read_format(name), REAL / folder)
+    assert recording.touches.readings.shape == shape
+    assert int((~recording.touches.labels[:, 0].isnan()).sum()) == known
+    assert recording.touches.valid.all()

@@ -1,0 +1,62 @@
+"""Units of a bench: what fits is named, and a setting converts it."""
+
+import numpy as np
+import pytest
+
+from skin.errors import InputError
+from skin.hardware.bench import Units, read_bench_session, write_bench_session
+from skin.hardware.bench_protocol import emulate_session
+from skin.hardware.calibration import check_force, fit_calibration
+from skin.hardware.wiring import Confirmed, wired_bench
+from tests.hardware.test_fit import PROTOCOL, device
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    skin, randomness = device(), np.random.default_rng(0)
+    gauge = PROTOCOL.gauge(PROTOCOL.places(skin, randomness))
+    session = emulate_session(skin, gauge, PROTOCOL, randomness, 12)
+    path = write_bench_session(session, tmp_path_factory.mktemp("units") / "bench.csv")
+    return path, [line.split(",") for line in path.read_text().splitlines()]
+
+
+def changed(rows, tmp_path, **factors):
+    source, lines = rows
+    names = [name.strip('"') for name in lines[0]]
+    table = [list(line) for line in lines]
+    for name, factor in factors.items():
+        for line in table[1:]:
+            place = names.index(name)
+            line[place] = line[place] and repr(float(line[place]) * factor)
+    path = tmp_path / "bench.csv"
+    path.write_text("\n".join(map(",".join, table)) + "\n")
+    path.with_name("bench.csv.json").write_text(source.with_name("bench.csv.json").read_text())
+    return path
+
+
+@pytest.mark.parametrize(("factor", "unit", "scale"), [(1000, "ms", 0.001), (1 / 60, "minutes", 60)])
+def test_times_in_another_unit_are_named(rows, tmp_path, factor, unit, scale):
+    path = changed(rows, tmp_path, time=factor)
+    with pytest.raises(InputError, match=f"{unit} would be 100 Hz: add calibrate.time_scale={scale}"):
+        read_bench_session(path, "disc", 0.01)
+    session = read_bench_session(path, "disc", 0.01, units=Units(time_scale=scale))
+    assert np.median(np.diff(session.time)) == pytest.approx(0.01)
+    assert len(session.gauge) == 12
+
+
+def test_a_gauge_that_counts_downwards_is_named(rows, tmp_path):
+    path = changed(rows, tmp_path, force=-1)
+    with pytest.raises(InputError, match=r"add calibrate\.force_scale=-1"):
+        read_bench_session(path, "disc", 0.01)
+    assert read_bench_session(path, "disc", 0.01, units=Units(force_scale=-1.0)).gauge.force.max() > 100
+
+
+@pytest.mark.parametrize(("unit", "newtons"), [("kg", 9.80665), ("g", 0.00980665), (None, 1.0)])
+def test_forces_in_another_unit_are_named(rows, tmp_path, unit, newtons):
+    session = read_bench_session(changed(rows, tmp_path, force=1 / newtons), "disc", 0.01)
+    calibration = fit_calibration(wired_bench(device(), session, None, Confirmed()))
+    if unit is None:
+        check_force(calibration, 10.0)
+        return
+    with pytest.raises(InputError, match=f"seems to be in {unit}; add calibrate.force_scale={newtons:g}"):
+        check_force(calibration, 10.0)

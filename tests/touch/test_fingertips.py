@@ -1,0 +1,188 @@
+"""Fingertips press where their contacts say, as hard as they say, and are labelled by what they do."""
+
+import numpy as np
+import pytest
+import torch
+
+from skin.body.base import Arm, Sheet
+from skin.body.layout import Grid
+from skin.errors import InputError
+from skin.mechanics.contact.prescribed import Prescribed
+from skin.touch.fingertips import FingertipSampler, FingertipSettings, read_touch
+from skin.touch.gesture import GestureSettings
+from skin.touch.labels import Thresholds
+from skin.touch.movie import join_movies, movie_labels
+
+LAYER = [{"material": "EcoFlex 00-30", "thickness": 0.005}]
+BODIES = {
+    "sheet": Sheet([0.16, 0.16], [64, 64], LAYER),
+    "oblong": Sheet([0.20, 0.12], [50, 36], LAYER),
+    "arm": Arm(radius=0.05, length=0.2, angle=2.4, cells=[40, 64], layers=LAYER),
+}
+
+
+def sampler(body=BODIES["sheet"], padded=True, **settings) -> FingertipSampler:
+    footprints = body.footprints(Grid(3, 3).sensors(body))
+    return FingertipSampler(body, footprints, Prescribed(), FingertipSettings(**settings), padded)
+
+
+@pytest.fixture(scope="module", params=BODIES)
+def sampled(request):
+    """A sampler, its movie, the dense pressure and the contacts, whose absent ones are 0."""
+    source = sampler(BODIES[request.param])
+    movie = source.sample(160, np.random.default_rng(3))
+    return source, movie, movie.pressure().double(), movie.contacts.double().nan_to_num(0)
+
+
+def test_the_pressure_is_that_of_the_contacts(sampled):
+    source, movie, pressure, contacts = sampled
+    width, height = source.body.cell
+    x, y, _, force, _ = contacts.unbind(-1)
+    np.testing.assert_allclose(pressure.sum((2, 3)) * width * height, force.sum(2), atol=1e-4)
+    np.testing.assert_allclose(movie.force, force.sum(2), rtol=1e-5)
+    centres = (
+        (torch.arange(count) + 0.5) * size
+        for count, size in zip(source.body.cells, (width, height), strict=True)
+    )
+    along, down = (centre.double() for centre in centres)
+    touched = force.sum(2) > 0
+    for moments, places in ((pressure.sum(2) @ along, x), (pressure.sum(3) @ down, y)):
+        middle = moments * width * height / force.sum(2)
+        expected = (places * force).sum(2) / force.sum(2)
+        assert (middle - expected)[touched].abs().max() < 0.1 * max(width, height)
+
+
+def test_contacts_are_absent_where_nothing_presses(sampled):
+    _, movie, _, _ = sampled
+    absent = movie.contacts.isnan()
+    assert (absent.all(-1) == absent.any(-1)).all()
+    present = ~absent[..., 0]
+    assert (present.any(2) == (movie.scale > 0)).all()
+    number = movie.parameters["contacts"]
+    assert (present.sum(2).amax(1) == number).all()
+    assert set(number.tolist()) == {1, 2, 3}
+
+
+def test_contacts_are_within_their_ranges(sampled):
+    source, movie, _, _ = sampled
+    settings = source.settings
+    contacts = movie.contacts.double()
+    x, y, radius, force, peak = contacts[~contacts[..., 0].isnan()].unbind(-1)
+    assert settings.radius[0] <= radius.min() * (1 + 1e-6)
+    assert radius.max() <= settings.radius[1] * (1 + 1e-6)
+    mean = force / (torch.pi * radius**2)
+    assert mean.max() <= settings.pressure * (1 + 1e-5)
+    # The rim of the disc is softened over one of the picture's 96 pixels.
+    assert (peak / mean).numpy() == pytest.approx(1.0, abs=0.02)
+    full = (contacts[..., 3] / movie.scale[..., None]).nan_to_num(1e9)
+    assert full.min() >= settings.force * (1 - 1e-5)
+    width, height = source.body.size
+    assert ((x >= radius - 1e-6) & (x <= width - radius + 1e-6)).all()
+    assert ((y >= radius - 1e-6) & (y <= height - radius + 1e-6)).all()
+
+
+def test_fingertips_are_apart(sampled):
+    source, movie, _, _ = sampled
+    x, y, radius, _, _ = movie.contacts.double().unbind(-1)
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        gap = torch.hypot(x[..., first] - x[..., second], y[..., first] - y[..., second])
+        gap -= radius[..., first] + radius[..., second]
+        assert gap[~gap.isnan()].min() >= source.settings.apart - 1e-6
+
+
+def test_fingertips_of_a_touch_slide_together(sampled):
+    _, movie, _, _ = sampled
+    for contacts, dynamic in zip(movie.contacts, movie.labels[:, 1], strict=True):
+        places = contacts[~contacts[:, 0, 0].isnan()][:, ~contacts[:, :, 0].isnan().all(0), :2]
+        steps = places.diff(dim=0)
+        assert (steps.abs().sum() > 1e-3) == bool(dynamic)
+        if len(steps):
+            assert (steps - steps[:, :1]).abs().max() < 1e-6
+
+
+def test_labels_are_what_the_movie_gives_and_balanced(sampled):
+    source, movie, pressure, _ = sampled
+    assert torch.equal(movie_labels(pressure.float(), source.footprints, source.body.cell), movie.labels)
+    codes = movie.labels[:, 1:3].numpy() @ [1, 2]
+    assert np.bincount(codes.astype(int), minlength=4).tolist() == [40] * 4
+    assert not movie.labels[:, 0].any()
+
+
+@pytest.mark.parametrize("count", [1, 3, 10, 257])
+def test_counts_of_combinations_differ_by_one_at_most(count):
+    labels = sampler().balanced(count, np.random.default_rng(0))
+    assert np.ptp(np.bincount(labels[:, 1:3] @ [1, 2], minlength=4)) <= 1
+    assert not labels[:, [0, 3]].any()
+
+
+def test_few_fingertips_are_dangerous():
+    """About one in a hundred with the shipped ranges: a tip must press a whole footprint at the limit."""
+    labels = sampler(BODIES["oblong"]).sample(2000, np.random.default_rng(0)).labels
+    assert 0 < labels[:, 3].mean() < 0.03
+
+
+def test_asked_for_labels_are_drawn_and_others_refused():
+    source = sampler()
+    wanted = np.tile([False, True, False, False], (8, 1))
+    assert (source.sample(8, np.random.default_rng(0), wanted).labels[:, 1:3].numpy() == wanted[:, 1:3]).all()
+    for column, name in ((0, "big"), (3, "dangerous")):
+        with pytest.raises(InputError, match=f"cannot be drawn to be {name}, .*touch=gestures"):
+            source.sample(1, np.random.default_rng(0), np.eye(4, dtype=bool)[[column]])
+
+
+def test_the_same_seed_is_the_same_movie_and_redraws_change_no_other_touch():
+    movies = [sampler().sample(24, np.random.default_rng(seed)) for seed in (1, 1, 2)]
+    assert torch.equal(movies[0].pressure(), movies[1].pressure())
+    assert not torch.equal(movies[0].force, movies[2].force)
+    # A path of 1.2 mm that turns at an edge goes no millimetre away: some draws are not dynamic.
+    picky = sampler(path=0.0012, speed=(0.006, 0.006), tap=(0.3, 0.3))
+    movie = picky.sample(200, np.random.default_rng(0))
+    draws = movie.parameters["draws"]
+    assert draws.max() > 1
+    kept = draws == 1
+    first = picky._draw(picky.balanced(200, random := np.random.default_rng(0)), random, np.arange(200), 1)
+    assert torch.equal(movie.contacts[kept].nan_to_num(0), first.contacts[kept].nan_to_num(0))
+
+
+def test_rows_and_joins_keep_the_contacts_beside_the_pressure():
+    movie = sampler().sample(12, np.random.default_rng(0))
+    rows = torch.tensor([7, 3])
+    again = join_movies([movie[rows], movie[:2]])
+    expected = movie.contacts[torch.tensor([7, 3, 0, 1])]
+    assert torch.equal(again.contacts.nan_to_num(0), expected.nan_to_num(0))
+    assert torch.equal(again.pressure().sum((2, 3)) > 0, ~again.contacts[..., 0].isnan().all(2))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"force": 20.0}, r"touch.force=20 N is more than the 6.53 N"),
+        ({"contacts": (0, 2)}, r"touch.contacts=\[0, 2\] must be greater than 0"),
+        ({"contacts": (3, 2)}, r"touch.contacts=\[3, 2\] must be a range"),
+        ({"radius": (0.01, 0.004)}, r"touch.radius=\[0.01, 0.004\] must be a range"),
+        ({"tap": (0.5, 0.6)}, r"touch.tap=\[0.5, 0.6\] s gives"),
+        ({"thresholds": Thresholds(travel=0.5)}, r"no touch of fingertips in 30 draws was dynamic"),
+        ({"radius": (0.03, 0.03)}, r"no room for 3 fingertips of touch.radius=\[0.03, 0.03\] m"),
+        ({"shapes": ("potato",)}, r"no shape potato"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(settings, message):
+    with pytest.raises(InputError, match=message):
+        sampler(BODIES["oblong"], **settings).sample(32, np.random.default_rng(0))
+
+
+def test_rigid_fingertips_are_refused():
+    rigid = type("Rigid", (), {"proportional": False})()
+    with pytest.raises(InputError, match="contact=prescribed, or touch=gestures"):
+        FingertipSampler(BODIES["sheet"], np.zeros((1, 4096)), rigid, FingertipSettings())
+
+
+@pytest.mark.parametrize("settings", [None, {}, {"window": 2.0}, {"shapes": ["disc"]}, GestureSettings()])
+def test_settings_without_one_of_fingertips_are_those_of_gestures(settings):
+    assert isinstance(read_touch(settings), GestureSettings)
+
+
+def test_a_setting_of_fingertips_makes_fingertips():
+    assert read_touch({"radius": [0.004, 0.006], "window": 2.0}).frames.window == 20
+    with pytest.raises(InputError, match="touch has no setting small_area"):
+        read_touch({"radius": [0.004, 0.006], "small_area": [0.1, 0.2]})

@@ -163,14 +163,18 @@ class Units:
     Attributes:
         force_scale: N per unit of the gauge, negative where pressing is; None: N.
         time_scale: s per unit of ``time``; None: s, and a rate that no bench has is refused.
+        command: whose settings these are; errors name it.
     """
 
     force_scale: float | None = None
     time_scale: float | None = None
+    command: str = "calibrate"
 
     def __post_init__(self) -> None:
         if self.force_scale == 0 or (self.time_scale is not None and not self.time_scale > 0):
-            raise InputError("calibrate.force_scale must not be 0, and calibrate.time_scale must be above 0")
+            raise InputError(
+                f"{self.command}.force_scale must not be 0, and {self.command}.time_scale must be above 0"
+            )
 
     def seconds(self, time: np.ndarray, where: str) -> np.ndarray:
         """Return times (N,) in s.
@@ -189,7 +193,7 @@ class Units:
         if near:
             unit = fits[near[0]]
             rate = 1 / (step * unit)
-            hint = f"{near[0]} would be {rate:.4g} Hz: add calibrate.time_scale={unit:g}"
+            hint = f"{near[0]} would be {rate:.4g} Hz: add {self.command}.time_scale={unit:g}"
         raise InputError(
             f"{where}: a row every {step:.4g} s is no rate of a bench "
             f"({_SLOWEST:g} to {_FASTEST:g} Hz); {hint}"
@@ -245,7 +249,7 @@ def gauge_from_table(
     if -force.min() > 2 * force.max():
         raise InputError(
             f"{where}: force goes down to {force.min():g}, so pressing seems to be negative: add "
-            f"calibrate.force_scale={-(units.force_scale or 1.0):g}"
+            f"{units.command}.force_scale={-(units.force_scale or 1.0):g}"
         )
     if force.min() < -0.05 * force.max():
         raise InputError(f"{where}: force must be at least 0 N, got {force.min():g}: zero the gauge")

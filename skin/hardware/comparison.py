@@ -17,15 +17,24 @@ from matplotlib.figure import Figure
 
 from skin.core.files import write
 from skin.core.rng import Stream, generator
+from skin.core.settings import configured
 from skin.device.base import AbstractSimulated
 from skin.device.resampling import resample
 from skin.device.touches import Touches
 from skin.errors import InputError
-from skin.hardware.bench import BenchData, build_bench_data, pressed_peaks, read_bench_session, read_gauge
+from skin.hardware.bench import (
+    BenchData,
+    Units,
+    build_bench_data,
+    pressed_peaks,
+    read_bench_session,
+    read_gauge,
+)
 from skin.hardware.emulator import Gesture, emulated_gestures, gestures_with_labels
 from skin.hardware.recorder import check_session
 from skin.hardware.session import read_session
 from skin.hardware.wire.segmentation import label_text
+from skin.hardware.wiring import turn_gauge
 from skin.plot.figures import COLOURS, save_figure
 from skin.touch.labels import TOUCH
 
@@ -150,11 +159,15 @@ def compare_session(
     if presses is None and holds_gestures(path):
         return compare_gestures(device, path, settings["seed"])
     shape = settings["indenter"], settings["radius"]
-    session = read_bench_session(path, *shape, settings["unit"])
+    scales = {name: settings[name] for name in ("force_scale", "time_scale")}
+    units = configured(Units, scales | {"command": "compare"}, "compare")
+    session = read_bench_session(path, *shape, settings["unit"], units)
     calibration = device.imperfection.calibration
     if calibration is not None and calibration.channels and session.channels is None:
         session = replace(session, raw=session.raw[:, list(calibration.channels)])
-    rows = None if presses is None else read_gauge(presses, *shape, settings["delay"])
+    rows = session.gauge if presses is None else read_gauge(presses, *shape, settings["delay"], units)
+    if rows is not None:
+        rows = turn_gauge(rows, settings["places"], device.size)
     return compare_presses(device, build_bench_data(device, session, rows), settings["scale"])
 
 

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
+from skin.core.files import CONF
+from skin.core.safe_loading import load_yaml
 from skin.errors import InputError
 from skin.hardware.bench import Units, read_bench_session, write_bench_session
 from skin.hardware.bench_protocol import emulate_session
 from skin.hardware.calibration import check_force, fit_calibration
+from skin.hardware.comparison import compare_session
 from skin.hardware.wiring import Confirmed, wired_bench
 from tests.hardware.test_fit import PROTOCOL, device
 
@@ -49,6 +52,23 @@ def test_a_gauge_that_counts_downwards_is_named(rows, tmp_path):
     with pytest.raises(InputError, match=r"add calibrate\.force_scale=-1"):
         read_bench_session(path, "disc", 0.01)
     assert read_bench_session(path, "disc", 0.01, units=Units(force_scale=-1.0)).gauge.force.max() > 100
+
+
+def test_a_comparison_takes_the_units_and_axes_of_the_calibration(rows, tmp_path):
+    """A session that was calibrated with settings is compared with the same ones."""
+    source = load_yaml(CONF / "compare.yaml")["compare"] | {"scale": 0.04}
+    straight = compare_session(device(), str(rows[0]), None, source)
+    path = str(changed(rows, tmp_path, time=1000, force=-1 / 9.80665))
+    with pytest.raises(InputError, match=r"ms would be 100 Hz: add compare\.time_scale=0\.001"):
+        compare_session(device(), path, None, source)
+    with pytest.raises(InputError, match=r"add compare\.force_scale=-1"):
+        compare_session(device(), path, None, source | {"time_scale": 0.001})
+    scales = source | {"time_scale": 0.001, "force_scale": -9.80665}
+    pairs = compare_session(device(), path, None, scales).pairs
+    assert [pair.force for pair in pairs] == pytest.approx([pair.force for pair in straight.pairs])
+    assert [pair.slope for pair in pairs] == pytest.approx([pair.slope for pair in straight.pairs], rel=1e-3)
+    turned = compare_session(device(), str(rows[0]), None, source | {"places": "mirror_y"})
+    assert turned.pairs[0].sensor != straight.pairs[0].sensor
 
 
 @pytest.mark.parametrize(("unit", "newtons"), [("kg", 9.80665), ("g", 0.00980665), (None, 1.0)])

@@ -9,6 +9,8 @@ import pytest
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.core.files import CONF
+from skin.core.safe_loading import load_yaml
 from skin.device.resampling import Frame
 from skin.device.simulated import Simulated
 from skin.errors import InputError
@@ -136,7 +138,7 @@ def test_presses_are_compared_as_gestures_are(device, tmp_path):
     raw[np.flatnonzero(press == 1)[5]] = np.nan
     raw[:, 8] = np.nan
     path = write_bench_session(replace(session, raw=raw), tmp_path / "bench.csv")
-    settings = {"indenter": "disc", "radius": 0.01, "unit": None, "delay": 0.0, "scale": None, "seed": 0}
+    settings = load_yaml(CONF / "compare.yaml")["compare"]
     comparison = compare_session(device, str(path), None, settings)
     assert comparison.things == "presses"
     assert [pair.number for pair in comparison.pairs] == [

@@ -10,6 +10,8 @@ import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
+from skin.core.files import CONF
+from skin.core.safe_loading import load_yaml
 from skin.device.files import read_recording
 from skin.device.simulated import Simulated
 from skin.hardware import bench, bench_protocol
@@ -170,7 +172,7 @@ def test_presses_of_a_bench_session_have_them(device, tmp_path):
     gauge = protocol.gauge(np.array([[0.03, 0.03], [0.08, 0.08]]))
     session = bench_protocol.emulate_session(device, gauge, protocol, np.random.default_rng(0))
     path = bench.write_bench_session(session, tmp_path / "s.parquet")
-    settings = {"indenter": "disc", "radius": 0.01, "unit": None, "delay": 0.0, "scale": None, "seed": 0}
+    settings = load_yaml(CONF / "compare.yaml")["compare"]
     sides = compare_session(device, str(path), None, settings).touches
     for touches in sides:
         assert touches.contacts.shape == (2, 10, 1, 5)

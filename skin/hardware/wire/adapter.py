@@ -69,6 +69,8 @@ class Adapter:
         head, tail: bytes in hexadecimal at the beginning and the end of each binary frame.
         values: fields that are sensors, by number from 0 or by name with ``*``; None: all others.
         drop: fields to leave out.
+        axes: ``plain``: every value is a sensor; ``normal`` or ``magnitude``: three in a row are x, y, z at
+            one place, of which z, or the length, is the sensor.
         counter, time: fields that number the frames and hold the clock; ``auto``: recognised; None: none.
         time_unit: ``s``, ``ms`` or ``us``; None: found in the stream.
         modulus: number at which the counter begins again; None: found in the stream.
@@ -96,6 +98,7 @@ class Adapter:
     tail: str = ""
     values: Sequence[int | str] | None = None
     drop: Sequence[int | str] = ()
+    axes: Literal["plain", "normal", "magnitude"] = "plain"
     counter: int | str | None = "auto"
     time: int | str | None = "auto"
     time_unit: Literal["s", "ms", "us"] | None = None
@@ -289,7 +292,7 @@ class Adapter:
         columns = find_roles(np.array(starts), reader.names(width), None, described)
         if isinstance(columns, int):
             return DetectedFormat(count_seen=columns)
-        total = count * len(columns.roles.values)
+        total = count * columns.roles.sensors
         if sensors not in (None, total):
             return DetectedFormat(count_seen=total)
         line = TextFormat(columns.roles, "none", reader.trailing, reader, self._delimiter(data), False)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _LEADING = 2  # fields before the values that may be a counter and a clock without a name
+_AXES = 3  # values of a sensor that measures along x, y, z
 _MOSTLY = 0.75  # share of the steps, of which one may be a wrap and a few may miss frames
 _REGULAR = 0.1, 10.0  # times the median step of a clock
 _USUAL = 0.01  # s between two frames: the unit whose steps are nearest is taken until the host's clock tells
@@ -78,7 +79,8 @@ def find_roles(
     if adapter.values is not None:
         chosen = resolve(adapter.values, names, count)
     # As many fields as sensors: none is a counter.
-    closed = sensors == (len(free) if adapter.values is None else -1) and not names
+    each = 1 if adapter.axes == "plain" else _AXES
+    closed = sensors == (len(free) / each if adapter.values is None else -1) and not names
     roles: dict[str, int | None] = {}
     for role, behaves, pattern in (("counter", counts, _COUNTERS), ("time", runs, _CLOCKS)):
         setting = getattr(adapter, role)
@@ -91,9 +93,18 @@ def find_roles(
             roles[role] = _recognise(table, names, taken, behaves, pattern)
     others = [place for place in free if place not in roles.values()]
     values = others if adapter.values is None else chosen
-    if not values or (sensors is not None and len(values) != sensors):
-        return len(values)
-    layout = Roles(count, tuple(values), roles["counter"], roles["time"], adapter._numbers)
+    if len(values) % each:
+        raise InputError(
+            f"device.adapter.axes={adapter.axes} takes x, y, z of each place, but {len(values)} values "
+            "are left: leave out the others by drop"
+        )
+    if adapter.axes == "normal":
+        values, each = values[_AXES - 1 :: _AXES], 1
+    if not values or (sensors is not None and len(values) != sensors * each):
+        return len(values) // each
+    layout = Roles(
+        count, tuple(values), roles["counter"], roles["time"], adapter._numbers, adapter.axes == "magnitude"
+    )
     return Columns(layout, *_unit(table, names, roles, adapter))
 
 

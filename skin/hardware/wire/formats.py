@@ -58,6 +58,7 @@ class Roles:
         counter: the field that numbers the frames; None: none does.
         time: the field with the device's clock; None: none has it.
         invalid: numbers that firmware sends instead of a value.
+        magnitude: whether three values in a row are the axes of one sensor, whose value is their length.
     """
 
     count: int
@@ -65,6 +66,12 @@ class Roles:
     counter: int | None = None
     time: int | None = None
     invalid: frozenset[float] = frozenset()
+    magnitude: bool = False
+
+    @property
+    def sensors(self) -> int:
+        """S."""
+        return len(self.values) // (3 if self.magnitude else 1)
 
     def __post_init__(self) -> None:
         first, last = self.values[0], self.values[-1] + 1
@@ -87,6 +94,8 @@ class Roles:
         if self.invalid and not self.invalid.isdisjoint(values.tolist()):
             values[np.isin(values, list(self.invalid))] = nan
             finite = False
+        if self.magnitude:
+            values = np.linalg.norm(values.reshape(-1, 3), axis=1)
         return RawFrame(None if seq is None else int(seq), ticks, values, finite)
 
 
@@ -114,7 +123,7 @@ class TextFormat:
     @property
     def sensors(self) -> int:
         """S."""
-        return len(self.roles.values)
+        return self.roles.sensors
 
     def split(self, data: bytes) -> tuple[list[bytes], bytes]:
         """Return the complete lines, and what is left."""
@@ -132,7 +141,7 @@ class TextFormat:
         if (missing := self.roles.count - len(read.fields)) == 0:
             return read
         if missing != 1 or self.trailing or not self.padded or not ends_with_separator(line):
-            extra = self.roles.count - self.sensors
+            extra = self.roles.count - len(self.roles.values)
             raise FrameError("fields", len(read.fields) - extra)
         return Line([*read.fields, nan], read.check, False)
 
@@ -241,7 +250,7 @@ class FixedFormat:
     @property
     def sensors(self) -> int:
         """S."""
-        return len(self.roles.values)
+        return self.roles.sensors
 
     def split(self, data: bytes) -> tuple[list[bytes], bytes]:
         """Return the frames, the bytes between them as pieces of their own, and what is left."""

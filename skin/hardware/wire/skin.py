@@ -420,6 +420,8 @@ class PortMonitor:
             middle = np.median(row)
             noise = _SPREAD * np.median(np.abs(row - middle))
             text = state if share == 1 else f"{state}, invalid in {1 - share:.0%}"
+            if share == 0 and state == "ok":
+                text = "no value"
             numbers = f"{channel:7d}{row.min():10.5g}{middle:10.5g}{row.max():10.5g}{noise:10.3g}"
             lines.append(f"{numbers}  {text}")
         return "\n".join(lines)

@@ -56,10 +56,13 @@ def packed(kinds, head=b"", tail=b"", check=None, values=lambda n, row: row):
     return frame
 
 
-def matrix(columns, between=b"\n", index=None, end="\n"):
+def matrix(columns, between=b"\n", index=None, end="\n", shape="%d"):
     def frame(n, row):
         rows = np.reshape(row, (-1, columns))
-        lines = [([] if index is None else [str(index + k)]) + words(values) for k, values in enumerate(rows)]
+        lines = [
+            ([] if index is None else [str(index + k)]) + words(values, shape)
+            for k, values in enumerate(rows)
+        ]
         text = "".join(",".join(line) + end for line in lines).encode()
         return text + (between(n) if callable(between) else between)
 
@@ -224,6 +227,35 @@ def test_the_shipped_adapters_read_what_they_are_named_after():
     frames = Decoder(9, adapter=read_adapter("anyskin_binary")).feed(data)
     assert len(frames) >= 199
     assert frames[-1].values.tolist() == rows[-1, :, 1:].astype("f4").ravel().tolist()
+
+
+@pytest.mark.parametrize("axes", ["normal", "magnitude"])
+@pytest.mark.parametrize("kind", ["text", "binary", "rows"])
+def test_three_axes_at_one_place_become_one_sensor(axes, kind):
+    """A chip per row, or all chips in one frame; what one axis lacks, the length lacks, too."""
+    chips = np.random.default_rng(4).normal(0, 50, (60, 5, 3)).round(2)
+    chips[40, 2, 0] = -999
+    head, described = b"", {"kind": "text"}
+    encode = lambda chip: joined(",", shape="%.2f")(0, chip.ravel())  # noqa: E731
+    if kind == "binary":
+        described = {"kind": "binary", "struct": {"xyz": "(15,)<f8"}, "head": "aa 55"}
+        encode = lambda chip: chip.tobytes()  # noqa: E731
+        head = b"\xaa\x55"
+    elif kind == "rows":
+        described = {"kind": "text", "rows": 0}
+        encode = lambda chip: matrix(3, shape="%.2f")(0, chip.ravel())  # noqa: E731
+    adapter = read_adapter({**described, "axes": axes, "invalid": [-999]})
+    data = b"".join(head + encode(chip) for chip in chips) + head
+    for count in (5, None):
+        frames = Decoder(count, adapter=adapter).feed(data)
+        assert len(frames) > 40
+        expected = chips[..., 2] if axes == "normal" else np.sqrt((chips**2).sum(axis=2))
+        for frame, row in zip(frames[::-1], expected[::-1], strict=False):
+            lost = axes == "magnitude" and row[2] > 900
+            assert frame.valid.tolist() == [True, True, not lost, True, True]
+            assert np.allclose(frame.values[frame.valid], row[frame.valid])
+    with pytest.raises(InputError, match=r"axes.* takes x, y, z of each place, but 4 values are left"):
+        Decoder(adapter=Adapter(kind="text", axes=axes)).feed(b"1,2,3,4\n" * 60)
 
 
 def test_fields_are_kept_dropped_and_marked_invalid():

@@ -139,3 +139,13 @@ def test_frames_of_an_open_skin_have_the_channel_marked():
     assert rows[0][1:4] == ["500", "501", "502"]
     assert rows[1][1:4] == ["7", "7", "8"]
     assert " ".join(rows[1][5:]) == "ok, invalid in 9%"
+
+
+def test_a_channel_that_never_sends_a_number_is_not_ok():
+    data = b"".join(line([n, 1000 * n, 500 + n % 3, b"nan"]) for n in range(100))
+    with open_skin("", range(2), opener=lambda: Sent(data)) as skin:
+        monitor = PortMonitor(skin)
+        monitor._frames.extend(skin.read(99, timeout=20))
+        rows = monitor.summary().splitlines()[-2:]
+    assert rows[0].endswith("  ok")
+    assert rows[1].endswith("  no value")

@@ -1,19 +1,21 @@
 """Imperfections of a real device: lag, gain, curve, clip, noise, offset, rounding, dead sensors, tare."""
 
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from annotated_types import Ge, Gt
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from scipy.sparse import csr_array
 from scipy.special import ndtri
 from torch import Tensor
 
 from skin.core.settings import RISING, checked
 from skin.device.calibration import Calibration, read_calibration
 from skin.device.curves import Curves, check_table
-from skin.device.resampling import resample
+from skin.device.resampling import frame_ages, highest_each, resample
 from skin.errors import InputError
 from skin.mechanics.relaxation import apply_hysteresis, first_order_lag, quantize
 
@@ -36,6 +38,7 @@ class Constants(NamedTuple):
         time_constant: of a first-order lag, s; 0: none.
         quantum: step of the converter, N; 0: none.
         exponent, exponent_at: of the sensor's curve (:class:`skin.device.curves.Curves`); 1, N: linear.
+        rate: frames per second, Hz, one number per device.
     """
 
     gain: Tensor
@@ -51,6 +54,7 @@ class Constants(NamedTuple):
     quantum: Tensor
     exponent: Tensor
     exponent_at: Tensor
+    rate: Tensor
 
     def to(self, device: torch.device | str) -> "Constants":
         """Return these constants on ``device``."""
@@ -59,7 +63,7 @@ class Constants(NamedTuple):
 
 _IDLE_FRAMES = 30
 
-_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent")
+_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent", "scale_spread")
 
 Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
 """A number, or a range (least, most) of which each device draws its own."""
@@ -70,10 +74,12 @@ class ImperfectionSettings:
     """Settings of a device's imperfections (``conf/device/simulated.yaml``).
 
     A :data:`Spread` is a number or [least, most]. A device draws one share from 0 to 1, uniformly, and takes
-    that share of all its ranges: a device that drifts much is noisy, too.
+    that share of all its ranges: a device that drifts much is noisy, too. If ``independent``, it draws a
+    share for each range.
 
     Attributes:
         gain_spread: standard deviation of the logarithm of each sensor's gain; the report gives none.
+        scale_spread: of the logarithm of a factor that all gains of a device share.
         offset: standard deviation of each sensor's offset, N, constant in a device.
         noise: standard deviation of the noise in every frame, N.
         clip: largest force that a sensor measures, N.
@@ -92,10 +98,14 @@ class ImperfectionSettings:
         exponent_at: N.
         table: another curve of all sensors: forces and readings, each rising from 0, N; None: the exponent's.
         polarity: -1: the values that the device sends fall with force.
-        rate: frames per second, Hz.
+        rate: frames per second, Hz, or [least, most], of which each device draws one on a logarithmic scale.
+        independent: each range above has a share of its own.
+        aligned: touches begin and end at the edges of the model's intervals; False: anywhere in them, as on
+            a real skin.
     """
 
     gain_spread: Spread = 0.05
+    scale_spread: Spread = 0.0
     offset: Annotated[float, Ge(0)] = 0.1
     noise: Spread = 0.05
     clip: Annotated[float, Gt(0)] = 10.0
@@ -111,7 +121,14 @@ class ImperfectionSettings:
     exponent_at: Annotated[float, Gt(0)] = 2.0
     table: list[list[float]] | None = None
     polarity: Literal[1, -1] = 1
-    rate: Annotated[float, Gt(0)] = 10.0
+    rate: PositiveFloat | Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = 10.0
+    independent: bool = False
+    aligned: bool = True
+
+    @property
+    def slowest(self) -> float:
+        """Least rate of a device, Hz."""
+        return float(self.rate if isinstance(self.rate, int | float) else self.rate[0])
 
 
 @checked("device")
@@ -182,8 +199,15 @@ class Imperfection(ImperfectionSettings):
             )
         idle = values["offset"] + values["noise"] / np.sqrt(_IDLE_FRAMES) * values.pop("idle")
         values["baseline"] = idle if self.tare else np.zeros(shape)
+        least, most = np.log(np.broadcast_to(self.rate, 2))
+        values["rate"] = (
+            np.asarray(self.slowest)
+            if least == most
+            else np.exp(generator.uniform(least, most, (*shape[:-1], 1)))
+        )
         tensors = {name: torch.from_numpy(value).float() for name, value in values.items()}
-        return Constants(**tensors | {"dead": tensors["dead"].bool()})
+        rate = torch.from_numpy(values["rate"])
+        return Constants(**tensors | {"dead": tensors["dead"].bool(), "rate": rate})
 
     def _draw_constants(
         self, shape: tuple[int, ...], generator: np.random.Generator
@@ -191,8 +215,10 @@ class Imperfection(ImperfectionSettings):
         """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
         ranges = {name: getattr(self, name) for name in _SPREADS}
         some = any(isinstance(bounds, list | tuple) for bounds in ranges.values())
-        share = generator.random((*shape[:-1], 1)) if some else np.zeros(())
-        spread = {name: _part(bounds, share) for name, bounds in ranges.items()}
+        shares = dict.fromkeys(ranges, generator.random((*shape[:-1], 1)) if some else np.zeros(()))
+        if self.independent:
+            shares = {name: generator.random((*shape[:-1], 1)) for name in ranges}
+        spread = {name: _part(bounds, shares[name]) for name, bounds in ranges.items()}
         gain = np.exp(spread["gain_spread"] * generator.standard_normal(shape))
         offset = self.offset * generator.standard_normal(shape)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
@@ -204,6 +230,8 @@ class Imperfection(ImperfectionSettings):
         if self.stuck:
             stuck = (rank >= count) & (rank < count + self.stuck)
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
+        if np.any(spread["scale_spread"]):
+            gain = gain * np.exp(spread["scale_spread"] * generator.standard_normal((*shape[:-1], 1)))
         values = {name: np.asarray(float(getattr(self, name))) for name in ("clip", "quantum", "exponent_at")}
         values |= {name: spread[name] for name in ("noise", "hysteresis", "time_constant", "exponent")}
         dead = rank < count + self.stuck + self.saturated
@@ -266,6 +294,27 @@ class Imperfection(ImperfectionSettings):
         output, _ = self._measure(readings, constants, generator, time)
         return torch.where(constants.dead, constants.level, output)
 
+    def is_static(self, constants: Constants, sensors: int) -> bool:
+        """Return whether the sensors follow the force at once and in proportion to it."""
+        in_time = constants.hysteresis.any() or constants.time_constant.any()
+        return not in_time and self._curves(constants, sensors) is None
+
+    def sense(self, force: Tensor, constants: Constants, time: Tensor) -> Tensor:
+        """Return what the sensors respond before the converter, (B, T, S), N: hysteresis, lag, gain, curve.
+
+        Args:
+            force: (B, T, S), true readings, N.
+            constants: of this device.
+            time: of every frame, (T,), s.
+        """
+        if constants.hysteresis.any():
+            force = apply_hysteresis(force, constants.hysteresis)
+        if constants.time_constant.any():
+            force = first_order_lag(force, constants.time_constant, time)
+        scaled = force * constants.gain
+        curves = self._curves(constants, force.shape[-1])
+        return scaled if curves is None else curves.bend(scaled)
+
     def _measure(
         self,
         readings: Tensor,
@@ -275,15 +324,8 @@ class Imperfection(ImperfectionSettings):
     ) -> tuple[Tensor, Tensor]:
         noise = torch.from_numpy(generator.standard_normal(readings.shape, dtype=np.float32))
         if time is None:
-            time = torch.arange(readings.shape[1], device=readings.device) / self.rate
-        force = readings
-        if constants.hysteresis.any():
-            force = apply_hysteresis(force, constants.hysteresis)
-        if constants.time_constant.any():
-            force = first_order_lag(force, constants.time_constant, time)
-        scaled = force * constants.gain
-        if (curves := self._curves(constants, readings.shape[-1])) is not None:
-            scaled = curves.bend(scaled)
+            time = torch.arange(readings.shape[1], device=readings.device) / self.slowest
+        scaled = self.sense(readings, constants, time)
         output, saturated = scaled.clamp(-constants.clip, constants.clip), scaled.abs() > constants.clip
         output += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
         if constants.drift.any():
@@ -307,6 +349,9 @@ def _settings(settings: ImperfectionSettings) -> dict[str, Any]:
 
 
 _QUANTILES = 20000
+_NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
+_SENSED = 10  # times the model's rate at which hysteresis, lag and curve are computed before the converter
+_ELEMENTS = 2**19  # frames times sensors at a time, which the cache holds
 
 
 def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndarray | float = 0.5) -> Tensor:
@@ -325,19 +370,28 @@ def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndar
     """
     batch, window, _ = force.shape
     frames = round(window * rate / model_rate)
+    row = np.arange(batch)[:, None]
     read = np.arange(frames) + np.reshape(phase, (-1, 1))
     place = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
-    now = np.minimum(place.astype(int), window - 1)
-    offset = place - now - 0.5  # from the middle of the interval, in intervals
-    neighbour = now + np.sign(offset).astype(int)
+    now, neighbour, offset = _neighbours(place, window)
     padded = torch.nn.functional.pad(force, (0, 0, 1, 1))
     touched = (padded != 0).any(dim=2, keepdim=True)
     share = torch.from_numpy(np.abs(offset)).to(force)[..., None]
-    row = np.arange(batch)[:, None]
     current, neighbour_value = padded[row, now + 1], padded[row, neighbour + 1]
     # Towards a frame without contact the force is 0 at the edge, which is half an interval away.
     share = torch.where(touched[row, neighbour + 1], share, 2 * share)
     return torch.where(touched[row, now + 1], torch.lerp(current, neighbour_value, share), 0.0)
+
+
+def _neighbours(place: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the frames at places and the nearest ones beside them, -1 to ``window``, and the distances.
+
+    Places are in intervals from the begin of the window, 0 to ``window``; the distances are from the middle
+    of the frame's interval, -0.5 to 0.5.
+    """
+    now = np.minimum(place.astype(int), window - 1)
+    offset = place - now - 0.5
+    return now, now + np.sign(offset).astype(int), offset
 
 
 def measure(
@@ -364,11 +418,122 @@ def measure(
     Returns:
         readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
     """
-    if imperfection.rate <= model_rate:
+    rate = imperfection.rate
+    if not imperfection.aligned or not isinstance(rate, int | float):
+        return _measure_each(imperfection, constants, force, model_rate, noise)
+    if rate <= model_rate:
         return imperfection.apply(force, constants, noise)
-    fine = between_frames(force, model_rate, imperfection.rate, noise.random(len(force)))
+    fine = between_frames(force, model_rate, rate, noise.random(len(force)))
     readings, valid, saturated = imperfection.apply(fine, constants, noise)
-    return _reduce_rate(readings, valid, saturated, (imperfection.rate, model_rate), force.shape[1])
+    return _reduce_rate(readings, valid, saturated, (rate, model_rate), force.shape[1])
+
+
+def _measure_each(
+    imperfection: Imperfection,
+    constants: Constants,
+    force: Tensor,
+    model_rate: float,
+    noise: np.random.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what :func:`measure` does, each gesture read at the rate of its device and at a phase.
+
+    Offset, drift in the middle of the interval, and rounding are added to the maximum of the interval.
+    Hysteresis, lag and curve act before the converter and are computed at ten times the model's rate.
+    """
+    batch, window, sensors = force.shape
+    ratios = np.maximum(np.broadcast_to(constants.rate.numpy().ravel(), batch) / model_rate, 1)
+    shifts = noise.random(batch)
+    if imperfection.aligned:
+        shifts = (0.5 - shifts) / ratios
+    else:
+        # Later by part of an interval; earlier where the window ends with the touch.
+        shifts -= (force[:, -1] != 0).any(dim=1).cpu().numpy()
+    padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
+    if not imperfection.is_static(constants, sensors):
+        fine = _SENSED
+        padded = between_frames(padded, model_rate, fine * model_rate)
+    time = torch.arange(padded.shape[1], device=force.device) / (fine * model_rate)
+    sensed = imperfection.sense(padded, constants, time)
+    highest, saturated = _read_each(sensed, fine, constants, ratios, shifts, window, noise)
+    output = highest.to(force.device) + (constants.offset - constants.baseline)
+    if constants.drift.any():
+        output += constants.drift * ((torch.arange(window)[:, None] + 0.5) / model_rate).to(output)
+    if constants.quantum.any():
+        output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
+    dead = constants.dead.expand(output.shape)
+    return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead
+
+
+def _read_each(
+    sensed: Tensor,
+    fine: int,
+    constants: Constants,
+    ratios: np.ndarray,
+    shifts: np.ndarray,
+    window: int,
+    noise: np.random.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Return the largest reading of every interval, N, and whether it is saturated, (B, window, S).
+
+    Args:
+        sensed: (B, F, S), what the sensors respond, N, ``fine`` times per interval of the model.
+        fine: see above.
+        constants: of the devices; clip and noise are used.
+        ratios: (B,), frames of the device per interval.
+        shifts: (B,), by which touches are later, intervals.
+        window: number of intervals.
+        noise: source of the noise.
+    """
+    batch, _, sensors = sensed.shape
+    values = np.pad(sensed.cpu().numpy(), ((0, 0), (1, 1), (0, 0)))
+    touched = (values != 0).any(axis=2)
+    clip, deviation = (
+        np.broadcast_to(value.numpy(), (batch, 1, sensors))[:, 0]
+        for value in (constants.clip, constants.noise)
+    )
+    highest, limited = (
+        np.empty((batch, window, sensors), np.float32),
+        np.zeros((batch, window, sensors), bool),
+    )
+    frames = np.cumsum(np.ceil(window * ratios - 0.5))
+    parts = np.flatnonzero(np.diff(frames * sensors // _ELEMENTS, prepend=0))
+    for rows in map(slice, [0, *parts], [*parts, batch]):
+        if rows.start == rows.stop:
+            continue
+        gesture, age = frame_ages(ratios[rows], window)
+        place = (window - age - shifts[rows][gesture]) * fine
+        read = _interpolation(place, gesture, touched[rows]) @ values[rows].reshape(-1, sensors)
+        number = gesture * window + window - 1 - np.floor(age).astype(int)
+        over = np.abs(values[rows]).max() > clip[rows].min()
+        if over:
+            limit = clip[rows][gesture]
+            strongest = highest_each(np.abs(read) > limit, number)
+            limited[rows] = strongest.reshape(-1, window, sensors)
+            read = np.clip(read, -limit, limit)
+        error = noise.standard_normal(read.shape, dtype=np.float32)
+        error *= deviation[rows][gesture]
+        read += error
+        highest[rows] = highest_each(read, number).reshape(-1, window, sensors)
+    return torch.from_numpy(highest), torch.from_numpy(limited)
+
+
+def _interpolation(place: np.ndarray, gesture: np.ndarray, touched: np.ndarray) -> csr_array:
+    """Return the weights of frames at places between them, as in :func:`between_frames`.
+
+    Args:
+        place: (N,), in frames from the begin of the window; outside of it nothing touches.
+        gesture: (N,), of each place.
+        touched: (B, F + 2), whether something touches in a frame; one more frame before the first and after
+            the last.
+    """
+    size = touched.shape[1]
+    place = np.clip(place, 0, size - 2)
+    now, neighbour, offset = _neighbours(place, size - 2)
+    column = np.stack([now, neighbour], axis=1) + 1 + size * gesture[:, None]
+    share = np.abs(offset) * np.where(touched.ravel()[column[:, 1]], 1, 2)
+    weights = np.stack([1 - share, share], axis=1) * touched.ravel()[column[:, :1]]
+    begins = np.arange(0, 2 * len(place) + 1, 2)
+    return csr_array((weights.ravel().astype(np.float32), column.ravel(), begins), (len(place), touched.size))
 
 
 def _reduce_rate(
@@ -404,21 +569,29 @@ def draw_constants(
         model_rate: Hz.
     """
     constants = imperfection.constants(sensors, drawn, gestures)
-    if not imperfection.tare or imperfection.rate <= model_rate:
+    if not imperfection.tare:
         return constants
-    return constants._replace(baseline=constants.baseline + idle_excess(imperfection, constants, model_rate))
+    return constants._replace(baseline=constants.baseline + idle_excess(constants, model_rate))
 
 
-def idle_excess(imperfection: Imperfection, constants: Constants, model_rate: float) -> Tensor:
+def idle_excess(constants: Constants, model_rate: float) -> Tensor:
     """Return the mean of idle readings above the offset, N: that of the maximum of the noise of an interval.
 
     Args:
-        imperfection: of the device, with its rate.
-        constants: of the device; the result has the shape of their noise.
+        constants: of the device, with its rate; the result has the shape of their noise.
         model_rate: Hz.
     """
-    number = imperfection.rate / model_rate
-    if number <= 1:
-        return torch.zeros_like(constants.noise)
+    numbers = np.maximum(constants.rate.numpy() / model_rate, 1)
+    if numbers.size == 1:
+        return constants.noise * _highest_of(numbers.item())
+    highest = np.interp(np.log(numbers), np.log(_NUMBERS), [_highest_of(number) for number in _NUMBERS])
+    return constants.noise * torch.from_numpy(highest).to(constants.noise)
+
+
+@cache
+def _highest_of(number: float) -> float:
+    """Return the mean of the largest of so many standard normal values; the number need not be whole."""
+    if number == 1:
+        return 0.0
     chance = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    return constants.noise * float(ndtri(chance ** (1 / number)).mean())
+    return float(ndtri(chance ** (1 / number)).mean())

@@ -177,7 +177,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         self.true_sensors = misplace(self.sensors, self.size, self.position_error, self.seed)
         settings = read_touch(self.touch)
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
-        check_rate(self.rate, self.model_rate, "device.rate")
+        check_rate(self.slowest, self.model_rate, "device.rate")
         self.model = build_model(self.simulator, self.body, self.true_sensors, self.model_rate)
         self.sampler = self._sampler(self.body, self.true_sensors, self.model)
         if self.sampler.settings.shear:
@@ -203,7 +203,7 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
-        excess = idle_excess(self.imperfection, self.constants, self.model_rate)
+        excess = idle_excess(self.constants, self.model_rate)
         level = self.constants.offset - self.constants.baseline + excess
         return level.masked_fill(self.constants.dead, 0.0)
 

@@ -18,8 +18,9 @@ from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.device.balance import summarise
 from skin.device.base import AbstractSimulated, Split, grouped, joined, split_rows, split_slices
-from skin.device.imperfection import Imperfection, ImperfectionSettings, draw_constants, idle_excess, measure
+from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.resampling import check_rate
+from skin.device.sampling import draw_constants, idle_excess, measure
 from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
 from skin.errors import InputError
 from skin.mechanics.contact.base import AbstractContact

@@ -25,7 +25,7 @@ from skin.body.layout import AbstractLayout
 from skin.core import array_cache
 from skin.core.messages import Steps, to_input_error
 from skin.core.settings import configured
-from skin.device import imperfection
+from skin.device import imperfection, sampling
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.calibration import Calibration, read_calibration
 from skin.device.touches import Touches
@@ -54,7 +54,7 @@ _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a devic
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
 _EXPECTED = 20.0  # s
-_SOURCES = (operating_point, decisions, imperfection)  # of the thresholds that are kept on disk
+_SOURCES = (operating_point, decisions, imperfection, sampling)  # of the thresholds that are kept on disk
 _log = logging.getLogger(__name__)
 
 

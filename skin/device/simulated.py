@@ -40,19 +40,27 @@ from skin.touch.splines import footprints
 _ROUNDING = 1e-9  # m
 
 
-def misplace(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
-    """Return sensors beside their places.
+def misplace(
+    sensors: Sensors, size: tuple[float, float], error: float, seed: int, footprint_error: float = 0.0
+) -> Sensors:
+    """Return sensors beside their places, with footprints of another size.
 
     Args:
         sensors: as touches report them.
         size: extent (x, y) of the sheet, m, on which they stay.
         error: standard deviation along x and along y, m.
         seed: of the device.
+        footprint_error: standard deviation of the logarithm of the factor on the sides of all footprints.
     """
-    moves = generator(Stream.POSITION, seed).standard_normal((len(sensors), 2))
+    drawn = generator(Stream.POSITION, seed)
+    moves = drawn.standard_normal((len(sensors), 2))
     positions = sensors.positions.copy()
     positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
-    return replace(sensors, positions=positions)
+    if not footprint_error:
+        return replace(sensors, positions=positions)
+    factor = float(np.exp(footprint_error * drawn.standard_normal()))
+    footprint = (sensors.footprint[0] * factor, sensors.footprint[1] * factor)
+    return replace(sensors, positions=positions, footprint=footprint)
 
 
 def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
@@ -143,6 +151,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
+        footprint_error: standard deviation of the logarithm of the true over the reported side of footprints.
+        described: ``described(body, sensors)``, the simulator that :attr:`geometry` reports the responses of;
+            None: ``simulator``.
 
     Raises:
         InputError: invalid settings.
@@ -164,6 +175,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     calibration: str | None = None
     randomise: bool = False
     position_error: Annotated[float, Ge(0)] = 0.0
+    footprint_error: Annotated[float, Ge(0)] = 0.0
+    described: Callable[[AbstractBody, Sensors], AbstractSimulator] | None = None
 
     def __post_init__(self) -> None:
         if self.stream and self.direction:
@@ -175,7 +188,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
             )
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
-        self.true_sensors = misplace(self.sensors, self.size, self.position_error, self.seed)
+        errors = self.position_error, self.seed, self.footprint_error
+        self.true_sensors = misplace(self.sensors, self.size, *errors)
         settings = read_touch(self.touch)
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
         check_rate(self.slowest, self.model_rate, "device.rate")
@@ -197,8 +211,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     @cached_property
     def geometry(self) -> Tensor:
         """Where the sensors are and what they respond to, (S, G), :data:`skin.device.touches.GEOMETRY`."""
-        same = self.position_error == 0
-        model = self.model if same else build_model(self.simulator, self.body, self.sensors, self.model_rate)
+        same = self.position_error == self.footprint_error == 0 and self.described is None
+        simulator = self.described or self.simulator
+        model = self.model if same else build_model(simulator, self.body, self.sensors, self.model_rate)
         return sensor_geometry(self.body, self.sensors, model)
 
     @property

@@ -38,7 +38,14 @@ from skin.evaluation.settings import Evaluation
 
 MACHINE = ("accelerator", "devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
 """Settings of Lightning's Trainer that choose the machine, not the result."""
-ADDED = {"scale_spread": 0.0, "independent": False, "aligned": True}
+ADDED = {
+    "scale_spread": 0.0,
+    "independent": False,
+    "aligned": True,
+    "footprint_error": 0.0,
+    "described": None,
+    "interface": 0.0,
+}
 """Settings of a device that came later, with the values that earlier runs mean; those count as left out."""
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 

@@ -14,15 +14,21 @@ if TYPE_CHECKING:
     from skin.device.files import read_recording as read_recording
     from skin.errors import InputError as InputError
     from skin.hardware.wire.skin import open_skin as open_skin
+    from skin.inference.candidates import FingertipPrior as FingertipPrior
+    from skin.inference.noise import Noise as Noise
+    from skin.inference.posterior import Posterior as Posterior
     from skin.mechanics.simulator.fem import PlatesAndBeams as PlatesAndBeams
     from skin.mechanics.simulator.solid import Solid as Solid
     from skin.runs.model_of_run import load_run as load_run
 
 __version__ = "0.1.0"
 __all__ = ["Arm", "Grid", "InputError", "LayoutFile", "PlatesAndBeams", "Sheet", "Solid"]
-__all__ += ["load_run", "open_skin", "read_recording"]
+__all__ += ["FingertipPrior", "Noise", "Posterior", "load_run", "open_skin", "read_recording"]
 
 _PLACES = {
+    "FingertipPrior": "skin.inference.candidates",
+    "Noise": "skin.inference.noise",
+    "Posterior": "skin.inference.posterior",
     "Arm": "skin.body.base",
     "Grid": "skin.body.layout",
     "InputError": "skin.errors",

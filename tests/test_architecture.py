@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from skin.core.files import CONF, ROOT
 
-# From the ground up. `inference` is empty until a posterior lives there.
+# From the ground up.
 ROOMS = [
     "errors",
     "core",
@@ -64,7 +64,7 @@ ALL = modules(ROOT / "skin")
 def test_every_module_is_in_a_room():
     assert {name.split(".")[1] for name in ALL if "." in name} <= set(ROOMS)
     assert house.loose_modules() == {"__init__", "__main__", "errors"}
-    assert house.rooms() == set(ROOMS) - {"errors", "__main__", "inference"}
+    assert house.rooms() == set(ROOMS) - {"errors", "__main__"}
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -102,7 +102,7 @@ def test_no_two_public_things_share_a_name():
 
 
 @pytest.mark.parametrize(
-    ("figure", "limit"), [("statements", 22_500), ("files", 205), ("words of documentation", 25_000)]
+    ("figure", "limit"), [("statements", 23_200), ("files", 205), ("words of documentation", 25_600)]
 )
 def test_the_house_stays_small(figure, limit):
     """Raise a limit only for a new capability, and say so in the change log."""

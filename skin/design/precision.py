@@ -26,6 +26,7 @@ from skin.body.material import Material
 from skin.core.files import json_text, whole, write
 from skin.core.settings import RISING, checked
 from skin.errors import InputError
+from skin.inference.noise import Noise
 from skin.mechanics.geometry import PARAMETERS, Fingertip
 from skin.mechanics.simulator.base import AbstractSimulator
 from skin.runs.build import SkinModel, build_skin
@@ -37,35 +38,6 @@ from skin.runs.configuration import Config
 # touch is not near it. Above a single sensor the exact posterior is several times narrower.
 
 _AT_ONCE = 64  # touches; their samples then take about 50 MB with all derivatives
-
-
-@dataclass(frozen=True)
-class Noise:
-    """How readings differ from those of the model.
-
-    Attributes:
-        frame: standard deviation of the noise of a sensor in a frame, N.
-        frames: number of frames that are averaged.
-        gain: standard deviation of the unknown gain of each sensor, relative; 0: gains are known.
-        clip: largest force that a sensor measures, N.
-    """
-
-    frame: float
-    frames: int = 1
-    gain: float = 0.0
-    clip: float = float("inf")
-
-    def variance(self, readings: Tensor) -> Tensor:
-        """Return the variance (B, S), N^2, of the mean of the frames of readings (B, S), N.
-
-        It is infinite where a sensor clips: its reading does not depend on the touch.
-        """
-        variance = self.frame**2 / self.frames + (self.gain * readings).square()
-        return variance.masked_fill(readings >= self.clip, torch.inf)
-
-    def felt(self, readings: Tensor, sigmas: float = 3.0) -> Tensor:
-        """Return which readings (B, S), N, exceed the noise of one frame, bool."""
-        return readings > sigmas * self.frame
 
 
 @dataclass(frozen=True)

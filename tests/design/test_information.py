@@ -6,7 +6,8 @@ import torch
 
 from skin.body.base import Sheet
 from skin.body.layout import Grid
-from skin.design.precision import Noise, Sensitivity, local_covariance, sensitivity
+from skin.design.precision import Sensitivity, local_covariance, sensitivity
+from skin.inference.noise import Noise
 from skin.mechanics.geometry import Fingertip
 from skin.mechanics.simulator.fem import PlatesAndBeams
 from skin.mechanics.simulator.naive import Naive

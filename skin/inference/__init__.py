@@ -1,0 +1,1 @@
+"""Posterior of contacts: where, how hard, how sure."""

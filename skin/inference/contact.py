@@ -1,0 +1,258 @@
+"""One contact: boxes of places and radii, refined where the probability is."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from skin.inference.candidates import Boxes, CandidateReadings, FingertipPrior
+from skin.inference.likelihood import (
+    Forces,
+    Observation,
+    fit_force,
+    integrate_force,
+    refit_force,
+    relative_variance,
+)
+from skin.inference.noise import Noise
+
+_LENGTH = 1.8  # a box is split along an axis that is longer, in standard deviations
+_DROPPED = 3e-5  # probability that may be lost in a refinement
+_MOST = 500  # boxes
+_ROUNDS = 12
+_FORCE_STEP = 0.5  # largest change of the logarithm of the force over a box
+_RADIUS_STEP = 0.3  # largest share of the radii in a box
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Posterior of one contact as weighted boxes.
+
+    Attributes:
+        boxes: N of them.
+        force: (N, J), N.
+        weight: (N, J), probabilities that sum to 1.
+        evidence: log of the likelihood integrated over the prior.
+        misfit: posterior mean of the squared misfit in variances.
+    """
+
+    boxes: Boxes
+    force: np.ndarray
+    weight: np.ndarray
+    evidence: float
+    misfit: float
+
+    @property
+    def mode(self) -> np.ndarray:
+        """The most probable contact (1, 4): x, y and radius, m, and force, N."""
+        box, force = np.unravel_index(self.weight.argmax(), self.weight.shape)
+        return np.array([[*self.boxes.centre[box], self.force[box, force]]])
+
+
+class _Leaves(NamedTuple):
+    """Boxes with what is computed of them.
+
+    Attributes:
+        boxes: N of them.
+        readings: (N, S), N/N.
+        slopes: (N, 3, S), their derivatives by place and radius, N/N/m.
+        spread: (N, S), variance from gains and positions per square newton, or None.
+        forces: of the boxes.
+        evidence: (N,), log of the probability in a box.
+    """
+
+    boxes: Boxes
+    readings: np.ndarray
+    slopes: np.ndarray
+    spread: np.ndarray | None
+    forces: Forces
+    evidence: np.ndarray
+
+    def rows(self, rows: np.ndarray) -> "_Leaves":
+        """Return some of the boxes."""
+        spread = None if self.spread is None else self.spread[rows]
+        boxes, forces = (type(part)(*(values[rows] for values in part)) for part in (self.boxes, self.forces))
+        arrays = self.readings[rows], self.slopes[rows], spread
+        return _Leaves(boxes, *arrays, forces, self.evidence[rows])  # type: ignore[arg-type]
+
+    @staticmethod
+    def join(parts: "Sequence[_Leaves]") -> "_Leaves":
+        """Return the boxes of all parts."""
+        boxes, forces = (
+            type(same[0])(*map(np.concatenate, zip(*same, strict=True)))
+            for same in ([part.boxes for part in parts], [part.forces for part in parts])
+        )
+        spread = None if parts[0].spread is None else np.concatenate([part.spread for part in parts])  # type: ignore[misc]
+        readings, slopes, evidence = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("readings", "slopes", "evidence")
+        )
+        return _Leaves(boxes, readings, slopes, spread, forces, evidence)  # type: ignore[arg-type]
+
+
+def blur_first(candidates: CandidateReadings, noise: Noise) -> tuple[np.ndarray | None, np.ndarray]:
+    """Return what all frames share: the relative variance of the first boxes, and that with their width."""
+    spread = relative_variance(noise, candidates.readings, candidates.slopes)
+    return spread, _blurred(candidates.boxes, candidates.slopes, spread)
+
+
+def one_contact(
+    candidates: CandidateReadings,
+    prior: FingertipPrior,
+    frame: Observation,
+    first: tuple[np.ndarray | None, np.ndarray] | None = None,
+) -> Cloud:
+    """Return the posterior of one contact.
+
+    Args:
+        candidates: of the skin.
+        prior: of the contact.
+        frame: the frame.
+        first: of :func:`blur_first` for the noise of the frame; None: it is computed.
+    """
+    spread, blurred = first or blur_first(candidates, frame.noise)
+    boxes = candidates.boxes
+    forces, evidence = fit_force(frame, prior, candidates.readings, blurred)
+    # The first boxes have the same width.
+    evidence = evidence + math.log(boxes.width[0].prod())
+    active = _Leaves(boxes, candidates.readings, candidates.slopes, spread, forces, evidence)
+    leaves = list[_Leaves]()
+    for _ in range(_ROUNDS):
+        kept = _probable(active.evidence, [part.evidence for part in leaves])
+        active = active.rows(kept)
+        _, information, turn = _expand(frame, prior, active)
+        lengths = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 0)) * active.boxes.width
+        lengths = np.maximum(lengths, np.abs(turn) * active.boxes.width * (_LENGTH / _FORCE_STEP))
+        lengths[:, 2] = np.maximum(lengths[:, 2], active.boxes.width[:, 2] / (_RADIUS_STEP * candidates.span))
+        cut = lengths > _LENGTH
+        many = sum(len(part.evidence) for part in leaves) + (1 << cut.sum(1)).sum() > _MOST
+        if many:
+            # Where there are many boxes, each is cut along its longest axis alone.
+            cut &= lengths == lengths.max(1, keepdims=True)
+        split = cut.any(1)
+        if len(kept) > _MOST or not split.any():
+            break
+        leaves.append(active.rows(np.flatnonzero(~split)))
+        old = Boxes(active.boxes.centre[split], active.boxes.width[split])
+        boxes = old.split(cut[split])
+        active = _judge(frame, prior, boxes, *candidates.at(boxes.centre))
+    return _weigh(candidates, frame, prior, _Leaves.join([*leaves, active]))
+
+
+def _judge(
+    frame: Observation, prior: FingertipPrior, boxes: Boxes, readings: np.ndarray, slopes: np.ndarray
+) -> _Leaves:
+    """Return boxes with their probability, as if each were blurred over its width."""
+    spread = relative_variance(frame.noise, readings, slopes)
+    forces, evidence = fit_force(frame, prior, readings, _blurred(boxes, slopes, spread))
+    return _Leaves(boxes, readings, slopes, spread, forces, evidence + np.log(boxes.width.prod(1)))
+
+
+def _blurred(boxes: Boxes, slopes: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
+    """Return the variance (N, S) per square newton with that over a box, which then speaks for all in it."""
+    scaled = slopes * (boxes.width * math.sqrt(1 / 12)).astype(np.float32)[..., None]
+    scaled *= scaled
+    blurred = scaled[:, 0]
+    blurred += scaled[:, 1]
+    blurred += scaled[:, 2]
+    return blurred if spread is None else blurred + spread
+
+
+def _probable(evidence: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
+    """Return the indices of what holds nearly all probability, in their order, beside that of others."""
+    top = max(float(part.max()) for part in [evidence, *others] if len(part))
+    chance = np.exp(evidence - top)
+    order = np.argsort(chance)
+    lost = np.cumsum(chance[order], dtype=float)
+    whole = lost[-1] + sum(float(np.exp(part - top).sum()) for part in others)
+    return np.sort(order[lost > _DROPPED * whole])
+
+
+def _expand(
+    frame: Observation, prior: FingertipPrior, leaves: _Leaves
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return slope (N, 3), 1/m, and information (N, 3, 3), 1/m^2, of the log likelihood in boxes.
+
+    Derivatives are those by place and radius at the most probable force, which follows them: the last result
+    is the derivative of its logarithm, (N, 3), 1/m.
+    """
+    readings, spread = leaves.readings, leaves.spread
+    force = np.exp(leaves.forces.mode)[:, None]
+    variance = np.float32(frame.noise.floor) + (0 if spread is None else force * force * spread)
+    weight = np.broadcast_to(frame.counts / variance, readings.shape)
+    pull = weight * (frame.readings - force * readings)
+    if len(frame.clipped):
+        # A sensor that clips tells most where it is predicted to read about its limit.
+        clipped = frame.clipped
+        deviation = np.broadcast_to(np.sqrt(variance), readings.shape)[:, clipped]
+        above = (force * readings[:, clipped] - np.float32(frame.noise.clip)) / deviation
+        hazard = np.exp(-0.5 * above**2 - log_ndtr(above)) / math.sqrt(2 * math.pi)
+        weight = weight.copy()
+        weight[:, clipped], pull[:, clipped] = hazard * (hazard + above) / deviation**2, hazard / deviation
+    slope = np.vecdot(leaves.slopes, (force * pull)[:, None])
+    weighted = leaves.slopes * (force * force * weight)[:, None]
+    whole = np.vecdot(readings * readings, force * force * weight) + 1 / prior.spread**2
+    crossed = np.vecdot(weighted, readings[:, None])
+    distance = (leaves.forces.mode - math.log(prior.force)) / prior.spread**2
+    left = np.vecdot(readings, force * pull) - distance
+    slope = slope - crossed * (left / whole)[:, None]
+    information = np.matmul(weighted, leaves.slopes.transpose(0, 2, 1))
+    turn = -crossed / whole[:, None]
+    return slope, information + crossed[:, :, None] * turn[:, None], turn
+
+
+def _average(
+    frame: Observation, prior: FingertipPrior, leaves: _Leaves
+) -> tuple[Boxes, np.ndarray, np.ndarray]:
+    """Return what a box holds, as a smaller box, and the log of the mean of the likelihood by its middle's.
+
+    The last result, (2, N), holds how much mean and variance of the log force exceed those in the middle.
+
+    To second order, with a normal distribution in place of the uniform one over the box.
+    """
+    # In double precision: what the force explains is subtracted, and may be nearly all.
+    precise = leaves._replace(readings=leaves.readings.astype(float), slopes=leaves.slopes.astype(float))
+    slope, information, turn = _expand(frame, prior, precise)
+    centre, width = leaves.boxes
+    # In units of the standard deviation over a box.
+    unit = width / math.sqrt(12)
+    slope, information = slope * unit, information * unit[:, :, None] * unit[:, None] + np.eye(3)
+    covariance = np.linalg.inv(information)
+    moved = np.vecdot(covariance, slope[:, None])
+    factor = 0.5 * (np.vecdot(slope, moved) - np.log(np.maximum(np.linalg.det(information), 1)))
+    inside = np.clip(moved, -1.5, 1.5)
+    factor = np.where((inside == moved).all(1), factor, np.vecdot(slope, inside) / 2)
+    narrow = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    turn = turn * unit
+    shift = np.vecdot(turn, inside)
+    wider = np.maximum(np.vecdot(turn, np.vecdot(covariance, turn[:, None])), 0)
+    return Boxes(centre + inside * unit, width * narrow), factor, np.stack([shift, wider])
+
+
+def _weigh(
+    candidates: CandidateReadings, frame: Observation, prior: FingertipPrior, leaves: _Leaves
+) -> Cloud:
+    """Return the posterior of boxes."""
+    _, readings, _, spread, blurred, _ = leaves
+    fit = refit_force(frame, prior, readings, spread, blurred.mode)
+    leaves = leaves._replace(forces=fit)
+    boxes, factor, further = _average(frame, prior, leaves)
+    force, logs = integrate_force(frame, prior, readings, spread, fit)
+    shift, stretch = np.clip(further[0], -1, 1), np.sqrt(1 + fit.curvature * further[1])
+    force = np.exp(
+        fit.mode[:, None] + shift[:, None] + (np.log(force) - fit.mode[:, None]) * stretch[:, None]
+    )
+    logs = logs + (np.log(leaves.boxes.width.prod(1)) + factor)[:, None]
+    top = logs.max()
+    weight = np.exp(logs - top)
+    total = weight.sum()
+    weight /= total
+    middle = np.exp(fit.mode)[:, None]
+    variance = frame.noise.floor + (0 if spread is None else middle * middle * spread)
+    misfit = ((frame.readings - middle * readings) ** 2 / variance) @ frame.counts
+    extent = float(np.prod(candidates.size) * candidates.span)
+    evidence = float(top + math.log(total) - math.log(extent))
+    return Cloud(boxes, force, weight, evidence, float(weight.sum(1) @ misfit) + 1)

@@ -1,0 +1,353 @@
+"""Where and how hard a skin is touched, and how sure that is, from readings of any layout."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import expit, gammaincc
+
+from skin.body.base import AbstractBody
+from skin.errors import InputError
+from skin.inference.candidates import CandidateReadings, FingertipPrior
+from skin.inference.contact import Cloud, blur_first, one_contact
+from skin.inference.contacts import Mixture, Search
+from skin.inference.large import LargeContacts
+from skin.inference.likelihood import Observation
+from skin.inference.noise import Noise
+from skin.mechanics.simulator.base import AbstractSimulator
+
+MOST_CONTACTS = 3
+"""Contacts that are told apart."""
+
+_PER_CONTACT = 3  # sensors that a contact takes at least: it has a place and a force
+_FITS = 0.01  # a smaller predictive probability says that no contacts give such readings
+_POOR, _LIKELY = 1e-3, 0.5  # a further contact is tried below this probability, or above these odds
+_CELLS = 160  # of a region, along an axis at most
+
+
+@dataclass(frozen=True)
+class Region:
+    """The most probable places of a contact, as cells of a raster.
+
+    Attributes:
+        cells: (C, 2), x and y of their centres, m.
+        width: (2,), of a cell, m.
+        share: probability that they hold.
+    """
+
+    cells: np.ndarray
+    width: np.ndarray
+    share: float
+
+    @property
+    def area(self) -> float:
+        """Area of all cells, m^2."""
+        return float(len(self.cells) * self.width.prod())
+
+    def contains(self, place: np.ndarray) -> bool:
+        """Return whether a place (2,), m, lies in a cell."""
+        return bool((np.abs(self.cells - place) <= self.width / 2).all(axis=1).any())
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """Posterior of one contact; samples are weighted.
+
+    Attributes:
+        place, place_deviation: (2,), mean and standard deviation of x and y, m.
+        force, force_deviation: N.
+        radius, radius_deviation: m.
+        peak, peak_deviation: highest pressure, Pa.
+        places, widths: (N, 2), boxes that hold the place, m.
+        peaks: (N, J), Pa, of the boxes' forces.
+        weights: (N, J), probabilities that sum to 1.
+    """
+
+    place: np.ndarray
+    place_deviation: np.ndarray
+    force: float
+    force_deviation: float
+    radius: float
+    radius_deviation: float
+    peak: float
+    peak_deviation: float
+    places: np.ndarray = field(repr=False)
+    widths: np.ndarray = field(repr=False)
+    peaks: np.ndarray = field(repr=False)
+    weights: np.ndarray = field(repr=False)
+
+    def exceeds(self, pressure: float) -> float:
+        """Return the probability that the highest pressure is above a limit, Pa."""
+        return float(self.weights[self.peaks > pressure].sum())
+
+    def region(self, share: float = 0.9) -> Region:
+        """Return the smallest set of cells that holds the place with a probability; it may have parts."""
+        weight = self.weights.sum(1)
+        low, high = (self.places - self.widths / 2).min(0), (self.places + self.widths / 2).max(0)
+        steps = np.clip(np.ceil((high - low) / self.widths.min(0) - 1e-6), 1, _CELLS).astype(int)
+        edges = [np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1)]
+        parts = [_overlap(edges[axis], self.places[:, axis], self.widths[:, axis]) for axis in (0, 1)]
+        mass = (parts[0] * weight[:, None]).T @ parts[1]
+        order = np.argsort(-mass, axis=None, kind="stable")
+        total = np.cumsum(mass.ravel()[order])
+        # The last cell counts if the share is nearer with it than without.
+        count = max(1, int(np.argmin(np.abs(total - share))) + 1)
+        chosen = np.unravel_index(order[:count], mass.shape)
+        middles = [(line[1:] + line[:-1]) / 2 for line in edges]
+        cells = np.stack([middles[axis][chosen[axis]] for axis in (0, 1)], axis=1)
+        return Region(cells, (high - low) / steps, float(total[count - 1]))
+
+
+def _overlap(edges: np.ndarray, centre: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return the share of each interval between edges, (N, cells)."""
+    low, high = (centre - width / 2)[:, None], (centre + width / 2)[:, None]
+    return np.clip(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0, None) / width[:, None]
+
+
+@dataclass(frozen=True)
+class FrameEstimate:
+    """What the readings of a frame tell.
+
+    Attributes:
+        number: the most probable number of contacts.
+        probabilities: (4,), of 0, 1, 2 and 3 contacts, if they are fingertips.
+        contacts: ``number`` of them, the strongest first.
+        fit: posterior predictive p-value: how often such contacts would give readings that fit worse.
+        large: probability of a larger contact, such as a hand, beside those of fingertips.
+        fingertip: whether there are contacts, they fit, and a larger one is less probable.
+        unknown: what cannot be known from these sensors, or None.
+    """
+
+    number: int
+    probabilities: np.ndarray
+    contacts: tuple[ContactEstimate, ...]
+    fit: float
+    large: float
+    fingertip: bool
+    unknown: str | None
+
+    def exceeds(self, pressure: float) -> float:
+        """Return the probability that some contact's highest pressure is above a limit, Pa."""
+        return 1 - math.prod(1 - contact.exceeds(pressure) for contact in self.contacts)
+
+
+class Posterior:
+    """Estimates contacts from readings, for any layout on a sheet or an arm, without training.
+
+    Readings of contacts add up, so those of all candidates are one table. Places and radii are refined around
+    the best candidates, forces are integrated. A silent sensor informs, too.
+
+    Args:
+        simulator: of the skin: ``solid``, ``naive``, or ``fem`` with ``reading=interface``. Readings of
+            equation 10 do not add up: it takes ``contacts=1``.
+        noise: of the readings.
+        body: the skin.
+        prior: of fingertips; None: the default.
+        contacts: the largest number of contacts, up to three.
+
+    Raises:
+        InputError: a simulator whose readings do not add up, or more contacts than three.
+    """
+
+    def __init__(
+        self,
+        simulator: AbstractSimulator,
+        noise: Noise,
+        body: AbstractBody,
+        prior: FingertipPrior | None = None,
+        contacts: int = MOST_CONTACTS,
+    ) -> None:
+        if not 1 <= contacts <= MOST_CONTACTS:
+            raise InputError(
+                f"a posterior tells 1 to {MOST_CONTACTS} contacts apart, got contacts={contacts}"
+            )
+        if not isinstance(simulator, AbstractSimulator):
+            raise InputError(
+                f"a posterior needs the mechanics of a skin, such as skin.Solid, got {simulator!r}"
+            )
+        if contacts > 1 and getattr(simulator, "reading", None) == "equation10":
+            raise InputError(
+                "readings of simulator.reading=equation10 do not add up, so that only one contact can be "
+                "estimated: give contacts=1, or set simulator.reading=interface or simulator=solid"
+            )
+        self.noise, self.prior = noise, prior or FingertipPrior()
+        possible = np.flatnonzero(self.prior.numbers[: contacts + 1])
+        self._most = int(possible[-1])
+        self.candidates = CandidateReadings(simulator, body, self.prior)
+        self._first = blur_first(self.candidates, noise)
+        self._search = Search(self.candidates, self.prior)
+        self._large = LargeContacts(self.candidates, noise) if self.prior.large else None
+        with np.errstate(divide="ignore"):
+            self._numbers = np.log(np.array(self.prior.numbers[: self._most + 1]))
+        self._peak = self.prior.peak
+
+    def estimate(
+        self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
+    ) -> "FrameEstimate | list[FrameEstimate]":
+        """Return what readings tell, frame by frame.
+
+        Args:
+            readings: (S,), N, or (T, S) of several frames.
+            valid: same shape, bool: which have a value; None: those that are finite.
+            saturated: same shape, bool: which exceed the largest force; None: those from ``noise.clip`` up.
+
+        Raises:
+            InputError: readings of another number of sensors.
+        """
+        values = np.asarray(readings, dtype=float)
+        sensors = self.candidates.readings.shape[1]
+        if values.ndim not in (1, 2) or values.shape[-1] != sensors:
+            raise InputError(
+                f"this skin has {sensors} sensors: give readings ({sensors},) or (T, {sensors}), N, got "
+                f"{values.shape}"
+            )
+        valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
+        clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
+        clipped = valued & clips
+        estimates = [
+            self._frame(Observation.of(frame, works, limits, self.noise))
+            for frame, works, limits in zip(
+                np.atleast_2d(values), np.atleast_2d(valued), np.atleast_2d(clipped), strict=True
+            )
+        ]
+        return estimates if values.ndim == 2 else estimates[0]
+
+    def estimate_touch(
+        self, readings: np.ndarray, valid: np.ndarray | None = None, saturated: np.ndarray | None = None
+    ) -> FrameEstimate:
+        """Return what the frames of a touch that does not move tell together.
+
+        Readings are proportional to the force, so that the mean of the frames is the reading of the mean
+        force. A sensor that is invalid or clips in a frame is so in all.
+
+        Args:
+            readings: (T, S), N.
+            valid, saturated: as of :meth:`estimate`.
+        """
+        values = np.atleast_2d(np.asarray(readings, dtype=float))
+        valued = np.isfinite(values) & (True if valid is None else np.asarray(valid, bool))
+        clips = values >= self.noise.clip if saturated is None else np.asarray(saturated, bool)
+        noise = replace(self.noise, frames=self.noise.frames * len(values))
+        return self._frame(Observation.of(values.mean(0), valued.all(0), (valued & clips).any(0), noise))
+
+    def _frame(self, frame: Observation) -> FrameEstimate:
+        """Return the estimate of a frame, which depends on nothing else."""
+        single = one_contact(self.candidates, self.prior, frame, self._first)
+        sensors = int(frame.counts.sum()) + len(frame.clipped)
+        evidence, mixtures = self._several(frame, single, min(self._most, max(1, sensors // _PER_CONTACT)))
+        logs = np.full(len(self._numbers), -np.inf)
+        logs[: len(evidence)] = np.array(evidence) + self._numbers[: len(evidence)]
+        number = int(logs.argmax())
+        total = float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
+        probabilities = np.exp(logs - total)
+        misfit = {0: frame.misfit_empty(), 1: single.misfit}.get(number)
+        if misfit is None:
+            misfit = mixtures[number].misfit
+        fit = float(gammaincc(max(frame.counts.sum(), 1) / 2, misfit / 2))
+        if number in mixtures:
+            mixtures[number] = self._search.walk(frame, mixtures[number])
+        contacts = self._contacts(number, single, mixtures)
+        large = self._probability_of_large(frame, total)
+        fingertip = number > 0 and fit >= _FITS and large < 0.5
+        return FrameEstimate(number, probabilities, contacts, fit, large, fingertip, _unknown(sensors, frame))
+
+    def _probability_of_large(self, frame: Observation, fingertips: float) -> float:
+        """Return the probability of a large contact, beside the log evidence of fingertips."""
+        if self._large is None:
+            return 0.0
+        odds = self._large.evidence(frame) + math.log(self.prior.large) - fingertips
+        return float(expit(odds))
+
+    def _several(
+        self, frame: Observation, single: Cloud, most: int
+    ) -> tuple[list[float], dict[int, Mixture]]:
+        """Return the log evidence of each number of contacts, and the posteriors of several."""
+        evidence, mixtures, misfit = [frame.empty(), single.evidence], dict[int, Mixture](), single.misfit
+        mode = np.column_stack(
+            [single.mode[:, :2], *self._search.scores(single.mode[:, 2], single.mode[:, 3])]
+        )
+        sensors = max(frame.counts.sum(), 1) / 2
+        felt = self._search.felt(mode[None])[0][0]
+        for number in range(2, most + 1):
+            addition = self._search.add(frame, mode)
+            silent = evidence[-1] + addition.factor
+            odds = addition.factor + self._numbers[number] - self._numbers[number - 1]
+            if gammaincc(sensors, misfit / 2) > _POOR and odds < math.log(_LIKELY):
+                evidence.append(silent)
+                continue
+            mixture = self._refine(frame, self._search.extend(mode, addition), mode, felt)
+            evidence.append(max(silent, mixture.evidence))
+            mixtures[number] = mixture
+            mode, felt, misfit = mixture.mode, mixture.felt, mixture.misfit
+        return evidence, mixtures
+
+    def _refine(self, frame: Observation, guesses: np.ndarray, mode: np.ndarray, felt: np.ndarray) -> Mixture:
+        """Return the best contacts, one more than a mode (n, 4), from several starts."""
+        starts = [guesses]
+        for index in range(len(mode)):
+            others = np.delete(mode, index, 0)
+            left = felt * 0 if not len(others) else self._search.felt(others[None])[0][0]
+            pairs = self._search.pairs(frame, left)
+            starts.append(np.concatenate([np.repeat(others[None], len(pairs), 0), pairs], axis=1))
+        modes, score = self._search.refine(frame, np.concatenate(starts))
+        return self._search.sample(frame, modes, score)
+
+    def _contacts(
+        self, number: int, single: Cloud, mixtures: dict[int, Mixture]
+    ) -> tuple[ContactEstimate, ...]:
+        if number == 0:
+            return ()
+        if number == 1:
+            boxes = single.boxes
+            return (self._summary(boxes.centre, boxes.width, single.force, single.weight),)
+        if number not in mixtures:
+            raise AssertionError("a number of contacts that was not refined is not the most probable")
+        mixture = mixtures[number]
+        weight = mixture.weight[:, None]
+        parts = list[ContactEstimate]()
+        for contact in self._search.contacts(mixture.samples).transpose(1, 0, 2):
+            spread = np.sqrt(np.maximum(_variance(contact[:, :2], weight[:, 0]), 1e-12))
+            widths = np.zeros((len(contact), 3))
+            widths[:, :2] = 0.6 * spread
+            parts.append(self._summary(contact[:, :3], widths, contact[:, 3:], weight))
+        return tuple(sorted(parts, key=lambda part: -part.force))
+
+    def _summary(
+        self, boxes: np.ndarray, widths: np.ndarray, force: np.ndarray, weight: np.ndarray
+    ) -> ContactEstimate:
+        """Return the moments of weighted boxes of places and radii (N, 3), m, and forces (N, J), N."""
+        total = weight.sum(1)
+        peaks = self._peak(boxes[:, 2:]) * force
+        middle = total @ boxes
+        deviation = np.sqrt(total @ ((boxes - middle) ** 2 + widths**2 / 12))
+        mean, peak = float((weight * force).sum()), float((weight * peaks).sum())
+        return ContactEstimate(
+            middle[:2],
+            deviation[:2],
+            mean,
+            math.sqrt(float((weight * (force - mean) ** 2).sum())),
+            float(middle[2]),
+            float(deviation[2]),
+            peak,
+            math.sqrt(float((weight * (peaks - peak) ** 2).sum())),
+            boxes[:, :2],
+            widths[:, :2],
+            peaks,
+            weight,
+        )
+
+
+def _variance(places: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return weight @ (places - weight @ places) ** 2
+
+
+def _unknown(sensors: int, frame: Observation) -> str | None:
+    """Return what a frame cannot tell, in a sentence."""
+    if sensors == 0:
+        return "no sensor is valid: nothing is known beyond the prior"
+    if sensors < 3:
+        return (
+            f"{sensors} valid sensor{'s' if sensors > 1 else ''}: place and force cannot be told apart; "
+            "a region is where the prior allows, and several contacts look like one"
+        )
+    return None

@@ -1,0 +1,325 @@
+"""The posterior of contacts against brute force, calibration, and what devices do to readings."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.special import log_ndtr
+from scipy.stats import kstest
+
+import skin
+from skin.body.base import Arm, Sheet
+from skin.body.layout import Grid
+from skin.inference.candidates import FingertipPrior, disc_readings
+from skin.inference.noise import Noise
+from skin.inference.posterior import ContactEstimate, FrameEstimate, Posterior
+from skin.mechanics.simulator.fem import PlatesAndBeams
+from skin.mechanics.simulator.naive import Naive
+from skin.mechanics.simulator.solid import Solid
+
+SOFT = {"material": "EcoFlex 00-30"}
+DEEP = Sheet((0.16, 0.16), (32, 32), [SOFT | {"thickness": 0.03}])
+THIN = Sheet(
+    (0.16, 0.16),
+    (32, 32),
+    [{"material": "Dragon Skin 10 Medium", "thickness": 0.01}, SOFT | {"thickness": 0.005}],
+)
+NOISE = Noise(0.05, frames=10)
+
+
+def sensors_of(body, depth):
+    return Grid(5, 5, (0.01, 0.01), depth=depth).sensors(body)
+
+
+@cache
+def solid(thin=False):
+    body, depth = (THIN, None) if thin else (DEEP, 0.0295)
+    return Solid(body, sensors_of(body, depth), poisson={"Dragon Skin 10 Medium": 0.49})
+
+
+@cache
+def posterior(thin=False, noise=NOISE, prior=None, contacts=3):
+    return Posterior(solid(thin), noise, THIN if thin else DEEP, prior, contacts)
+
+
+def draw(count, seed, number=1, margin=0.0, apart=0.0):
+    """Return contacts (count, number, 4) of the default prior: x, y, radius, m, and force, N."""
+    rng, touches = np.random.default_rng(seed), []
+    while len(touches) < count:
+        places = rng.uniform(margin, 0.16 - margin, (number, 2))
+        radius, force = rng.uniform(0.004, 0.012, number), 5 * np.exp(0.5 * rng.standard_normal(number))
+        distance = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(number, 1)]
+        if (distance >= apart).all():
+            touches.append(np.column_stack([places, radius, force]))
+    return np.array(touches)
+
+
+def felt(touches, thin=False):
+    """Return the true readings (count, 25), N."""
+    flat = touches.reshape(-1, 4)
+    body = THIN if thin else DEEP
+    readings = disc_readings(solid(thin), body, flat[:, :3], FingertipPrior().rim) * flat[:, 3:]
+    return readings.reshape(*touches.shape[:2], -1).sum(1)
+
+
+def measure(readings, noise, seed):
+    rng = np.random.default_rng(seed)
+    scaled = readings * (1 + noise.gain * rng.standard_normal(readings.shape))
+    return scaled + np.sqrt(noise.floor) * rng.standard_normal(readings.shape)
+
+
+def moments(contact):
+    mean = [*contact.place, contact.radius, contact.force]
+    spread = [*contact.place_deviation, contact.radius_deviation, contact.force_deviation]
+    return np.array(mean), np.array(spread)
+
+
+def brute_force(readings, thin, noise, contact, count, seed=0):
+    """Return mean and deviation (4,) by importance samples near the posterior, and their effective number.
+
+    The last result is by how much the deviations of both halves of the samples differ, relative.
+    """
+    prior, rng = FingertipPrior(), np.random.default_rng(seed)
+    mean, spread = moments(contact)
+    centre = np.array([*mean[:2], np.log(mean[3])])
+    wide = 1.6 * np.maximum([*spread[:2], spread[3] / mean[3]], [1e-4, 1e-4, 1e-3])
+    # A third of the samples are from the prior, which has all modes.
+    points, radius = centre + wide * rng.standard_normal((count, 3)), rng.uniform(*prior.radii, count)
+    third = count // 3
+    points[:third, :2] = rng.uniform(0, 0.16, (third, 2))
+    points[:third, 2] = np.log(prior.force) + prior.spread * rng.standard_normal(third)
+    near = np.exp(-0.5 * (((points - centre) / wide) ** 2).sum(1)) / wide.prod() / (2 * np.pi) ** 1.5
+    density = -0.5 * ((points[:, 2] - np.log(prior.force)) / prior.spread) ** 2
+    far = np.exp(density) / (prior.spread * np.sqrt(2 * np.pi) * 0.16**2)
+    force = np.exp(points[:, 2])
+    inside = ((points[:, :2] > 0) & (points[:, :2] < 0.16)).all(1)
+    proposal = np.log(2 / 3 * near + np.where(inside, far / 3, 0))
+    discs = np.column_stack([points[:, :2].clip(0, 0.16), radius])
+    true = disc_readings(solid(thin), THIN if thin else DEEP, discs, prior.rim) * force[:, None]
+    variance = noise.floor + (noise.gain * true) ** 2
+    clips = readings >= noise.clip
+    terms = -0.5 * ((readings - true) ** 2 / variance + np.log(variance))
+    terms = np.where(clips, log_ndtr((true - noise.clip) / np.sqrt(variance)), terms)
+    logs = np.where(inside, terms.sum(1) + density - proposal, -np.inf)
+    weight = np.exp(logs - logs.max())
+    weight /= weight.sum()
+    values = np.column_stack([discs, force])
+    average, spread = _moments(weight, values)
+    halves = [_moments(weight[part], values[part])[1] for part in (slice(0, None, 2), slice(1, None, 2))]
+    differ = np.abs(halves[0] / halves[1] - 1).max()
+    return average, spread, 1 / (weight**2).sum(), differ
+
+
+def _moments(weight, values):
+    average = weight @ values / weight.sum()
+    return average, np.sqrt(weight @ (values - average) ** 2 / weight.sum())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("thin", "noise"),
+    [(False, NOISE), (True, NOISE), (False, Noise(0.05, 10, gain=0.02)), (True, Noise(0.05, clip=1.0))],
+)
+def test_a_contact_agrees_with_brute_force(thin, noise):
+    touches = draw(60, seed=3, margin=0.02)
+    true = felt(touches, thin)
+    estimated, compared = posterior(thin, noise, contacts=1), 0
+    for row in np.flatnonzero((true > 0.15).any(1))[:6]:
+        readings = measure(true[row], noise, row)
+        (contact,) = estimated.estimate(readings).contacts
+        mean, spread, effective, differ = brute_force(readings, thin, noise, contact, 400_000, row)
+        # A rare second mode with few samples says nothing of its weight.
+        if effective < 5000 or differ > 0.03:
+            continue
+        assert (np.abs(moments(contact)[0] - mean) <= 0.1 * spread).all()
+        # On the thin skin the deviation of the force falls short, as docs/contacts.md states.
+        columns = slice(3 if thin else 4)
+        assert moments(contact)[1][columns] == pytest.approx(spread[columns], rel=0.05)
+        compared += 1
+        if compared == 2:
+            break
+    assert compared == 2
+
+
+@pytest.mark.parametrize(("thin", "noise"), [(False, NOISE), (True, Noise(0.05, 10, gain=0.05, offset=0.02))])
+def test_truth_drawn_from_the_prior_has_uniform_ranks(thin, noise):
+    touches = draw(150, seed=8)
+    readings = measure(felt(touches, thin), noise, seed=9)
+    contacts = [
+        estimate.contacts[0] if estimate.contacts else None
+        for estimate in posterior(thin, noise, FingertipPrior(numbers=(0.0, 1.0, 0.0, 0.0))).estimate(
+            readings
+        )
+    ]
+    place = np.array(
+        [place_ranks(contact, touch[0]) for contact, touch in zip(contacts, touches, strict=True)]
+    )
+    for column in place.T:
+        assert kstest(column, "uniform").pvalue > 0.01
+    held = np.mean([c.region().contains(t[0, :2]) for c, t in zip(contacts, touches, strict=True)])
+    assert 0.83 <= held <= 0.96  # 90 % of 150, within 3 standard deviations
+
+
+def place_ranks(contact: ContactEstimate, touch):
+    """Return the probability below the truth along x and y."""
+    low = contact.places - contact.widths / 2
+    share = ((touch[:2] - low) / contact.widths).clip(0, 1)
+    return contact.weights.sum(1) @ share
+
+
+def same(first: FrameEstimate, second: FrameEstimate) -> bool:
+    return (
+        first.number == second.number
+        and np.array_equal(first.probabilities, second.probabilities)
+        and all(
+            np.array_equal(np.concatenate(moments(a)), np.concatenate(moments(b)))
+            for a, b in zip(first.contacts, second.contacts, strict=True)
+        )
+    )
+
+
+def test_a_contact_is_told_as_one_and_where_it_is():
+    touches = draw(60, seed=1, margin=0.03)
+    true = felt(touches)
+    rows = (true > 0.15).any(1)
+    estimates = posterior().estimate(measure(true, NOISE, 2)[rows])
+    assert np.mean([estimate.number == 1 for estimate in estimates]) >= 0.97
+    assert np.mean([estimate.fingertip for estimate in estimates]) >= 0.95
+    error = [e.contacts[0].place - t[0, :2] for e, t in zip(estimates, touches[rows], strict=True)]
+    assert np.sqrt(np.square(error).mean()) < 2.5e-3
+    force = [e.contacts[0].force / t[0, 3] - 1 for e, t in zip(estimates, touches[rows], strict=True)]
+    assert np.median(np.abs(force)) < 0.1
+
+
+def test_two_contacts_are_told_apart():
+    touches = draw(12, seed=4, number=2, margin=0.03, apart=0.064)
+    estimates = posterior().estimate(measure(felt(touches), NOISE, 5))
+    right = [row for row, estimate in enumerate(estimates) if estimate.number == 2]
+    assert len(right) >= 11
+    for row in right:
+        places = np.array([contact.place for contact in estimates[row].contacts])
+        away = np.linalg.norm(touches[row][:, None, :2] - places, axis=2).min(1)
+        assert away.max() < 0.015
+
+
+@pytest.mark.parametrize("thin", [False, True])
+def test_a_bar_is_no_fingertip(thin):
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0.04, 0.12, 21), np.linspace(0.06, 0.084, 7)))
+    chain = np.stack([x, y, np.full(x.size, 0.004), np.full(x.size, 0.6)], axis=1)
+    estimate = posterior(thin).estimate(measure(felt(chain[None], thin), NOISE, 22)[0])
+    assert not estimate.fingertip
+    assert estimate.large > 0.9
+
+
+def test_frames_alone_and_together_give_the_same_bits():
+    touches = np.concatenate([draw(3, 11, 2, 0.03, 0.05), np.repeat(draw(3, 12, margin=0.03), 2, 1)])
+    readings = measure(felt(touches), NOISE, 13)
+    together = posterior().estimate(readings)
+    assert all(
+        same(posterior().estimate(row), estimate) for row, estimate in zip(readings, together, strict=True)
+    )
+
+
+def test_the_order_of_sensors_does_not_matter():
+    order = np.random.default_rng(0).permutation(25)
+    sensors = sensors_of(DEEP, 0.0295)
+    shuffled = Solid(DEEP, type(sensors)(sensors.positions[order], sensors.footprint, sensors.normals[order]))
+    readings = measure(felt(draw(4, 14, margin=0.03)), NOISE, 15)
+    for row in readings:
+        first, second = posterior().estimate(row), Posterior(shuffled, NOISE, DEEP).estimate(row[order])
+        assert first.number == second.number
+        for a, b in zip(first.contacts, second.contacts, strict=True):
+            np.testing.assert_allclose(moments(a)[0], moments(b)[0], rtol=1e-3)
+            np.testing.assert_allclose(moments(a)[1], moments(b)[1], rtol=1e-2)
+
+
+def test_an_invalid_sensor_counts_for_nothing():
+    readings = measure(felt(draw(1, 16, margin=0.05)), NOISE, 17)[0]
+    valid = np.arange(25) != readings.argmax()
+    worse = np.where(valid, readings, 99.0)
+    clean, spoilt = posterior().estimate(readings, valid), posterior().estimate(worse, valid)
+    assert same(clean, spoilt)
+    assert same(clean, posterior().estimate(np.where(valid, readings, np.nan)))
+    assert (
+        clean.contacts[0].place_deviation.max()
+        > posterior().estimate(readings).contacts[0].place_deviation.max()
+    )
+
+
+def test_a_sensor_that_clips_says_at_least_so_much():
+    touch = np.array([[[0.08, 0.08, 0.008, 40.0]]])
+    true = felt(touch, thin=True)[0]
+    noise = Noise(0.05, 10, clip=float(true.max() / 2))
+    prior = FingertipPrior(force=20.0)
+    readings = np.minimum(measure(true, noise, 18), noise.clip)
+    (contact,) = posterior(True, noise, prior).estimate(readings).contacts
+    blind = posterior(True, noise, prior).estimate(readings, readings < noise.clip).contacts
+    assert np.linalg.norm(contact.place - touch[0, 0, :2]) < 0.006
+    assert contact.force > 20
+    assert not blind or blind[0].place_deviation.max() > contact.place_deviation.max()
+
+
+def test_frames_of_a_touch_tell_more_together():
+    touches = draw(1, 19, margin=0.05)
+    frames = np.concatenate([measure(felt(touches), Noise(0.05), seed) for seed in range(10)])
+    alone = posterior(noise=Noise(0.05)).estimate(frames[0])
+    together = posterior(noise=Noise(0.05)).estimate_touch(frames)
+    assert together.contacts[0].region().area < 0.5 * alone.contacts[0].region().area
+    mean = posterior().estimate(frames.mean(0))
+    np.testing.assert_allclose(together.contacts[0].place, mean.contacts[0].place, rtol=1e-9)
+
+
+def test_two_sensors_say_what_cannot_be_known():
+    body = DEEP
+    sensors = sensors_of(body, 0.0295)
+    two = type(sensors)(sensors.positions[[11, 13]], sensors.footprint)
+    estimate = Posterior(Solid(body, two), NOISE, body).estimate(np.array([0.3, 0.0]))
+    assert "cannot be told apart" in estimate.unknown
+    assert estimate.number >= 1
+    assert estimate.contacts[0].region().area > 5e-4
+    nothing = Posterior(Solid(body, two), NOISE, body).estimate(np.array([np.nan, np.nan]))
+    assert "nothing is known" in nothing.unknown
+
+
+def test_a_limit_of_pressure_has_a_probability():
+    touch = np.array([[[0.08, 0.08, 0.008, 10.0]]])
+    estimate = posterior().estimate(measure(felt(touch), NOISE, 21)[0])
+    limits = [estimate.exceeds(limit) for limit in (1e3, 50e3, 1e6)]
+    assert limits[0] == pytest.approx(1)
+    assert limits[2] < 0.01
+    assert limits == sorted(limits, reverse=True)
+
+
+def test_every_simulator_that_adds_up_and_an_arm_work():
+    touch, sensors = np.array([[0.075, 0.083, 0.008]]), Grid(5, 5, (0.01, 0.01)).sensors(THIN)
+    arm = Arm(
+        radius=0.05, length=0.16, angle=3.2, cells=(16, 16),
+        layers=[{"material": {"name": "Dragon Skin 10 Medium", "poisson": 0.49}, "thickness": 0.01},
+                SOFT | {"thickness": 0.005}],
+    )  # fmt: skip
+    on_arm = Grid(5, 5, (0.01, 0.01)).sensors(arm)
+    skins = [
+        (PlatesAndBeams(THIN, sensors, reading="interface"), THIN, 3),
+        (PlatesAndBeams(THIN, sensors), THIN, 1),
+        (Naive(THIN, sensors), THIN, 3),
+        (Solid(arm, on_arm), arm, 3),
+    ]
+    for simulator, body, most in skins:
+        readings = 8 * disc_readings(simulator, body, touch, 0.0015)[0]
+        estimate = Posterior(simulator, NOISE, body, contacts=most).estimate(readings)
+        assert estimate.number == 1
+        assert np.linalg.norm(estimate.contacts[0].place - touch[0, :2]) < 0.012
+
+
+def test_errors_are_one_sentence():
+    body, sensors = THIN, Grid(5, 5, (0.01, 0.01)).sensors(THIN)
+    with pytest.raises(skin.InputError, match="a standard deviation above 0 N"):
+        Noise(0.0)
+    with pytest.raises(skin.InputError, match="needs the mechanics of a skin"):
+        Posterior(None, NOISE, body)
+    with pytest.raises(skin.InputError, match="1 to 3 contacts"):
+        Posterior(solid(), NOISE, DEEP, contacts=4)
+    with pytest.raises(skin.InputError, match="do not add up"):
+        Posterior(PlatesAndBeams(body, sensors), NOISE, body)
+    with pytest.raises(skin.InputError, match="this skin has 25 sensors"):
+        posterior().estimate(np.zeros(24))

@@ -231,9 +231,10 @@ class TouchAlarms:
         trained, settings = subject.trained, check_evaluation(subject.config.evaluation)
         device = subject.device.simulated("touches are simulated")
         patience = DebounceSettings().alarm
-        aligned = device.rate <= device.model_rate
-        watching = trained.watching(device.rate, patience, aligned)
-        at_once = trained.watching(device.rate, 0.0, aligned)
+        rate = float(np.ravel(device.rate)[0])
+        aligned = rate <= device.model_rate
+        watching = trained.watching(rate, patience, aligned)
+        at_once = trained.watching(rate, 0.0, aligned)
         target = settings.false_alarm_rate
         touch = choose_for_touches(subject.learner, device, watching, target)
         window = choose_operating_point(subject.learner, device, settings)

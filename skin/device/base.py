@@ -134,7 +134,7 @@ class AbstractSimulated(AbstractDevice):
         sampler: draws the touches.
         window: frames per touch.
         model_rate: frames per second of touches, Hz.
-        rate: frames per second of the sensors, Hz; touches are resampled to ``model_rate``.
+        rate: frames per second of the sensors, Hz, or [least, most]; touches are resampled to ``model_rate``.
         stream: whether touches are windows of streams.
         seed: for the device's constants and noise.
         data_seed: for the gestures of the training budget.
@@ -151,7 +151,7 @@ class AbstractSimulated(AbstractDevice):
     sampler: "AbstractSampler"
     window: int
     model_rate: float
-    rate: float
+    rate: float | tuple[float, float]
     stream: bool
     seed: int
     data_seed: int

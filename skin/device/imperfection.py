@@ -7,13 +7,11 @@ import numpy as np
 import torch
 from annotated_types import Ge, Gt
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
-from scipy.special import ndtri
 from torch import Tensor
 
 from skin.core.settings import RISING, checked
 from skin.device.calibration import Calibration, read_calibration
 from skin.device.curves import Curves, check_table
-from skin.device.resampling import resample
 from skin.errors import InputError
 from skin.mechanics.relaxation import apply_hysteresis, first_order_lag, quantize
 
@@ -36,6 +34,7 @@ class Constants(NamedTuple):
         time_constant: of a first-order lag, s; 0: none.
         quantum: step of the converter, N; 0: none.
         exponent, exponent_at: of the sensor's curve (:class:`skin.device.curves.Curves`); 1, N: linear.
+        rate: frames per second, Hz, one number per device.
     """
 
     gain: Tensor
@@ -51,6 +50,7 @@ class Constants(NamedTuple):
     quantum: Tensor
     exponent: Tensor
     exponent_at: Tensor
+    rate: Tensor
 
     def to(self, device: torch.device | str) -> "Constants":
         """Return these constants on ``device``."""
@@ -59,7 +59,7 @@ class Constants(NamedTuple):
 
 _IDLE_FRAMES = 30
 
-_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent")
+_SPREADS = ("gain_spread", "noise", "drift", "hysteresis", "time_constant", "exponent", "scale_spread")
 
 Spread = NonNegativeFloat | Annotated[tuple[NonNegativeFloat, NonNegativeFloat], RISING]
 """A number, or a range (least, most) of which each device draws its own."""
@@ -70,10 +70,12 @@ class ImperfectionSettings:
     """Settings of a device's imperfections (``conf/device/simulated.yaml``).
 
     A :data:`Spread` is a number or [least, most]. A device draws one share from 0 to 1, uniformly, and takes
-    that share of all its ranges: a device that drifts much is noisy, too.
+    that share of all its ranges: a device that drifts much is noisy, too. If ``independent``, it draws a
+    share for each range.
 
     Attributes:
         gain_spread: standard deviation of the logarithm of each sensor's gain; the report gives none.
+        scale_spread: of the logarithm of a factor that all gains of a device share.
         offset: standard deviation of each sensor's offset, N, constant in a device.
         noise: standard deviation of the noise in every frame, N.
         clip: largest force that a sensor measures, N.
@@ -92,10 +94,14 @@ class ImperfectionSettings:
         exponent_at: N.
         table: another curve of all sensors: forces and readings, each rising from 0, N; None: the exponent's.
         polarity: -1: the values that the device sends fall with force.
-        rate: frames per second, Hz.
+        rate: frames per second, Hz, or [least, most], of which each device draws one on a logarithmic scale.
+        independent: each range above has a share of its own.
+        aligned: touches begin and end at the edges of the model's intervals; False: anywhere in them, as on
+            a real skin.
     """
 
     gain_spread: Spread = 0.05
+    scale_spread: Spread = 0.0
     offset: Annotated[float, Ge(0)] = 0.1
     noise: Spread = 0.05
     clip: Annotated[float, Gt(0)] = 10.0
@@ -111,7 +117,14 @@ class ImperfectionSettings:
     exponent_at: Annotated[float, Gt(0)] = 2.0
     table: list[list[float]] | None = None
     polarity: Literal[1, -1] = 1
-    rate: Annotated[float, Gt(0)] = 10.0
+    rate: PositiveFloat | Annotated[tuple[PositiveFloat, PositiveFloat], RISING] = 10.0
+    independent: bool = False
+    aligned: bool = True
+
+    @property
+    def slowest(self) -> float:
+        """Least rate of a device, Hz."""
+        return float(self.rate if isinstance(self.rate, int | float) else self.rate[0])
 
 
 @checked("device")
@@ -182,8 +195,15 @@ class Imperfection(ImperfectionSettings):
             )
         idle = values["offset"] + values["noise"] / np.sqrt(_IDLE_FRAMES) * values.pop("idle")
         values["baseline"] = idle if self.tare else np.zeros(shape)
+        least, most = np.log(np.broadcast_to(self.rate, 2))
+        values["rate"] = (
+            np.asarray(self.slowest)
+            if least == most
+            else np.exp(generator.uniform(least, most, (*shape[:-1], 1)))
+        )
         tensors = {name: torch.from_numpy(value).float() for name, value in values.items()}
-        return Constants(**tensors | {"dead": tensors["dead"].bool()})
+        rate = torch.from_numpy(values["rate"])
+        return Constants(**tensors | {"dead": tensors["dead"].bool(), "rate": rate})
 
     def _draw_constants(
         self, shape: tuple[int, ...], generator: np.random.Generator
@@ -191,8 +211,10 @@ class Imperfection(ImperfectionSettings):
         """Draw from spreads. What is neutral draws nothing, so that other constants stay what they were."""
         ranges = {name: getattr(self, name) for name in _SPREADS}
         some = any(isinstance(bounds, list | tuple) for bounds in ranges.values())
-        share = generator.random((*shape[:-1], 1)) if some else np.zeros(())
-        spread = {name: _part(bounds, share) for name, bounds in ranges.items()}
+        shares = dict.fromkeys(ranges, generator.random((*shape[:-1], 1)) if some else np.zeros(()))
+        if self.independent:
+            shares = {name: generator.random((*shape[:-1], 1)) for name in ranges}
+        spread = {name: _part(bounds, shares[name]) for name, bounds in ranges.items()}
         gain = np.exp(spread["gain_spread"] * generator.standard_normal(shape))
         offset = self.offset * generator.standard_normal(shape)
         rank = generator.random(shape).argsort(axis=-1).argsort(axis=-1)
@@ -204,6 +226,8 @@ class Imperfection(ImperfectionSettings):
         if self.stuck:
             stuck = (rank >= count) & (rank < count + self.stuck)
             level = np.where(stuck, generator.uniform(0, self.clip, shape), level)
+        if np.any(spread["scale_spread"]):
+            gain = gain * np.exp(spread["scale_spread"] * generator.standard_normal((*shape[:-1], 1)))
         values = {name: np.asarray(float(getattr(self, name))) for name in ("clip", "quantum", "exponent_at")}
         values |= {name: spread[name] for name in ("noise", "hysteresis", "time_constant", "exponent")}
         dead = rank < count + self.stuck + self.saturated
@@ -266,6 +290,27 @@ class Imperfection(ImperfectionSettings):
         output, _ = self._measure(readings, constants, generator, time)
         return torch.where(constants.dead, constants.level, output)
 
+    def is_static(self, constants: Constants, sensors: int) -> bool:
+        """Return whether the sensors follow the force at once and in proportion to it."""
+        in_time = constants.hysteresis.any() or constants.time_constant.any()
+        return not in_time and self._curves(constants, sensors) is None
+
+    def sense(self, force: Tensor, constants: Constants, time: Tensor) -> Tensor:
+        """Return what the sensors respond before the converter, (B, T, S), N: hysteresis, lag, gain, curve.
+
+        Args:
+            force: (B, T, S), true readings, N.
+            constants: of this device.
+            time: of every frame, (T,), s.
+        """
+        if constants.hysteresis.any():
+            force = apply_hysteresis(force, constants.hysteresis)
+        if constants.time_constant.any():
+            force = first_order_lag(force, constants.time_constant, time)
+        scaled = force * constants.gain
+        curves = self._curves(constants, force.shape[-1])
+        return scaled if curves is None else curves.bend(scaled)
+
     def _measure(
         self,
         readings: Tensor,
@@ -275,15 +320,8 @@ class Imperfection(ImperfectionSettings):
     ) -> tuple[Tensor, Tensor]:
         noise = torch.from_numpy(generator.standard_normal(readings.shape, dtype=np.float32))
         if time is None:
-            time = torch.arange(readings.shape[1], device=readings.device) / self.rate
-        force = readings
-        if constants.hysteresis.any():
-            force = apply_hysteresis(force, constants.hysteresis)
-        if constants.time_constant.any():
-            force = first_order_lag(force, constants.time_constant, time)
-        scaled = force * constants.gain
-        if (curves := self._curves(constants, readings.shape[-1])) is not None:
-            scaled = curves.bend(scaled)
+            time = torch.arange(readings.shape[1], device=readings.device) / self.slowest
+        scaled = self.sense(readings, constants, time)
         output, saturated = scaled.clamp(-constants.clip, constants.clip), scaled.abs() > constants.clip
         output += noise.to(readings.device).mul_(constants.noise) + (constants.offset - constants.baseline)
         if constants.drift.any():
@@ -301,124 +339,3 @@ def _part(spread: Spread, share: np.ndarray) -> np.ndarray:
 
 def _settings(settings: ImperfectionSettings) -> dict[str, Any]:
     return {entry.name: getattr(settings, entry.name) for entry in fields(ImperfectionSettings)}
-
-
-# Simulated readings at the rate of a device, reduced to the rate of a model like those of a real one.
-
-
-_QUANTILES = 20000
-
-
-def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndarray | float = 0.5) -> Tensor:
-    """Return true readings (B, F, S), N, at the rate of a device.
-
-    A frame of the model is the force in the middle of its interval. Between two frames in contact the force
-    changes linearly: a sliding touch goes at its speed from one place of its path to the next, and its force
-    follows the profile. A touch begins and ends at the edges of its first and last interval, so it does not
-    become longer. No reading exceeds the larger of its two frames, so a safe touch stays safe.
-
-    Args:
-        force: (B, T, S), true readings at the model's rate, N; a frame without contact is 0.
-        model_rate: Hz.
-        rate: of the device, Hz.
-        phase: when the device reads, (B,) or one for all: share of its interval, from 0 to 1.
-    """
-    batch, window, _ = force.shape
-    frames = round(window * rate / model_rate)
-    read = np.arange(frames) + np.reshape(phase, (-1, 1))
-    place = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
-    now = np.minimum(place.astype(int), window - 1)
-    offset = place - now - 0.5  # from the middle of the interval, in intervals
-    neighbour = now + np.sign(offset).astype(int)
-    padded = torch.nn.functional.pad(force, (0, 0, 1, 1))
-    touched = (padded != 0).any(dim=2, keepdim=True)
-    share = torch.from_numpy(np.abs(offset)).to(force)[..., None]
-    row = np.arange(batch)[:, None]
-    current, neighbour_value = padded[row, now + 1], padded[row, neighbour + 1]
-    # Towards a frame without contact the force is 0 at the edge, which is half an interval away.
-    share = torch.where(touched[row, neighbour + 1], share, 2 * share)
-    return torch.where(touched[row, now + 1], torch.lerp(current, neighbour_value, share), 0.0)
-
-
-def measure(
-    imperfection: Imperfection,
-    constants: Constants,
-    force: Tensor,
-    model_rate: float,
-    noise: np.random.Generator,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what a device measures, at the rate of a model.
-
-    Imperfections apply at the rate of the device. The maximum over each interval of the model is kept, as for
-    a real device (:func:`skin.device.resampling.resample`). A faster device reads each gesture, or each
-    stream, at a random phase of its interval, since no touch waits for the device. One at the model's rate,
-    or slower by up to 5 %, gives the frames of the model.
-
-    Args:
-        imperfection: of the device, with its rate.
-        constants: of the device.
-        force: (B, T, S), true readings, N, at the model's rate.
-        model_rate: Hz.
-        noise: source of the noise and of the phases.
-
-    Returns:
-        readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
-    """
-    if imperfection.rate <= model_rate:
-        return imperfection.apply(force, constants, noise)
-    fine = between_frames(force, model_rate, imperfection.rate, noise.random(len(force)))
-    readings, valid, saturated = imperfection.apply(fine, constants, noise)
-    return _reduce_rate(readings, valid, saturated, (imperfection.rate, model_rate), force.shape[1])
-
-
-def _reduce_rate(
-    readings: Tensor, valid: Tensor, saturated: Tensor, rates: tuple[float, float], window: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return readings and masks (B, F, S) at the first of two rates as (B, window, S) at the second, Hz."""
-    batch, frames, sensors = readings.shape
-    values, works, limits = (
-        tensor.transpose(0, 1).flatten(1).cpu().numpy() for tensor in (readings, valid, saturated)
-    )
-    time = (np.arange(frames) + 0.5) / rates[0]
-    resampled = resample(time, values, works, limits, window / rates[1], 1 / rates[1], window)
-    tensors = (
-        torch.from_numpy(tensor).unflatten(1, (batch, sensors)).transpose(0, 1) for tensor in resampled[:3]
-    )
-    highest, known_frames, limited = (tensor.contiguous().to(readings.device) for tensor in tensors)
-    return highest.to(readings.dtype), known_frames, limited
-
-
-def draw_constants(
-    imperfection: Imperfection,
-    sensors: int,
-    model_rate: float,
-    drawn: np.random.Generator,
-    gestures: int | None = None,
-) -> Constants:
-    """Draw the constants of a device, or of one per gesture, with a baseline of resampled readings.
-
-    The maximum of noise is not 0, so a tare of a real device takes its baseline from resampled readings, too.
-
-    Args:
-        imperfection, sensors, drawn, gestures: as in :meth:`Imperfection.constants`.
-        model_rate: Hz.
-    """
-    constants = imperfection.constants(sensors, drawn, gestures)
-    if not imperfection.tare or imperfection.rate <= model_rate:
-        return constants
-    return constants._replace(baseline=constants.baseline + idle_excess(imperfection, constants, model_rate))
-
-
-def idle_excess(imperfection: Imperfection, constants: Constants, model_rate: float) -> Tensor:
-    """Return the mean of idle readings above the offset, N: that of the maximum of the noise of an interval.
-
-    Args:
-        imperfection: of the device, with its rate.
-        constants: of the device; the result has the shape of their noise.
-        model_rate: Hz.
-    """
-    number = imperfection.rate / model_rate
-    if number <= 1:
-        return torch.zeros_like(constants.noise)
-    chance = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    return constants.noise * float(ndtri(chance ** (1 / number)).mean())

@@ -151,6 +151,29 @@ def resample(
     return Resampled(strongest if polarity is None else strongest * polarity, has_value, limited)
 
 
+def frame_ages(ratios: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gesture and the age of each frame of many windows, (N,), gesture by gesture, oldest first.
+
+    As in a live window, the last frame is half its interval before the end.
+
+    Args:
+        ratios: (B,), frames of the device per interval of the model, at least 1.
+        window: number of intervals.
+
+    Returns:
+        gesture, from 0; age before the end of the window, in intervals of the model.
+    """
+    counts = np.ceil(window * ratios - 0.5).astype(int)
+    gesture = np.repeat(np.arange(len(counts)), counts)
+    left = np.repeat(np.cumsum(counts), counts) - np.arange(len(gesture))
+    return gesture, (left - 0.5) / ratios[gesture]
+
+
+def highest_each(values: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Return the largest of the values (N, S) of every interval, whose ``number`` (N,) rises, (I, S)."""
+    return np.maximum.reduceat(values, np.flatnonzero(np.diff(number, prepend=-1)), axis=0)
+
+
 def check_rate(measured: float, rate: float, setting: str | None = None) -> None:
     """Check that a device is fast enough for a model.
 

@@ -18,8 +18,9 @@ from skin.core.rng import Stream, generator
 from skin.core.settings import checked
 from skin.device.balance import summarise
 from skin.device.base import AbstractSimulated, Split, grouped, joined, split_rows, split_slices
-from skin.device.imperfection import Imperfection, ImperfectionSettings, draw_constants, idle_excess, measure
+from skin.device.imperfection import Imperfection, ImperfectionSettings
 from skin.device.resampling import check_rate
+from skin.device.sampling import draw_constants, idle_excess, measure
 from skin.device.touches import Part, Recording, Touches, TouchStream, draw_timeline, only_touches
 from skin.errors import InputError
 from skin.mechanics.contact.base import AbstractContact
@@ -39,19 +40,27 @@ from skin.touch.splines import footprints
 _ROUNDING = 1e-9  # m
 
 
-def misplace(sensors: Sensors, size: tuple[float, float], error: float, seed: int) -> Sensors:
-    """Return sensors beside their places.
+def misplace(
+    sensors: Sensors, size: tuple[float, float], error: float, seed: int, footprint_error: float = 0.0
+) -> Sensors:
+    """Return sensors beside their places, with footprints of another size.
 
     Args:
         sensors: as touches report them.
         size: extent (x, y) of the sheet, m, on which they stay.
         error: standard deviation along x and along y, m.
         seed: of the device.
+        footprint_error: standard deviation of the logarithm of the factor on the sides of all footprints.
     """
-    moves = generator(Stream.POSITION, seed).standard_normal((len(sensors), 2))
+    drawn = generator(Stream.POSITION, seed)
+    moves = drawn.standard_normal((len(sensors), 2))
     positions = sensors.positions.copy()
     positions[:, :2] = np.clip(positions[:, :2] + error * moves, 0, size)
-    return replace(sensors, positions=positions)
+    if not footprint_error:
+        return replace(sensors, positions=positions)
+    factor = float(np.exp(footprint_error * drawn.standard_normal()))
+    footprint = (sensors.footprint[0] * factor, sensors.footprint[1] * factor)
+    return replace(sensors, positions=positions, footprint=footprint)
 
 
 def cover_surface(body: AbstractBody, footprint: tuple[float, float]) -> Sensors:
@@ -142,6 +151,9 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
         calibration: file of skin calibrate, which replaces all these but dead, tare and rate.
         randomise: measure every gesture with another device.
         position_error: standard deviation of the true sensor positions from the reported ones, m.
+        footprint_error: standard deviation of the logarithm of the true over the reported side of footprints.
+        described: ``described(body, sensors)``, the simulator that :attr:`geometry` reports the responses of;
+            None: ``simulator``.
 
     Raises:
         InputError: invalid settings.
@@ -163,6 +175,8 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     calibration: str | None = None
     randomise: bool = False
     position_error: Annotated[float, Ge(0)] = 0.0
+    footprint_error: Annotated[float, Ge(0)] = 0.0
+    described: Callable[[AbstractBody, Sensors], AbstractSimulator] | None = None
 
     def __post_init__(self) -> None:
         if self.stream and self.direction:
@@ -174,10 +188,11 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
             )
         self.task = TOUCH_OR_NOT if self.stream else TOUCH_SLIDING if self.direction else TOUCH
         self.size, self.sensors = self.body.size, self.layout.sensors(self.body)
-        self.true_sensors = misplace(self.sensors, self.size, self.position_error, self.seed)
+        errors = self.position_error, self.seed, self.footprint_error
+        self.true_sensors = misplace(self.sensors, self.size, *errors)
         settings = read_touch(self.touch)
         self.window, self.model_rate = settings.frames.window, float(settings.rate)
-        check_rate(self.rate, self.model_rate, "device.rate")
+        check_rate(self.slowest, self.model_rate, "device.rate")
         self.model = build_model(self.simulator, self.body, self.true_sensors, self.model_rate)
         self.sampler = self._sampler(self.body, self.true_sensors, self.model)
         if self.sampler.settings.shear:
@@ -196,14 +211,15 @@ class Simulated(ImperfectionSettings, AbstractSimulated):
     @cached_property
     def geometry(self) -> Tensor:
         """Where the sensors are and what they respond to, (S, G), :data:`skin.device.touches.GEOMETRY`."""
-        same = self.position_error == 0
-        model = self.model if same else build_model(self.simulator, self.body, self.sensors, self.model_rate)
+        same = self.position_error == self.footprint_error == 0 and self.described is None
+        simulator = self.described or self.simulator
+        model = self.model if same else build_model(simulator, self.body, self.sensors, self.model_rate)
         return sensor_geometry(self.body, self.sensors, model)
 
     @property
     def idle(self) -> Tensor:
         """What the untouched skin reads on average, (S,), N; 0 for dead sensors."""
-        excess = idle_excess(self.imperfection, self.constants, self.model_rate)
+        excess = idle_excess(self.constants, self.model_rate)
         level = self.constants.offset - self.constants.baseline + excess
         return level.masked_fill(self.constants.dead, 0.0)
 

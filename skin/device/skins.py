@@ -54,12 +54,16 @@ class DrawnSkin:
         layout: of its sensors.
         simulator: ``simulator(body, sensors)``.
         position_error: standard deviation of the true positions from those of the layout, m.
+        footprint_error: of the logarithm of the true over the layout's sides of footprints.
+        described: the mechanics that the skin is described with; None: ``simulator``.
     """
 
     body: AbstractBody
     layout: AbstractLayout
     simulator: Make
     position_error: float
+    footprint_error: float = 0.0
+    described: Make | None = None
 
 
 @checked("device.skins")
@@ -84,6 +88,9 @@ class SkinDistribution:
         plates: share of sheets with the mechanics of plates on beams (:mod:`skin.mechanics.simulator.fem`);
             their sensors are between the layers.
         naive: share of sheets without mechanics.
+        interface: share of sheets that read the forces between the layers of plates on beams, and are
+            described as an elastic solid, because their owner does not know better.
+        footprint_error: standard deviation of the logarithm of the true over the layout's side of footprints.
     """
 
     length: Range
@@ -103,12 +110,14 @@ class SkinDistribution:
     divisions: PositiveInt
     plates: Annotated[float, Ge(0), Le(1)] = 0.0
     naive: Annotated[float, Ge(0), Le(1)] = 0.0
+    interface: Annotated[float, Ge(0), Le(1)] = 0.0
+    footprint_error: NonNegativeFloat = 0.0
 
     def __post_init__(self) -> None:
-        if self.plates + self.naive > 1:
+        if (total := self.plates + self.naive + self.interface) > 1:
             raise InputError(
-                "device.skins.plates + device.skins.naive must be at most 1, got "
-                f"{self.plates + self.naive:g}: make one of them smaller"
+                "device.skins.plates + device.skins.naive + device.skins.interface must be at most 1, got "
+                f"{total:g}: make one of them smaller"
             )
 
     def draw(self, generator: np.random.Generator, mixed: bool = False) -> DrawnSkin:
@@ -123,14 +132,20 @@ class SkinDistribution:
         kind, top = str(generator.choice(self.layouts)), body.layers[-1].thickness
         depth = top * generator.uniform(*self.depth)
         side = generator.uniform(*self.footprint)
-        simulator: Make = partial(Solid, divisions=self.divisions)
-        chance = generator.random()
-        if mixed and isinstance(body, Sheet) and chance < self.plates + self.naive:
-            plates = chance < self.plates
-            simulator = PlatesAndBeams if plates else Naive
-            depth = top if plates else depth  # plates on beams know forces between layers only
+        solid: Make = partial(Solid, divisions=self.divisions)
+        simulator, described = solid, None
+        chance = generator.random() if mixed and isinstance(body, Sheet) else generator.random() + 1
+        if chance < self.plates:
+            simulator = PlatesAndBeams
+        elif chance < self.plates + self.naive:
+            simulator = Naive
+        elif chance < self.plates + self.naive + self.interface:
+            simulator, described = partial(PlatesAndBeams, reading="interface"), solid
+        # Plates on beams know forces between layers only.
+        depth = depth if simulator in (solid, Naive) else top
         layout = _layout(kind, count, body.size, side, depth, generator)
-        return DrawnSkin(body, layout, simulator, generator.uniform(*self.position_error))
+        error = generator.uniform(*self.position_error)
+        return DrawnSkin(body, layout, simulator, error, self.footprint_error if mixed else 0.0, described)
 
     def outside(self, body: AbstractBody, sensors: Sensors) -> list[str]:
         """Return what of a skin lies outside the ranges, as "number of sensors 100 (4 to 64)"."""
@@ -356,6 +371,8 @@ class Skins(ImperfectionSettings, AbstractDevice):
             layout=skin.layout,
             simulator=skin.simulator,
             position_error=skin.position_error,
+            footprint_error=skin.footprint_error,
+            described=skin.described,
             touch=self.touch,
             padded=self.padded,
             randomise=True,

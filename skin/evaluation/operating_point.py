@@ -20,7 +20,7 @@ from torch.nn.functional import max_pool1d, pad
 
 from skin.core.rng import Stream, generator
 from skin.device.base import AbstractDevice, AbstractSimulated
-from skin.device.imperfection import between_frames, draw_constants
+from skin.device.sampling import between_frames, draw_constants
 from skin.device.touches import Touches
 from skin.errors import InputError
 from skin.evaluation.decisions import DECISIONS, RELEASE, as_press, held_frames, longest_shown

@@ -38,6 +38,15 @@ from skin.evaluation.settings import Evaluation
 
 MACHINE = ("accelerator", "devices", "enable_progress_bar", "num_nodes", "precision", "strategy")
 """Settings of Lightning's Trainer that choose the machine, not the result."""
+ADDED = {
+    "scale_spread": 0.0,
+    "independent": False,
+    "aligned": True,
+    "footprint_error": 0.0,
+    "described": None,
+    "interface": 0.0,
+}
+"""Settings of a device that came later, with the values that earlier runs mean; those count as left out."""
 _FOLDERS = ("skin", "experiments", "conf", "data")  # results depend on nothing else in the repository
 
 
@@ -45,16 +54,21 @@ def config_hash(content: dict[str, Any]) -> str:
     """Return the hash of a configuration in plain containers, 16 hexadecimal digits."""
     texts = (value for _, value in walk_settings(content) if isinstance(value, str))
     files = {text: _hash_of(text) for text in texts if _file(text)}
-    text = json.dumps([_without_machine(content), files, __version__], sort_keys=True)
+    text = json.dumps([_counted(content), files, __version__], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _without_machine(value: Any, group: str = "") -> Any:
-    """Return a configuration without :data:`MACHINE`."""
+def _counted(value: Any, group: str = "") -> Any:
+    """Return a configuration without :data:`MACHINE`, and without the values in :data:`ADDED`."""
     if not isinstance(value, dict):
         return value
     left_out = MACHINE if group == "trainer" else ()
-    return {key: _without_machine(entry, key) for key, entry in value.items() if key not in left_out}
+    added = ADDED if group in ("device", "skins") else {}
+    return {
+        key: _counted(entry, key)
+        for key, entry in value.items()
+        if key not in left_out and not (key in added and entry == added[key])
+    }
 
 
 def _file(name: str) -> Path | None:

@@ -4,7 +4,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from functools import cached_property
 from math import log
 from pathlib import Path
@@ -25,7 +25,7 @@ from skin.body.layout import AbstractLayout
 from skin.core import array_cache
 from skin.core.messages import Steps, to_input_error
 from skin.core.settings import configured
-from skin.device import imperfection
+from skin.device import imperfection, sampling
 from skin.device.base import AbstractDevice, AbstractSimulated
 from skin.device.calibration import Calibration, read_calibration
 from skin.device.touches import Touches
@@ -51,10 +51,11 @@ from skin.runs.store import Store
 from skin.runs.trained_model import TrainedModel
 
 _RATIOS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)  # of the rate of a device to that of the model
+_DEVICE = "device"  # in place of a profile: the imperfections of the device that is evaluated
 _FAINT = 0.3  # N, default contact threshold
 _MANY = 4000  # windows of streams, a tenth of which tunes the contact threshold
 _EXPECTED = 20.0  # s
-_SOURCES = (operating_point, decisions, imperfection)  # of the thresholds that are kept on disk
+_SOURCES = (operating_point, decisions, imperfection, sampling)  # of the thresholds that are kept on disk
 _log = logging.getLogger(__name__)
 
 
@@ -128,7 +129,7 @@ def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
     """Return the device whose fresh gestures determine the threshold of the alarm.
 
     It is the device of the training on the skin of ``config``. If ``evaluation.profile`` is set, every
-    gesture is measured by another device of this profile.
+    gesture is measured by another device of this profile; ``device``: with the imperfections of ``config``.
 
     Args:
         stored: configuration of a training.
@@ -146,7 +147,7 @@ def threshold_device(stored: Config, config: Config) -> AbstractSimulated:
     skin = {group: getattr(config, group) for group in ("body", "layout", "simulator")}
     settings = settings | skin
     if profile is not None:
-        settings |= profile_settings(profile)
+        settings |= _evaluated(config) if profile == _DEVICE else profile_settings(profile)
         # Drawn skins draw a device for every gesture without being told.
         every = {} if "skins" in settings else {"randomise": True, "calibration": None}
         settings = {name: value for name, value in settings.items() if name != "randomise"} | every
@@ -227,6 +228,21 @@ def _remaining(calibration: Calibration) -> dict[str, Any]:
     return left | limit | {"gain_spread": 0.02, "dead": 0, "tare": True}
 
 
+def _evaluated(config: Config) -> dict[str, Any]:
+    """Return the imperfections of the simulated device that a run is evaluated on.
+
+    Raises:
+        InputError: the device is not simulated.
+    """
+    names = {entry.name for entry in fields(imperfection.ImperfectionSettings)}
+    if not names <= set(config.device):
+        raise InputError(
+            f"evaluation.profile={_DEVICE} takes the imperfections of a simulated device: add "
+            "device=simulated, or name a profile"
+        )
+    return {name: config.device[name] for name in names}
+
+
 def profile_settings(name: str) -> dict[str, Any]:
     """Return the settings of the device in a profile (``conf/profile/``).
 
@@ -236,7 +252,7 @@ def profile_settings(name: str) -> dict[str, Any]:
     loader = GlobalHydra.instance().config_loader()
     names = loader.get_group_options("profile")
     if name not in names:
-        raise InputError(f"there is no profile {name}: choose one of {', '.join(names)}")
+        raise InputError(f"there is no profile {name}: choose one of {', '.join(names)}, or {_DEVICE}")
     return OmegaConf.to_container(compose(f"profile/{name}").device, resolve=True)  # type: ignore[return-value]
 
 

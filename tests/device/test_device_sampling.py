@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from skin.device.imperfection import Imperfection, between_frames, draw_constants, idle_excess, measure
-from skin.device.resampling import Frame, Window
+from skin.device.imperfection import Imperfection
+from skin.device.resampling import Frame, Window, resample
+from skin.device.sampling import between_frames, draw_constants, idle_excess, measure
 
 ROUGH = {"noise": 0.1, "drift": 0.05, "time_constant": 0.1, "hysteresis": 0.05, "quantum": 0.02, "clip": 4.0}
 
@@ -104,8 +105,125 @@ def test_the_noise_of_an_interval_raises_idle_readings(rate):
     device = Imperfection(rate=rate, noise=0.1)
     constants = device.constants(3, np.random.default_rng(0))
     drawn = 0.1 * np.random.default_rng(0).standard_normal((100000, round(rate / 10))).max(axis=1)
-    excess = idle_excess(device, constants, 10.0).item()
+    excess = idle_excess(constants, 10.0).item()
     assert excess == pytest.approx(drawn.mean(), abs=5 * drawn.std() / np.sqrt(len(drawn)))
     tared = Imperfection(rate=rate, noise=0.1, tare=True)
     raised = draw_constants(tared, 3, 10.0, np.random.default_rng(0)).baseline
     torch.testing.assert_close(raised, tared.constants(3, np.random.default_rng(0)).baseline + excess)
+
+
+def test_each_gesture_is_read_as_a_single_one_is():
+    """At one rate, touches that are read each at a rate of their own are those that are read together."""
+    settings = {"drift": 0.05, "quantum": 0.02, "clip": 4.0, "noise": 0.0}
+    together, each = (Imperfection(rate=rate, dead=1, **settings) for rate in (70.0, (70.0, 70.0)))
+    constants = together.constants(3, np.random.default_rng(0))
+    expected = measure(together, constants, touches(), 10.0, np.random.default_rng(1))
+    drawn = measure(each, constants, touches(), 10.0, np.random.default_rng(1))
+    # A drift is taken in the middle of the interval, so a few readings round to the next step.
+    error = (drawn[0] - expected[0]).abs()
+    assert (error <= 0.021).all()
+    assert (error > 1e-5).float().mean() < 0.25
+    assert all(torch.equal(one, other) for one, other in zip(drawn[1:], expected[1:], strict=True))
+
+
+@pytest.mark.parametrize("rate", [40.0, 100.0, 370.0])
+def test_lag_and_hysteresis_before_the_converter_are_those_at_the_rate_of_the_device(rate):
+    """They are computed at 50 Hz whatever the rate; the device's own steps differ by part of a step."""
+    slow = {"time_constant": 0.05, "hysteresis": 0.05, "noise": 0.0, "offset": 0.0}
+    together, each = (Imperfection(rate=bounds, **slow) for bounds in (rate, (rate, rate)))
+    constants = together.constants(3, np.random.default_rng(0))
+    expected, drawn = (
+        measure(device, constants, touches(), 10.0, np.random.default_rng(1))[0]
+        for device in (together, each)
+    )
+    step = max(1 / rate, 0.02)
+    # The force rises by at most 2 N in 0.05 s, of which the lag passes on 1 - exp(-step / 0.05).
+    assert (drawn - expected).abs().max() < 5.0 * (1 - np.exp(-step / 0.05))
+    assert (drawn - expected).abs().mean() < 0.1
+
+
+def test_unaligned_readings_are_those_of_the_common_resampler():
+    """Each device reads at its own rate; the window is cut as that of a live skin is."""
+    rates, tap = np.array([10.0, 12.3, 47.0, 100.0, 999.0]), torch.zeros(5, 12, 2)
+    tap[:, 6] = torch.tensor([1.0, -3.0])
+    tap[4, 6:] = torch.tensor([1.0, -3.0])  # until the end of the window: it is moved to the front
+    device = Imperfection(rate=(10.0, 1000.0), aligned=False, noise=0.0, offset=0.0, gain_spread=0.0)
+    constants = device.constants(2, np.random.default_rng(0), 5)
+    constants = constants._replace(rate=torch.from_numpy(rates).reshape(5, 1, 1))
+    readings, valid, saturated = measure(device, constants, tap, 10.0, np.random.default_rng(1))
+    later = np.random.default_rng(1).random(5) - (tap[:, -1, 0] != 0).numpy()
+    for number, (rate, shift) in enumerate(zip(rates, later, strict=True)):
+        time = 1.2 - (np.arange(round(1.2 * rate + 0.5), 0, -1) - 0.5) / rate
+        time = time[time > 0]
+        knots, force = ([6, 6.5, 11.5, 12], [0, 1, 1, 0]) if number == 4 else ([6, 6.5, 7], [0, 1, 0])
+        share = np.interp(10 * time - shift, knots, force)
+        values = share[:, None] * [1.0, -3.0]
+        works = np.ones(values.shape, dtype=bool)
+        seen = resample(time, values, works, ~works, 1.2, 0.1, 12)
+        np.testing.assert_allclose(readings[number].numpy(), seen.values, atol=1e-5)
+    assert valid.all()
+    assert not saturated.any()
+
+
+def test_touches_begin_anywhere_in_an_interval():
+    """A tap of one frame is felt in the two intervals that it lies in, with a uniform phase."""
+    tap = torch.zeros(4000, 3, 1)
+    tap[:, 1] = 1.0
+    device = Imperfection(rate=1000.0, aligned=False, noise=0.0, offset=0.0, gain_spread=0.0)
+    constants = device.constants(1, np.random.default_rng(0))
+    readings = measure(device, constants, tap, 10.0, np.random.default_rng(1))[0][:, :, 0].numpy()
+    later = readings[:, 2] > 0.01
+    assert later.mean() == pytest.approx(0.99, abs=0.01)
+    assert readings[:, 2].mean() == pytest.approx(0.75, abs=0.02)  # of min(1, 2 u) for uniform u
+    assert not readings[:, 0].any()
+
+
+def test_independent_ranges_are_not_correlated():
+    ranges = {
+        "noise": (0.0, 0.1),
+        "time_constant": (0.0, 0.1),
+        "hysteresis": (0.0, 0.1),
+        "rate": (10.0, 1000.0),
+    }
+    for independent in (False, True):
+        device = Imperfection(independent=independent, **ranges)
+        constants = device.constants(4, np.random.default_rng(0), 2000)
+        names = ("noise", "time_constant", "hysteresis", "rate")
+        values = np.stack([getattr(constants, name).double().numpy().ravel() for name in names])
+        correlation = np.corrcoef(values[:3])[np.triu_indices(3, 1)]
+        assert (np.abs(correlation) < 0.1).all() if independent else (correlation > 0.99).all()
+        rate = np.log(values[3])
+        assert abs(np.corrcoef(values[0], rate)[0, 1]) < 0.1
+        assert rate.mean() == pytest.approx(np.log(100), abs=0.15)
+
+
+def test_a_device_has_one_scale():
+    device = Imperfection(gain_spread=0.0, scale_spread=0.2)
+    gain = device.constants(5, np.random.default_rng(0), 3000).gain
+    assert torch.equal(gain, gain[:, :, :1].expand_as(gain))
+    assert gain[:, 0, 0].log().std().item() == pytest.approx(0.2, abs=0.02)
+
+
+def test_the_mean_noise_of_an_interval_is_interpolated_between_rates():
+    device = Imperfection(rate=(10.0, 1000.0), noise=0.1, tare=True)
+    constants = device.constants(1, np.random.default_rng(0), 20)
+    for number, rate in enumerate(constants.rate.ravel().tolist()):
+        single = Imperfection(rate=rate, noise=0.1).constants(1, np.random.default_rng(0))
+        assert idle_excess(constants, 10.0)[number].item() == pytest.approx(
+            idle_excess(single, 10.0).item(), abs=2e-4
+        )
+
+
+@pytest.mark.parametrize("rate", [10.0, 30.0, 1000.0])
+def test_the_noise_of_an_interval_is_the_largest_of_its_frames(rate):
+    """It is drawn at once where nothing touches, and frame by frame elsewhere; both are the same noise."""
+    device = Imperfection(rate=(rate, rate), noise=0.1, offset=0.0, aligned=False)
+    constants = device.constants(20, np.random.default_rng(0))
+    force = torch.zeros(1000, 8, 20)
+    force[:, 2:5] = 0.002  # N, felt by the device, and nothing beside the noise
+    readings = measure(device, constants, force, 10.0, np.random.default_rng(1))[0]
+    direct = 0.1 * np.random.default_rng(2).standard_normal((20000, round(rate / 10))).max(axis=1)
+    shares = np.linspace(0.02, 0.98, 25)
+    for values in (readings[:, 3], readings[:, 6:]):
+        drawn, expected = (np.quantile(noise, shares) for noise in (values.numpy(), direct))
+        np.testing.assert_allclose(drawn, expected, atol=0.008)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from skin.body.base import Sheet
+from skin.body.base import GEOMETRY, Sheet
 from skin.body.layout import Grid, Scattered
 from skin.core.rng import Stream, generator
 from skin.device.imperfection import ImperfectionSettings
@@ -280,3 +280,19 @@ def test_touches_between_the_sensors_count_if_asked_to():
         assert (pressure[dangerous] > 90.5e3).all()
         assert (pressure[~dangerous] <= 90.5e3).all()
     assert everywhere.parameters["draws"].mean() < over.parameters["draws"].mean()
+
+
+def test_the_true_footprints_differ_and_the_reported_ones_do_not():
+    """All sensors of a skin have the same factor; positions stay what they were."""
+    exact, wrong = (device(footprint_error=error) for error in (0.0, 0.1))
+    assert exact.true_sensors.footprint == exact.sensors.footprint == wrong.sensors.footprint
+    assert (wrong.true_sensors.positions == exact.true_sensors.positions).all()
+    factors = []
+    for seed in range(20):
+        true = wrong.replace(seed=seed).true_sensors.footprint
+        across, down = (side / known for side, known in zip(true, wrong.sensors.footprint, strict=True))
+        assert across == pytest.approx(down)
+        factors.append(across)
+    assert 0.05 < np.log(factors).std() < 0.15
+    shares = [skin.geometry[:, GEOMETRY.index("share")] for skin in (exact, wrong)]
+    torch.testing.assert_close(*shares)

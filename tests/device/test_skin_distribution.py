@@ -1,5 +1,7 @@
 """Drawn skins lie in their ranges, and a skin outside is told by its numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
@@ -10,6 +12,7 @@ from skin.body.material import Material
 from skin.core.files import CONF
 from skin.core.rng import Stream, generator
 from skin.device.skins import SkinDistribution
+from skin.mechanics.simulator.solid import Solid
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +49,31 @@ def test_most_skins_are_solids_and_only_those_of_tests_are_all(distribution):
     assert set(kinds(False)) == {"Solid"}
     assert set(kinds(True)) == {"Solid", "PlatesAndBeams", "Naive"}
     assert 40 <= kinds(True).count("Solid") < 60
+
+
+def test_a_skin_that_reads_forces_between_layers_is_described_as_a_solid(distribution):
+    def drawn(settings, number):
+        return settings.draw(generator(Stream.SKIN, 0, 0, number), mixed=True)
+
+    mixed = replace(distribution, interface=0.5, footprint_error=0.1)
+    kinds = {False: 0, True: 0}
+    for number in range(40):
+        skin, former = drawn(mixed, number), drawn(distribution, number)
+        assert skin.body.size == former.body.size
+        assert skin.position_error == former.position_error
+        assert (skin.footprint_error, former.footprint_error) == (0.1, 0.0)
+        interface = getattr(skin.simulator, "keywords", {}).get("reading") == "interface"
+        kinds[interface] += 1
+        assert interface == (skin.described is not None)
+        if interface:
+            assert skin.described.func is Solid
+            top = skin.body.layers[-1].thickness
+            assert (skin.layout.sensors(skin.body).positions[:, 2] == top).all()
+        else:
+            assert getattr(skin.simulator, "func", skin.simulator) is getattr(
+                former.simulator, "func", former.simulator
+            )
+    assert min(kinds.values()) > 10
 
 
 def test_what_is_outside_is_named(distribution):

@@ -81,7 +81,10 @@ def test_a_blank_device_prepares_no_skin(configured):
         ("device.skins.sensors=[9,4]", "must be a range"),
         ("device.skins.layouts=[square]", "device.skins.layouts"),
         ("device.count=0", "device.count=0"),
-        ("device.skins={plates: 0.6, naive: 0.5}", "plates + device.skins.naive must be at most 1, got 1.1"),
+        (
+            "device.skins={plates: 0.6, naive: 0.5}",
+            "naive + device.skins.interface must be at most 1, got 1.1",
+        ),
     ],
 )
 def test_refuses(configured, override, words):

@@ -52,6 +52,16 @@ def test_a_profile_holds_on_a_run_of_drawn_skins(hydra):
         assert device.noise == profile_settings(profile)["noise"]
 
 
+def test_the_evaluated_device_counts_with_its_rate_and_alignment(hydra):
+    changes = ["profile=rough", "device.rate=100", "device.aligned=false", "evaluation.profile=device"]
+    for stored in (hydra("device=skins", "device.count=1"), hydra("device.seed=3")):
+        device = threshold_device(stored, hydra(*changes))
+        assert device.randomise
+        assert (device.rate, device.aligned, device.gain_spread) == (100, False, 0.2)
+    with pytest.raises(InputError, match="device=simulated"):
+        threshold_device(hydra(), hydra("device=recording", "device.path=x", "evaluation.profile=device"))
+
+
 def run_of(config, point):
     """Return as much of a run as its operating point is read from."""
     data = SimpleNamespace(tags={TAG: point.text()})

@@ -1,8 +1,11 @@
 """A run is the same one on another machine."""
 
+from copy import deepcopy
+from dataclasses import replace
+
 import pytest
 
-from skin.runs.configuration import config_hash, fingerprint
+from skin.runs.configuration import ADDED, config_hash, fingerprint
 
 
 @pytest.mark.parametrize(
@@ -20,6 +23,22 @@ def test_the_machine_makes_no_other_run(configured, overrides, learner):
     assert fingerprint(configured(f"learner={learner}", *overrides)) == fingerprint(
         configured(f"learner={learner}")
     )
+
+
+@pytest.mark.parametrize("device", ["simulated", "skins"])
+@pytest.mark.parametrize("profile", ["mild", "rough", "harsh", "calibrated", "drawn"])
+def test_settings_that_came_later_make_no_other_run(configured, device, profile):
+    """A run that finished before them has their values without naming them, and is found again."""
+    config = configured(f"device={device}", f"profile={profile}")
+    former = deepcopy(config)
+    groups = [former.device, former.device.get("skins", {})]
+    missing = [{name: group.pop(name) for name in ADDED if name in group} for group in groups]
+    assert set().union(*missing) >= {"scale_spread", "independent", "aligned", "footprint_error"}
+    assert all(value == ADDED[name] for group in missing for name, value in group.items())
+    assert fingerprint(config) == fingerprint(former)
+    others = {"scale_spread": 0.1, "independent": True, "aligned": False, "footprint_error": 0.1}
+    for name, value in others.items():
+        assert fingerprint(replace(former, device=former.device | {name: value})) != fingerprint(former)
 
 
 def test_a_data_set_counts_by_its_manifest(tmp_path, monkeypatch):

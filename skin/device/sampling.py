@@ -1,0 +1,270 @@
+"""Simulated readings at the rate of a device, reduced to the rate of a model like those of a real one."""
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+from scipy.special import ndtri
+from torch import Tensor
+
+from skin.device.imperfection import Constants, Imperfection
+from skin.device.resampling import frame_ages, highest_each, resample
+from skin.mechanics.relaxation import quantize
+
+_QUANTILES = 20000
+_NUMBERS = tuple(np.geomspace(1, 1000, 61).tolist())  # of frames in an interval; between them, 0.001 s.d.
+_SENSED = 5  # times the model's rate, of hysteresis, lag and curve; odd, so that a frame of the model is one
+_FAINT = 0.01  # standard deviations of the noise below which a sensor feels nothing
+_ELEMENTS = 2**19  # frames times sensors at a time, which the cache holds
+
+
+def between_frames(force: Tensor, model_rate: float, rate: float, phase: np.ndarray | float = 0.5) -> Tensor:
+    """Return true readings (B, F, S), N, at the rate of a device.
+
+    A frame of the model is the force in the middle of its interval. Between two frames in contact the force
+    changes linearly: a sliding touch goes at its speed from one place of its path to the next, and its force
+    follows the profile. A touch begins and ends at the edges of its first and last interval, so it does not
+    become longer. No reading exceeds the larger of its two frames, so a safe touch stays safe.
+
+    Args:
+        force: (B, T, S), true readings at the model's rate, N; a frame without contact is 0.
+        model_rate: Hz.
+        rate: of the device, Hz.
+        phase: when the device reads, (B,) or one for all: share of its interval, from 0 to 1.
+    """
+    batch, window, _ = force.shape
+    frames = round(window * rate / model_rate)
+    row = np.arange(batch)[:, None]
+    read = np.arange(frames) + np.reshape(phase, (-1, 1))
+    place = np.broadcast_to(np.minimum(read * model_rate / rate, window), (batch, frames))
+    now, neighbour, offset = _neighbours(place, window)
+    padded = torch.nn.functional.pad(force, (0, 0, 1, 1))
+    touched = (padded != 0).any(dim=2, keepdim=True)
+    share = torch.from_numpy(np.abs(offset)).to(force)[..., None]
+    current, neighbour_value = padded[row, now + 1], padded[row, neighbour + 1]
+    # Towards a frame without contact the force is 0 at the edge, which is half an interval away.
+    share = torch.where(touched[row, neighbour + 1], share, 2 * share)
+    return torch.where(touched[row, now + 1], torch.lerp(current, neighbour_value, share), 0.0)
+
+
+def _neighbours(place: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the frames at places and the nearest ones beside them, -1 to ``window``, and the distances.
+
+    Places are in intervals from the begin of the window, 0 to ``window``; the distances are from the middle
+    of the frame's interval, -0.5 to 0.5.
+    """
+    now = np.minimum(place.astype(int), window - 1)
+    offset = place - now - 0.5
+    return now, now + np.sign(offset).astype(int), offset
+
+
+def measure(
+    imperfection: Imperfection,
+    constants: Constants,
+    force: Tensor,
+    model_rate: float,
+    noise: np.random.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what a device measures, at the rate of a model.
+
+    Imperfections apply at the rate of the device. The maximum over each interval of the model is kept, as for
+    a real device (:func:`skin.device.resampling.resample`). A faster device reads each gesture, or each
+    stream, at a random phase of its interval, since no touch waits for the device. One at the model's rate,
+    or slower by up to 5 %, gives the frames of the model.
+
+    Args:
+        imperfection: of the device, with its rate.
+        constants: of the device.
+        force: (B, T, S), true readings, N, at the model's rate.
+        model_rate: Hz.
+        noise: source of the noise and of the phases.
+
+    Returns:
+        readings (B, T, S), N, float32, valid and saturated (B, T, S), bool.
+    """
+    rate = imperfection.rate
+    if not imperfection.aligned or not isinstance(rate, int | float):
+        return _measure_each(imperfection, constants, force, model_rate, noise)
+    if rate <= model_rate:
+        return imperfection.apply(force, constants, noise)
+    fine = between_frames(force, model_rate, rate, noise.random(len(force)))
+    readings, valid, saturated = imperfection.apply(fine, constants, noise)
+    return _reduce_rate(readings, valid, saturated, (rate, model_rate), force.shape[1])
+
+
+def _measure_each(
+    imperfection: Imperfection,
+    constants: Constants,
+    force: Tensor,
+    model_rate: float,
+    noise: np.random.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what :func:`measure` does, each gesture read at the rate of its device and at a phase.
+
+    Offset, drift in the middle of the interval, and rounding are added to the maximum of the interval.
+    Hysteresis, lag and curve act before the converter and are computed at five times the model's rate.
+    """
+    batch, window, sensors = force.shape
+    ratios = np.maximum(np.broadcast_to(constants.rate.numpy().ravel(), batch) / model_rate, 1)
+    shifts = noise.random(batch)
+    if imperfection.aligned:
+        shifts = (0.5 - shifts) / ratios
+    else:
+        # Later by part of an interval; earlier where the window ends with the touch.
+        shifts -= (force[:, -1] != 0).any(dim=1).cpu().numpy()
+    padded, fine = torch.nn.functional.pad(force, (0, 0, 0, 1)), 1
+    if not imperfection.is_static(constants, sensors):
+        fine = _SENSED
+        padded = between_frames(padded, model_rate, fine * model_rate)
+    time = torch.arange(padded.shape[1], device=force.device) / (fine * model_rate)
+    sensed = imperfection.sense(padded, constants, time)
+    highest, saturated = _read_each(sensed, fine, constants, ratios, shifts, window, noise)
+    output = highest.to(force.device) + (constants.offset - constants.baseline)
+    if constants.drift.any():
+        output += constants.drift * ((torch.arange(window)[:, None] + 0.5) / model_rate).to(output)
+    if constants.quantum.any():
+        output = quantize(output + constants.baseline, constants.quantum) - constants.baseline
+    dead = constants.dead.expand(output.shape)
+    return output.masked_fill(dead, 0.0), ~dead, saturated.to(force.device) & ~dead
+
+
+def _read_each(
+    sensed: Tensor,
+    fine: int,
+    constants: Constants,
+    ratios: np.ndarray,
+    shifts: np.ndarray,
+    window: int,
+    noise: np.random.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Return the largest reading of every interval, N, and whether it is saturated, (B, window, S).
+
+    Args:
+        sensed: (B, F, S), what the sensors respond, N, ``fine`` times per interval of the model.
+        fine: see above.
+        constants: of the devices; clip and noise are used.
+        ratios: (B,), frames of the device per interval.
+        shifts: (B,), by which touches are later, intervals.
+        window: number of intervals.
+        noise: source of the noise.
+    """
+    batch, _, sensors = sensed.shape
+    values = np.pad(sensed.cpu().numpy(), ((0, 0), (1, 1), (0, 0)))
+    clip, deviation = (
+        np.broadcast_to(value.numpy(), (batch, 1, sensors))[:, 0]
+        for value in (constants.clip, constants.noise)
+    )
+    touched = (np.abs(values) > _FAINT * deviation[:, None]).any(axis=2)
+    highest, limited = (np.zeros((batch, window, sensors), kind) for kind in (np.float32, bool))
+    frames = np.cumsum(np.ceil(window * ratios - 0.5))
+    cuts = np.flatnonzero(np.diff(frames * sensors // _ELEMENTS, prepend=0))
+    for first, last in pairwise(np.unique([0, *cuts, batch])):
+        part = slice(first, last)
+        gesture, age = frame_ages(ratios[part], window)
+        number = gesture * window + window - 1 - np.floor(age).astype(int)
+        place = np.clip((window - age - shifts[part][gesture]) * fine, 0, values.shape[1] - 2)
+        begins = np.flatnonzero(np.diff(number, prepend=-1))
+        counts = np.diff(begins, append=len(number))
+        rows = touched[part][gesture, np.minimum(place.astype(int) + 1, values.shape[1] - 2)]
+        felt = np.logical_or.reduceat(rows, begins)
+        rows = np.repeat(felt, counts)
+        read = _interpolation(place[rows], gesture[rows], touched[part]) @ values[part].reshape(-1, sensors)
+        if np.abs(values[part]).max() > clip[part].min():
+            limit = clip[part][gesture[rows]]
+            limited[part].reshape(-1, sensors)[felt] = highest_each(np.abs(read) > limit, number[rows])
+            read = np.clip(read, -limit, limit)
+        read += noise.standard_normal(read.shape, dtype=np.float32) * deviation[part][gesture[rows]]
+        result = highest[part].reshape(-1, sensors)
+        result[felt] = highest_each(read, number[rows])
+        result[~felt] = _draw_highest(counts[~felt], sensors, noise) * deviation[part][gesture[begins[~felt]]]
+    return torch.from_numpy(highest), torch.from_numpy(limited)
+
+
+def _draw_highest(counts: np.ndarray, sensors: int, noise: np.random.Generator) -> np.ndarray:
+    """Return the largest of ``counts`` (I,) standard normal values for each sensor, (I, S).
+
+    Its chance to be below x is the normal one to the power of the count, and is itself uniform.
+    """
+    drawn = noise.standard_exponential((len(counts), sensors), dtype=np.float32)
+    return -ndtri(-np.expm1(-drawn / counts[:, None].astype(np.float32)))
+
+
+def _interpolation(place: np.ndarray, gesture: np.ndarray, touched: np.ndarray) -> csr_array:
+    """Return the weights of frames at places between them, as in :func:`between_frames`.
+
+    Args:
+        place: (N,), in frames from the begin of the window.
+        gesture: (N,), of each place.
+        touched: (B, F + 2), whether something touches in a frame; one more frame before the first and after
+            the last.
+    """
+    size = touched.shape[1]
+    now, neighbour, offset = _neighbours(place, size - 2)
+    column = np.stack([now, neighbour], axis=1) + 1 + size * gesture[:, None]
+    share = np.abs(offset) * np.where(touched.ravel()[column[:, 1]], 1, 2)
+    weights = np.stack([1 - share, share], axis=1) * touched.ravel()[column[:, :1]]
+    begins = np.arange(0, 2 * len(place) + 1, 2)
+    return csr_array((weights.ravel().astype(np.float32), column.ravel(), begins), (len(place), touched.size))
+
+
+def _reduce_rate(
+    readings: Tensor, valid: Tensor, saturated: Tensor, rates: tuple[float, float], window: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return readings and masks (B, F, S) at the first of two rates as (B, window, S) at the second, Hz."""
+    batch, frames, sensors = readings.shape
+    values, works, limits = (
+        tensor.transpose(0, 1).flatten(1).cpu().numpy() for tensor in (readings, valid, saturated)
+    )
+    time = (np.arange(frames) + 0.5) / rates[0]
+    resampled = resample(time, values, works, limits, window / rates[1], 1 / rates[1], window)
+    tensors = (
+        torch.from_numpy(tensor).unflatten(1, (batch, sensors)).transpose(0, 1) for tensor in resampled[:3]
+    )
+    highest, known_frames, limited = (tensor.contiguous().to(readings.device) for tensor in tensors)
+    return highest.to(readings.dtype), known_frames, limited
+
+
+def draw_constants(
+    imperfection: Imperfection,
+    sensors: int,
+    model_rate: float,
+    drawn: np.random.Generator,
+    gestures: int | None = None,
+) -> Constants:
+    """Draw the constants of a device, or of one per gesture, with a baseline of resampled readings.
+
+    The maximum of noise is not 0, so a tare of a real device takes its baseline from resampled readings, too.
+
+    Args:
+        imperfection, sensors, drawn, gestures: as in :meth:`Imperfection.constants`.
+        model_rate: Hz.
+    """
+    constants = imperfection.constants(sensors, drawn, gestures)
+    if not imperfection.tare:
+        return constants
+    return constants._replace(baseline=constants.baseline + idle_excess(constants, model_rate))
+
+
+def idle_excess(constants: Constants, model_rate: float) -> Tensor:
+    """Return the mean of idle readings above the offset, N: that of the maximum of the noise of an interval.
+
+    Args:
+        constants: of the device, with its rate; the result has the shape of their noise.
+        model_rate: Hz.
+    """
+    numbers = np.maximum(constants.rate.numpy() / model_rate, 1)
+    if numbers.size == 1:
+        return constants.noise * _highest_of(numbers.item())
+    highest = np.interp(np.log(numbers), np.log(_NUMBERS), [_highest_of(number) for number in _NUMBERS])
+    return constants.noise * torch.from_numpy(highest).to(constants.noise)
+
+
+@cache
+def _highest_of(number: float) -> float:
+    """Return the mean of the largest of so many standard normal values; the number need not be whole."""
+    if number == 1:
+        return 0.0
+    chance = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    return float(ndtri(chance ** (1 / number)).mean())

@@ -55,8 +55,8 @@ RISKS = (0.05, 0.01)
 
 @checked("real")
 @dataclass(frozen=True)
-class Settings:
-    """Settings of the command line.
+class RealSettings:
+    """RealSettings of the command line.
 
     Attributes:
         data: folder that holds ``eflesh`` and ``sdu_fsi``; absent recordings are named and left out.
@@ -98,7 +98,7 @@ class Presses:
 
 
 @dataclass(frozen=True)
-class Row:
+class RealRow:
     """A comparison: train on some presses, test on others.
 
     Attributes:
@@ -121,7 +121,7 @@ class Row:
     unit: str
     split: str
     goal: float | None
-    run: Callable[["Row", Presses, Settings], Iterator[dict[str, Any]]] = field(repr=False)
+    run: Callable[["RealRow", Presses, RealSettings], Iterator[dict[str, Any]]] = field(repr=False)
 
 
 class SubsetProcess(RegressorMixin, BaseEstimator):
@@ -163,7 +163,7 @@ def estimators(outputs: int, seed: int) -> dict[str, BaseEstimator]:
     }
 
 
-def candidates(presses: Presses, seed: int) -> dict[tuple[str, str], BaseEstimator]:
+def pair_estimators(presses: Presses, seed: int) -> dict[tuple[str, str], BaseEstimator]:
     """Return estimators by (inputs, estimator); engineered features go to SVM and trees."""
     pairs = {}
     for inputs in presses.inputs:
@@ -176,7 +176,7 @@ def candidates(presses: Presses, seed: int) -> dict[tuple[str, str], BaseEstimat
 
 def predict(pair: tuple[str, str], training: Presses, test: Presses, seed: int) -> np.ndarray:
     """Return the predicted targets of the test presses, (N, D)."""
-    estimator = candidates(training, seed)[pair]
+    estimator = pair_estimators(training, seed)[pair]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # the choice judges what has not converged
         targets = training.targets
@@ -204,7 +204,7 @@ def choose(training: Presses, seed: int, by_place: bool) -> tuple[str, str]:
     else:
         folds = list(KFold(FOLDS).split(groups))
     errors = {}
-    for pair in candidates(training, seed):
+    for pair in pair_estimators(training, seed):
         parts = (
             square_errors(predict(pair, training[fit], training[held], seed), training[held])
             for fit, held in folds
@@ -230,7 +230,7 @@ def interval(squares: np.ndarray, units: np.ndarray, seed: int) -> tuple[float, 
     return float(low), float(high)
 
 
-def sweeps(session: np.ndarray) -> np.ndarray:
+def number_sweeps(session: np.ndarray) -> np.ndarray:
     """Return the number of the sweep of each press, (N,), in sessions of ``SWEEPS`` equal parts."""
     numbers = np.zeros(len(session), int)
     for name in np.unique(session):
@@ -239,7 +239,7 @@ def sweeps(session: np.ndarray) -> np.ndarray:
     return numbers
 
 
-def line(row: Row, training: int | str, test: int, pair: str, **values: Any) -> dict[str, Any]:
+def result_line(row: RealRow, training: int | str, test: int, pair: str, **values: Any) -> dict[str, Any]:
     """Return a line of the results; keyword arguments are the metric, its value and its interval."""
     start = {"row": row.name, "split": row.split, "training": training, "test": test, "estimator": pair}
     goal = "" if row.goal is None else row.goal
@@ -248,22 +248,24 @@ def line(row: Row, training: int | str, test: int, pair: str, **values: Any) -> 
 
 
 def run_sessions(
-    row: Row, presses: Presses, settings: Settings, train: set[int], test: int
+    row: RealRow, presses: Presses, settings: RealSettings, train: set[int], test: int
 ) -> Iterator[dict[str, Any]]:
     """Train on sessions, test on another."""
     training, tested = presses[np.isin(presses.session, list(train))], presses[presses.session == test]
     pair = choose(training, settings.seed, by_place=False)
     squares = square_errors(predict(pair, training, tested, settings.seed), tested)
-    units, name = (tested.place, "places") if len(row.targets) == 2 else (sweeps(tested.session), "sweeps")
+    units, name = (
+        (tested.place, "places") if len(row.targets) == 2 else (number_sweeps(tested.session), "sweeps")
+    )
     low, high = interval(squares, units, settings.seed)
     value = float(np.sqrt(squares.mean()))
     words = ", ".join(reversed(pair))
-    yield line(
+    yield result_line(
         row, len(training), len(tested), words, metric="rms", value=value, low=low, high=high, over=name
     )
 
 
-def run_draws(row: Row, presses: Presses, settings: Settings, count: int) -> Iterator[dict[str, Any]]:
+def run_draws(row: RealRow, presses: Presses, settings: RealSettings, count: int) -> Iterator[dict[str, Any]]:
     """Train on few presses of the first session, drawn several times, and test on the second."""
     first, tested = presses[presses.session == 0], presses[presses.session == 1]
     values, pairs = list[float](), list[str]()
@@ -278,7 +280,9 @@ def run_draws(row: Row, presses: Presses, settings: Settings, count: int) -> Ite
     often = "; ".join(f"{name} {pairs.count(name)}" for name in sorted(set(pairs)))
     mean = float(np.mean(values))
     used = min(count, len(first))
-    yield line(row, used, len(tested), often, metric="mean rms", value=mean, low=low, high=high, over="draws")
+    yield result_line(
+        row, used, len(tested), often, metric="mean rms", value=mean, low=low, high=high, over="draws"
+    )
 
 
 def place_folds(presses: Presses, seed: int) -> Iterator[tuple[Presses, Presses]]:
@@ -288,7 +292,7 @@ def place_folds(presses: Presses, seed: int) -> Iterator[tuple[Presses, Presses]
         yield presses[fit], presses[test]
 
 
-def run_places(row: Row, presses: Presses, settings: Settings) -> Iterator[dict[str, Any]]:
+def run_places(row: RealRow, presses: Presses, settings: RealSettings) -> Iterator[dict[str, Any]]:
     """Test on places that no training press has touched, in folds."""
     squares, places, pairs = [], [], list[str]()
     for training, tested in place_folds(presses, settings.seed):
@@ -300,7 +304,9 @@ def run_places(row: Row, presses: Presses, settings: Settings) -> Iterator[dict[
     low, high = interval(joined, np.concatenate(places), settings.seed)
     words, value = "; ".join(sorted(set(pairs))), float(np.sqrt(joined.mean()))
     size = len(presses) - len(presses) // FOLDS
-    yield line(row, size, len(joined), words, metric="rms", value=value, low=low, high=high, over="places")
+    yield result_line(
+        row, size, len(joined), words, metric="rms", value=value, low=low, high=high, over="places"
+    )
 
 
 def risk_threshold(scores: np.ndarray, dangerous: np.ndarray, places: np.ndarray, risk: float) -> float:
@@ -329,7 +335,7 @@ def risk_threshold(scores: np.ndarray, dangerous: np.ndarray, places: np.ndarray
     return float(values[order][allowed[-1]]) if len(allowed) else -np.inf
 
 
-def run_alarm(row: Row, presses: Presses, settings: Settings) -> Iterator[dict[str, Any]]:
+def run_alarm(row: RealRow, presses: Presses, settings: RealSettings) -> Iterator[dict[str, Any]]:
     """Raise an alarm at presses above ``DANGEROUS``: thresholds of a quarter of the training places."""
     parts = []
     for training, tested in place_folds(presses, settings.seed):
@@ -352,7 +358,9 @@ def run_alarm(row: Row, presses: Presses, settings: Settings) -> Iterator[dict[s
             goal = replace(row, goal=100 * risk if metric == "misses" else None)
             for over, low, high in _rates(wrong, places[inside], settings.seed):
                 values = {"metric": f"{metric}, risk {100 * risk:g} %", "value": 100 * float(wrong.mean())}
-                yield line(goal, size, len(wrong), words, **values, low=100 * low, high=100 * high, over=over)
+                yield result_line(
+                    goal, size, len(wrong), words, **values, low=100 * low, high=100 * high, over=over
+                )
 
 
 def _rates(wrong: np.ndarray, places: np.ndarray, seed: int) -> Iterator[tuple[str, float, float]]:
@@ -366,9 +374,9 @@ def _rates(wrong: np.ndarray, places: np.ndarray, seed: int) -> Iterator[tuple[s
 PLACE, FORCE, SHEAR = "eflesh/spatial_resolution", "eflesh/normal_force", "eflesh/shear_force"
 PAD = "sdu_fsi/2D_6060_learning_data.xlsx"
 A_B, UNSEEN = "session of 16 March 2025 -> 17 March 2025", "5 folds by place"
-_place = partial(Row, mapping="eflesh_place", path=PLACE, targets=("x", "y"), factor=1e3, unit="mm")
-_force = partial(Row, mapping="eflesh_force", path=FORCE, targets=("force",), factor=1.0, unit="N")
-_pad = partial(Row, mapping="sdu", path=PAD, split=UNSEEN)
+_place = partial(RealRow, mapping="eflesh_place", path=PLACE, targets=("x", "y"), factor=1e3, unit="mm")
+_force = partial(RealRow, mapping="eflesh_force", path=FORCE, targets=("force",), factor=1.0, unit="N")
+_pad = partial(RealRow, mapping="sdu", path=PAD, split=UNSEEN)
 ROWS = (
     _place("eflesh place", split=A_B, goal=0.55, run=partial(run_sessions, train={0}, test=1)),
     _place("eflesh place, 100 presses", split=A_B, goal=1.5, run=partial(run_draws, count=100)),
@@ -380,7 +388,7 @@ ROWS = (
         run=partial(run_sessions, train={0, 1}, test=2),
     ),
     _force("eflesh force, 1", split="session 1 -> 3", goal=0.5, run=partial(run_sessions, train={0}, test=2)),
-    Row(
+    RealRow(
         "eflesh shear",
         "eflesh_shear",
         SHEAR,
@@ -397,7 +405,7 @@ ROWS = (
 )
 
 
-def read_presses(row: Row, folder: Path, share: float, seed: int) -> Presses:
+def read_presses(row: RealRow, folder: Path, share: float, seed: int) -> Presses:
     """Return the presses of a row with known targets; a share of them, or of the places of a pad."""
     recording = convert_files(read_format(row.mapping), folder / row.path)
     targets = row.factor * np.stack([recording.parameters[name].numpy() for name in row.targets], axis=1)
@@ -419,7 +427,7 @@ def _grid(recording: Recording) -> np.ndarray:
     return np.asarray(1000 * x + y)
 
 
-def make_inputs(row: Row, recording: Recording, session: np.ndarray) -> dict[str, np.ndarray]:
+def make_inputs(row: RealRow, recording: Recording, session: np.ndarray) -> dict[str, np.ndarray]:
     """Return the inputs of the choice.
 
     Only sweeps of the force have a history. Both sessions press the places in the same order, so that the
@@ -442,7 +450,7 @@ def make_inputs(row: Row, recording: Recording, session: np.ndarray) -> dict[str
     return inputs
 
 
-def measure(settings: Settings) -> Iterator[dict[str, Any]]:
+def measure_rows(settings: RealSettings) -> Iterator[dict[str, Any]]:
     """Yield the lines of all rows whose recordings are in the folder."""
     chosen = [row for row in ROWS if row.name.startswith(tuple(settings.rows.split(",")))]
     if not chosen:
@@ -477,9 +485,9 @@ def write_lines(lines: Iterator[dict[str, Any]], path: Path) -> None:
 
 def main(words: Sequence[str]) -> None:
     """Run what the words ``name=value`` select."""
-    given = OmegaConf.to_container(OmegaConf.from_dotlist(list(words)))
-    settings = configured(Settings, given, "real")  # type: ignore[arg-type]
-    write_lines(measure(settings), Path(settings.out) / "real.csv")
+    entries = OmegaConf.to_container(OmegaConf.from_dotlist(list(words)))
+    settings = configured(RealSettings, entries, "real")  # type: ignore[arg-type]
+    write_lines(measure_rows(settings), Path(settings.out) / "real.csv")
 
 
 if __name__ == "__main__":

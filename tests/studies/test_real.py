@@ -64,7 +64,7 @@ def test_the_choice_and_the_prediction_do_not_depend_on_the_targets_of_the_test(
     presses = real.Presses({"readings": x}, x[:, :1] ** 2, np.repeat([0, 1, 2], 30), np.arange(90))
     spoilt = real.Presses(presses.inputs, presses.targets.copy(), presses.session, presses.place)
     spoilt.targets[60:] = 1e6
-    row, settings = real.ROWS[3], real.Settings("")
+    row, settings = real.ROWS[3], real.RealSettings("")
     lines = [next(real.run_sessions(row, each, settings, {0, 1}, 2)) for each in (presses, spoilt)]
     assert lines[0]["estimator"] == lines[1]["estimator"]
     assert lines[1]["value"] > 1e5

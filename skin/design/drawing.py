@@ -18,7 +18,7 @@ from skin.design.expected import Findings, Step
 from skin.plot.figures import COLOURS, MARKS, save_figure
 
 _NOTE = (
-    "Errors of the posterior mean; of the place per axis: rms, median, 90 %, and rms where a sensor is raised.\n"
+    "Errors of the posterior mean; of the place: rms per axis, median, 90 %, rms where a sensor is raised.\n"
     "Local precision tells a touch from its neighbours alone and is no limit (docs/design.md)."
 )
 _WIDE = ("raised\nmm", "radius\nmm", "reach\nmm", "local precision\nmm")  # no room in the table of a sweep
